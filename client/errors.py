@@ -1,14 +1,14 @@
-"""Exceptions of the client for error responses and for a service that cannot be reached.
+"""Exceptions that the client raises for error responses and for an unreachable service.
 
 ::
 
-    ServiceError            error response; `problem` is its problem document
-    ├── InvalidRequest      400, 405, 415, 422  a field is invalid; `problem.field` is its name
+    ServiceError            error response; `problem` is the problem document
+    ├── InvalidRequest      400, 405, 415, 422  a field is invalid; `problem.field` names it
     ├── TooLarge            413                 the request exceeds the size limit
     ├── NotAuthorized       401, 403            the token is missing or unknown
     ├── NotFound            404, 410            the scene, frame or camera does not exist
     ├── Conflict            409                 the current state does not allow the request
-    │   └── FrameGap                            … because another frame comes first: `expected` is its index
+    │   └── FrameGap                            another frame must be sent first; `expected` is its index
     ├── Busy                429                 the queue stayed full longer than the busy timeout
     └── ServiceFault        5xx                 the service, or a proxy in front of it, failed
     ServiceUnreachable      no response was received
@@ -21,7 +21,7 @@ import httpx
 from client.wire import ProblemDetails
 
 TEXT_LENGTH = 200
-"""Maximum number of characters shown of a response that is not a problem document."""
+"""Maximum number of characters to show from a response that is not a problem document."""
 
 
 class ServiceError(RuntimeError):
@@ -68,7 +68,7 @@ class FrameGap(Conflict):
 
 
 class Busy(ServiceError):
-    """Error raised if the service has no capacity for the request at the moment."""
+    """Error raised if the service currently has no capacity for the request."""
 
 
 class ServiceFault(ServiceError):
@@ -100,14 +100,14 @@ def error_of(response: httpx.Response) -> ServiceError:
         problem = ProblemDetails.model_validate_json(response.content)
     except ValueError:  # not from our service, e.g. from a proxy in front of it
         text = response.text[:TEXT_LENGTH]
-        problem = ProblemDetails(title="unexpected answer", status=response.status_code, detail=text)
+        problem = ProblemDetails(title="unexpected response", status=response.status_code, detail=text)
     return error_of_problem(problem)
 
 
 def error_of_problem(problem: ProblemDetails) -> ServiceError:
     """Returns the exception for a problem document."""
     more = problem.model_extra or {}
-    # A frame sent again with different content also has `expected`, plus `identity`; it is not a gap.
+    # The 409 for a frame that was resent with different content has `expected` too, but also `identity`; it is no gap.
     if problem.status == 409 and isinstance(more.get("expected"), int) and "identity" not in more:
         return FrameGap(problem)
     fallback = ServiceFault if problem.status >= 500 else ServiceError

@@ -1,6 +1,6 @@
-"""Frame upload over a WebSocket with one acknowledged binary message of `client.wire.framing` per frame.
+"""Frame upload over a WebSocket, with one acknowledged binary message (`client.wire.framing`) per frame.
 
-The retry policy is the same as over HTTP: after a lost connection, the client reconnects and sends the frame again.
+The retry policy is the same as over HTTP. If the connection is lost, the client reconnects and resends the frame.
 """
 
 from __future__ import annotations
@@ -26,10 +26,12 @@ ANSWER_S = 130.0
 
 
 class IngestSocket:
-    """Connection of one sender to a scene, to be closed or used as a context manager; not thread-safe.
+    """WebSocket connection of one sender to a scene; not thread-safe.
+
+    Close it after use, or use it as a context manager.
 
     Args:
-        client: client whose address, token, timeouts and `on_retry` are used.
+        client: client that provides the address, token, timeouts and `on_retry` callback.
         scene: id of the scene.
 
     >>> n = client.scene(open_scene).next_frame

@@ -1,4 +1,4 @@
-"""Images written by the commands: renderings next to ground truth, depth maps and part labels."""
+"""Images written by the commands: renders next to ground truth, depth maps and part labels."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ Picture = NDArray[np.uint8]
 
 
 def eight_bit(colour: NDArray[np.floating]) -> Picture:
-    """Returns colours [H, W, 3] in 0…1 as 8-bit values 0…255; values outside the range are clipped."""
+    """Converts colours [H, W, 3] in 0…1 to 8-bit values 0…255; values outside the range are clipped."""
     rounded: Picture = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
     return rounded
 
 
 def comparison(truth: Picture, render: Picture) -> Picture:
-    """Returns ground truth, rendering and amplified difference side by side, [H, 3 W, 3]."""
+    """Returns ground truth, render and amplified difference side by side, [H, 3 W, 3]."""
     difference = np.abs(truth.astype(np.int16) - render.astype(np.int16)) * DIFFERENCE_GAIN
     return np.concatenate([truth, render, np.minimum(difference, 255).astype(np.uint8)], axis=1)
 
 
 def psnr(truth: Picture, render: Picture) -> float:
-    """Returns the peak signal-to-noise ratio in dB over all pixels and channels; infinite for equal images."""
+    """Returns the peak signal-to-noise ratio in dB over all pixels and channels; infinity for identical images."""
     error = np.mean(np.square(truth.astype(np.float64) - render))
     return float(10 * np.log10(255**2 / error)) if error > 0 else float("inf")
 
 
 def colour_labels(labels: NDArray[np.uint8]) -> Picture:
-    """Returns the colours [H, W, 3] of labels [H, W], where 0 is no part (black) and k is part k − 1."""
+    """Returns a colour image [H, W, 3] of labels [H, W], where 0 means no part (black) and k means part k − 1."""
     palette = [(0, 0, 0), *(part_colour(label) for label in range(int(labels.max(initial=0))))]
     return np.array(palette, np.uint8)[labels]
 
 
 def depth_to_grey(depth: NDArray[np.floating]) -> Picture:
-    """Returns depth [H, W] as a grey image [H, W, 3]: near is bright, pixels without depth are black."""
+    """Returns depth [H, W] as a grayscale image [H, W, 3]: near is bright, and pixels without depth are black."""
     met = np.isfinite(depth)
     if not met.any():
         return np.zeros((*depth.shape, 3), np.uint8)
@@ -51,7 +51,7 @@ def depth_to_grey(depth: NDArray[np.floating]) -> Picture:
 
 
 def save(path: Path, picture: Picture) -> Path:
-    """Saves an image, creating missing folders, and returns the path; the suffix selects the format."""
+    """Saves an image, creating missing folders, and returns its path; the suffix determines the format."""
     path.parent.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(path, picture)
     return path

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 console = Console()
 
 LINE_S = 10.0
-"""Default interval in seconds between lines about one stage if the output is not a terminal."""
+"""Default interval in seconds between lines for the same stage if the output is not a terminal."""
 
 
 class Bars:
@@ -19,7 +19,7 @@ class Bars:
 
     Args:
         to: console to write to; None for the default console.
-        every: interval in seconds between lines about one stage if the output is not a terminal.
+        every: interval in seconds between lines for the same stage if the output is not a terminal.
     """
 
     def __init__(self, to: Console | None = None, every: float = LINE_S) -> None:

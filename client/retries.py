@@ -1,18 +1,18 @@
-"""Retry policy of calls: which responses are retried, after which delay, and for how long.
+"""Retry policy for calls: which failures are retried, after what delay, and for how long.
 
-Idempotent calls are retried. These include reads and frame uploads, since the service recognizes a frame by its
+Idempotent calls are retried. They include reads and frame uploads, because the service recognizes frames by their
 content.
 
 ============================  =====================================================================================
 429                           after the delay that the service requests, for `busy` seconds in total; if the service
-                              predicts a long delay (`retry_after_seconds`), the client asks again after half of it
+                              predicts a long delay (`retry_after_seconds`), the client retries after half of it
 502, 503, 504, 507, and a     after 0.2, 0.4, 0.8 … 5 s, each with a random factor of 0.5…1 so that many senders do
 connection that is lost       not retry at the same time, or later if the response says so; until `outage` seconds
 or cannot be made             after the first failure of the call
 every other 4xx, 500          never: the same request would be refused again
 ============================  =====================================================================================
 
-Calls that are *not* idempotent, such as creating a scene, are retried only if no connection could be established.
+Calls that are *not* idempotent, such as creating a scene, are retried only if no connection was established.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SHORTEST_BUSY_WAIT_S = 0.1
 SURE_S, LONGEST_BUSY_WAIT_S = 2.0, 10.0
-"""Predicted delay in seconds up to which the client waits in full, and maximum wait for longer predictions.
+"""Predicted delay in seconds up to which the client waits the full time, and maximum wait for longer predictions.
 
-For longer predictions the client waits half of the delay, because frame 0 may finish earlier than predicted.
+For longer predictions, the client waits half of the delay, because frame 0 may finish earlier than predicted.
 """
 OUTAGE_STATUSES = (502, 503, 504, 507)
 
 BUSY_S = 3600.0
-"""Default time in seconds to wait for a full queue; a first frame takes minutes."""
+"""Default time in seconds to wait while the queue is full; a first frame takes minutes."""
 OUTAGE_S = 20.0
-"""Default time in seconds to wait for a service that does not answer."""
+"""Default time in seconds to keep retrying while the service does not respond."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Retry:
     """Delay before a call is retried, with its reason.
 
     Attributes:
-        reason: "busy" if the service has no capacity, "outage" if it does not answer.
+        reason: "busy" if the service has no capacity, "outage" if it does not respond.
         seconds: delay in seconds.
-        detail: description in one sentence.
+        detail: one-sentence description.
     """
 
     reason: Literal["busy", "outage"]
@@ -111,7 +111,7 @@ class Retries:
                 wait = self._busy_wait(asked, response)
             elif response.status_code in OUTAGE_STATUSES:
                 self._lost = True
-                wait = self._outage_wait(asked or 0.0, f"it answered {response.status_code}")
+                wait = self._outage_wait(asked or 0.0, f"it responded with {response.status_code}")
         if wait is None:
             raise error_of(response)
         return wait
@@ -127,7 +127,7 @@ class Retries:
         wait = max(asked, SHORTEST_BUSY_WAIT_S) * random.uniform(1.0, 1.1)
         wait = min(wait, self._busy_left)
         self._busy_left -= wait
-        self._failed_at, self._failures = None, 0  # the service responds, so an outage has ended
+        self._failed_at, self._failures = None, 0  # the service responded, so any outage is over
         return self._notify(Retry("busy", wait, problem.detail))
 
     def _outage_wait(self, asked: float, detail: str) -> float | None:

@@ -1,6 +1,6 @@
 """Access to a reconstruction as arrays: states, tracks and parts in the rig's world frame and units.
 
-It works on files or with a running service. World axes are those of the rig's calibration. Cameras follow the OpenCV
+Works with files and with a running service. World axes are those of the rig's calibration. Cameras follow the OpenCV
 convention (x right, y down, z forward). Requires numpy and zstandard.
 """
 
@@ -30,11 +30,11 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State of N Gaussians in one frame; row i is the same Gaussian in every frame, and new rows are appended.
+    """State of N Gaussians in one frame. Row i is the same Gaussian in every frame; new Gaussians are appended.
 
     Attributes:
         frame: index of the frame.
-        seconds: time of the frame.
+        seconds: time of the frame in seconds.
         gaussians: state in the internal world frame, float32.
         world: transform between the user's and the internal world frame.
     """
@@ -57,7 +57,7 @@ class State:
 
     @property
     def rotations(self) -> NDArray[np.float32]:
-        """Rotations [N, 4] as unit quaternions (w, x, y, z), relative to frame 0 or to the frame of creation."""
+        """Rotations [N, 4] as unit quaternions (w, x, y, z), relative to frame 0 or the frame of creation."""
         return self.gaussians.rotations
 
     @property
@@ -77,7 +77,7 @@ class State:
 
     @property
     def present(self) -> Bool:
-        """Mask [N] of Gaussians that are present in this frame; those that have left the scene are not."""
+        """Mask [N] of Gaussians that are present in this frame, i.e. have not left the scene."""
         return self.gaussians.present
 
     @property
@@ -93,7 +93,7 @@ class GaussianTracks:
     Attributes:
         positions: centres [T, K, 3], float64, in the user's world and units; NaN in frames in which a Gaussian is not
             present.
-        seconds: times [T] of the frames.
+        seconds: times [T] of the frames in seconds.
         frames: indices [T] of the frames.
         ids: ids [K] of the Gaussians.
         present: mask [T, K] of the frames in which a Gaussian is present.
@@ -117,7 +117,7 @@ class PartPoses:
     Attributes:
         parts: labels [P] of the parts.
         frames: indices [T] of the frames.
-        seconds: times [T] of the frames.
+        seconds: times [T] of the frames in seconds.
         motions: rigid transforms [P, T, 4, 4], float64, in the user's units. A point of part p at (x, y, z) in the
             first of the frames is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN if no Gaussian of the part is
             present.
@@ -132,14 +132,14 @@ class PartPoses:
 
 
 class Scene:
-    """Reconstruction opened from a compact file, its folder, or a scene of the service.
+    """Reconstruction opened from a compact file, its folder, or a scene on the service.
 
-    States are read one at a time. The states of a scene of the service are downloaded on opening; in that case, close
+    States are read one at a time. For a scene on the service, all states are downloaded on opening; in that case, close
     the object or use it as a context manager.
 
     Attributes:
         frames: indices of the frames.
-        seconds: times [T] of the frames.
+        seconds: times [T] of the frames in seconds.
 
     >>> with Scene.open(scene, url=url) as given:  # a folder, a .s4d file, or an id
     ...     shapes = [(state.frame, state.means.shape) for state in given.states("0:1")]
@@ -161,13 +161,13 @@ class Scene:
 
         Args:
             source: .s4d file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
-                of a scene of the service.
-            frames: range ``A:B``, inclusive, as for `scas4d export`; None for all.
+                of a scene on the service.
+            frames: inclusive range ``A:B``, as for `scas4d export`; None for all frames.
             url: address of the service.
             token: token of the service.
 
         Raises:
-            InputError: the source does not exist, or has none of these frames.
+            InputError: the source does not exist, or contains none of these frames.
             ServiceError: the service refused the request.
         """
         low, high = frame_range(frames)
@@ -187,7 +187,7 @@ class Scene:
         self.close()
 
     def close(self) -> None:
-        """Deletes the states downloaded from a service, which makes them unreadable."""
+        """Deletes states downloaded from a service; they cannot be read afterwards."""
         self._closing.close()
 
     @property
@@ -214,7 +214,7 @@ class Scene:
         """Yields the states in frame order.
 
         Args:
-            frames: range ``A:B``, inclusive; None for all.
+            frames: inclusive range ``A:B``; None for all frames.
 
         Raises:
             InputError: none of these frames exists.
@@ -230,14 +230,14 @@ class Scene:
             yield State(index, seconds, gaussians, world)
 
     def tracks(self, ids: ArrayLike | None = None, frames: str | None = None) -> GaussianTracks:
-        """Returns the trajectories of Gaussians, which take 24 bytes per Gaussian and frame.
+        """Returns the trajectories of Gaussians; they take 24 bytes per Gaussian and frame.
 
         Args:
-            ids: ids [K] of the Gaussians; None for all that are moving in the last of the frames.
-            frames: range ``A:B``, inclusive; None for all.
+            ids: ids [K] of the Gaussians; None for all Gaussians that are moving in the last of these frames.
+            frames: inclusive range ``A:B``; None for all frames.
 
         Raises:
-            InputError: no Gaussian has one of the ids, or none of these frames exists.
+            InputError: one of the ids does not exist, or none of these frames exists.
 
         >>> with Scene.open(scene, url=url) as given:
         ...     tracks = given.tracks(ids=[0])
@@ -254,10 +254,10 @@ class Scene:
         return GaussianTracks(positions, np.array(list(chosen.values())), np.array(list(chosen), np.int64), known)
 
     def parts(self) -> Int:
-        """Returns the part label of each Gaussian [N] of the last frame by row; −1 for no part.
+        """Returns the part label [N] of each row in the last frame; −1 if a Gaussian belongs to no part.
 
-        For a scene of the service, the labels are those of its newest frame. The service computes them on demand,
-        which takes seconds.
+        For a scene on the service, the labels are those of its newest frame. The service computes them on demand,
+        which takes a few seconds.
 
         >>> with Scene.open(scene, url=url) as given:
         ...     given.parts()
@@ -276,7 +276,7 @@ class Scene:
         return labels
 
     def part_poses(self, frames: str | None = None) -> PartPoses:
-        """Returns the rigid motions of the parts since the first frame, fitted to their Gaussians (docs/exports.md).
+        """Returns the rigid motion of each part since the first frame, fitted to its Gaussians (docs/exports.md).
 
         Requires scipy, which the extra `server` installs.
 
@@ -315,11 +315,11 @@ class Scene:
         )
 
     def _within(self, frames: str | None) -> dict[int, float]:
-        """Returns the times of the opened frames in a range by index."""
+        """Returns the time of each opened frame in a range, keyed by frame index."""
         low, high = frame_range(frames)
         times = {index: time for index, time in self._times.items() if low <= index <= high}
         if not times:
-            raise InputError(f"frames {frames} are not there", f"frames {self.frames[0]} to {self.frames[-1]} are")
+            raise InputError(f"frames {frames} do not exist", f"give frames {self.frames[0]} to {self.frames[-1]}")
         return times
 
     def _rows(self, ids: ArrayLike | None, last: int) -> tuple[NDArray[np.intp], Int]:
@@ -333,5 +333,5 @@ class Scene:
         rows = order[places]
         missing = asked[state.ids[rows] != asked]
         if missing.size:
-            raise InputError(f"ids: there is no Gaussian {missing[0]} in frame {last}", "give ids of a state's `ids`")
+            raise InputError(f"ids: there is no Gaussian {missing[0]} in frame {last}", "give ids from a state's `ids`")
         return rows, state.ids[rows]

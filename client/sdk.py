@@ -1,7 +1,7 @@
-"""Typed SDK with a sync (`Client`) and an async (`AsyncClient`) client, which have the same methods.
+"""Typed SDK with a sync client (`Client`) and an async client (`AsyncClient`), which have the same methods.
 
-Each method has the arguments of the function with the same name in `client.calls`, and returns its parsed response.
-`client.retries` describes the retry policy, and `client.errors` the exceptions.
+Each method takes the arguments of the function with the same name in `client.calls` and returns the parsed response.
+The retry policy is described in `client.retries`, and the exceptions in `client.errors`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TIMEOUT_S = 130.0
 
 
 def _with_signature(method: Callable[..., R], build: Callable[..., Any]) -> Callable[..., R]:
-    """Sets the signature of a method to that of its call, for `help` and editors."""
+    """Gives a method the signature of the function that builds its call, for `help` and editors."""
     signature = inspect.signature(build)
     self = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
     method.__signature__ = signature.replace(  # type: ignore[attr-defined]
@@ -59,7 +59,7 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
 
 
 class _ClientBase:
-    """Common base of both clients, with address, token and timeouts."""
+    """Common base class of both clients, which stores the address, token and timeouts."""
 
     def __init__(
         self, url: str, token: str | None, busy_timeout: float, outage: float, on_retry: OnRetry | None
@@ -80,19 +80,21 @@ class _ClientBase:
 
 
 class Client(_ClientBase):
-    """Synchronous client of the service at `url`, to be closed or used as a context manager; it is thread-safe.
+    """Synchronous, thread-safe client for the service at `url`.
+
+    Close it after use, or use it as a context manager.
 
     Args:
         url: address of the service.
-        token: token, if the service requires one.
-        busy_timeout: seconds per call to wait for space in a full queue (429).
-        outage: seconds per call to wait for a service that does not answer.
-        on_retry: called with reason and delay before a call is retried.
+        token: access token, if the service requires one.
+        busy_timeout: maximum time in seconds that a call waits for space in a full queue (429).
+        outage: maximum time in seconds that a call waits for a service that does not respond.
+        on_retry: callback that receives the reason and delay before each retry.
         transport: httpx transport that replaces the network.
 
     Raises:
         ServiceError: the service refused a request; see `client.errors` for the subclasses.
-        ServiceUnreachable: the service did not answer.
+        ServiceUnreachable: the service did not respond.
 
     >>> with Client(url, busy_timeout=60) as client:
     ...     new = client.create_scene(rig)
@@ -202,7 +204,7 @@ class Client(_ClientBase):
         Args:
             id: id of the scene.
             index: index of the frame.
-            seconds: timeout.
+            seconds: timeout in seconds.
             every: polling interval in seconds.
 
         Raises:
@@ -227,7 +229,7 @@ class Client(_ClientBase):
         Args:
             id: id of the scene.
             index: index of the frame.
-            seconds: timeout.
+            seconds: timeout in seconds.
             every: polling interval in seconds.
 
         Raises:
@@ -242,7 +244,7 @@ class Client(_ClientBase):
 
 
 class AsyncClient(_ClientBase):
-    """Asynchronous client of the service at `url`, with the same arguments, methods and errors as `Client`.
+    """Asynchronous client for the service at `url`, with the same arguments, methods and errors as `Client`.
 
     >>> async def committed():
     ...     async with AsyncClient(url) as client:

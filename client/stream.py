@@ -1,4 +1,4 @@
-"""Live stream of a scene, sync (`Stream`) and async (`AsyncStream`); docs/stream.md describes the protocol.
+"""Sync (`Stream`) and async (`AsyncStream`) clients for a scene's live stream; docs/stream.md describes the protocol.
 
 ::
 
@@ -13,8 +13,8 @@
                     show(event.picture())
                     stream.update("live", camera=next_camera())
 
-After a lost connection, the client reconnects and renews all subscriptions, so that a stream survives a restart of the
-service. Trajectories are then sent again from their first frame. The iteration ends when the scene is deleted.
+If the connection is lost, the client reconnects and renews all subscriptions, so that a stream survives a restart of
+the service. Trajectories are then sent again from their first frame. Iteration ends when the scene is deleted.
 """
 
 from __future__ import annotations
@@ -72,20 +72,20 @@ CONNECTION_ERRORS = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
 
 
 class Stream:
-    """Stream of a scene as a context manager and an iterator over events.
+    """Live stream of a scene, used as a context manager and an iterator over events.
 
-    `subscribe`, `update` and `unsubscribe` may be called from a different thread than the iteration. The iteration can
-    be continued after a `ServiceError`.
+    `subscribe`, `update` and `unsubscribe` may be called from a different thread than the one that iterates. Iteration
+    can continue after a `ServiceError`.
 
     Args:
         url: address of the service, http or https.
         scene: id of the scene.
-        token: token, if the service requires one.
-        outage: seconds to wait for a service that does not answer.
+        token: access token, if the service requires one.
+        outage: maximum time in seconds to wait for a service that does not respond.
 
     Raises:
         ServiceError: the service refused a request; `NotFound` if the scene does not exist.
-        ServiceUnreachable: the service did not answer.
+        ServiceUnreachable: the service did not respond.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("live", view("c0"), tag=1)
@@ -182,7 +182,7 @@ class Stream:
 
 
 class AsyncStream:
-    """Stream of a scene for asyncio, as an async context manager and an async iterator over events.
+    """Live stream of a scene for asyncio, used as an async context manager and an async iterator over events.
 
     >>> async def newest():
     ...     async with AsyncStream(url, scene) as stream:

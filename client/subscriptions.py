@@ -42,24 +42,24 @@ OUTAGE_S = 20.0
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 UNREAD_MESSAGES = 2
-"""Maximum number of messages read ahead of the caller.
+"""Maximum number of messages to read ahead of the caller.
 
-It is small because the service replaces messages that it cannot send yet by newer ones.
+It is small because the service replaces messages that it cannot send yet with newer ones.
 """
 RETRIED_STATUSES = (429, 502, 503, 504)
 
 
 @dataclass(frozen=True)
 class BinaryEvent:
-    """Binary message of a subscription.
+    """Event from a binary message of a subscription.
 
     Attributes:
         id: id of the subscription.
-        tag: tag of the request that it answers.
-        missed: number of unsent messages that it replaces.
-        frame: index of the newest frame that it covers.
+        tag: tag of the request that caused the event.
+        missed: number of unsent messages that this one replaces.
+        frame: index of the newest frame that the event covers.
         media_type: media type of `body`.
-        headers: response headers of the equivalent HTTP request.
+        headers: response headers that the equivalent HTTP request would return.
         body: encoded content.
     """
 
@@ -72,7 +72,7 @@ class BinaryEvent:
     body: bytes
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Returns the arrays of an npz body by name; pickled data is refused."""
+        """Returns the arrays in an npz body, keyed by name; refuses pickled data."""
         with np.load(io.BytesIO(self.body), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
 
@@ -82,14 +82,14 @@ class ViewEvent(BinaryEvent):
     """Event with a rendered view."""
 
     def picture(self) -> NDArray[Any]:
-        """Returns the decoded image: [H, W, 3] uint8 for colour, else [H, W]."""
+        """Returns the decoded image: [H, W, 3] uint8 for colour, otherwise [H, W]."""
         with Image.open(io.BytesIO(self.body)) as picture:
             return np.array(picture)
 
 
 @dataclass(frozen=True)
 class TracksEvent(BinaryEvent):
-    """Event with trajectories over the frames `first` to `frame`, which continue the previous event."""
+    """Event with trajectories over the frames `first` to `frame`, continuing those of the previous event."""
 
     first: int
 
@@ -151,7 +151,7 @@ def view(
     background: tuple[float, float, float] | None = None,
     parts: int | None = None,
 ) -> SubscriptionRequest:
-    """Returns a subscription to a view of every new frame or of a fixed one; arguments as for `client.calls.render`.
+    """Returns a subscription to a view of every new frame or a fixed one; see `client.calls.render` for arguments.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("live", view(rig.cameras[0], format="png"))
@@ -176,7 +176,7 @@ def tracks(
     project: Sequence[Camera | str] = (),
     format: str = "json",
 ) -> SubscriptionRequest:
-    """Returns a subscription to trajectories, first over all frames, then over each new one.
+    """Returns a subscription to trajectories, first over all existing frames, then over each new frame.
 
     The arguments are those of `client.calls.tracks`, except that `first` replaces `frames`.
 
@@ -220,7 +220,7 @@ def event_of(head: BinaryHead, body: bytes) -> ViewEvent | TracksEvent | PartsEv
 
 
 class StreamSession:
-    """Session state of a stream: its subscriptions, the messages to send, and the decoding of received messages."""
+    """Session state of a stream, which stores subscriptions, builds messages to send and decodes received messages."""
 
     def __init__(self, url: str, scene: str, token: str | None, outage: float) -> None:
         self.scene = scene
@@ -260,7 +260,7 @@ class StreamSession:
         return Unsubscribe(id=id).model_dump_json()
 
     def read(self, data: str | bytes) -> Event | SceneGone | None:
-        """Returns the event of a received message, or None if it is irrelevant to the caller.
+        """Returns the event for a received message, or None if the message is irrelevant to the caller.
 
         Raises:
             ServiceError: the service refused a request.
@@ -302,4 +302,4 @@ def _problem(error: InvalidStatus) -> ProblemDetails:
         return ProblemDetails.model_validate_json(bytes(body))
     except ValueError:
         text = bytes(body)[:200].decode("utf-8", "replace")
-        return ProblemDetails(title="unexpected answer", status=error.response.status_code, detail=text or str(error))
+        return ProblemDetails(title="unexpected response", status=error.response.status_code, detail=text or str(error))

@@ -20,11 +20,11 @@ Float = NDArray[np.float64]
 CAMERA_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
 """Pattern of valid camera names. Names are used as file names, so path separators are not allowed."""
 ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R Rᵀ − I that is accepted as a rotation; calibration files round to 4–6 digits."""
+"""Largest absolute entry of R Rᵀ − I for which R counts as a rotation; calibration files round to 4–6 digits."""
 
 
 class CameraError(InputError):
-    """An invalid camera. The message gives the camera, the field, the value and the remedy."""
+    """Raised if a camera or rig is invalid; the message names the problem and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,8 @@ class Camera:
 
     Attributes:
         name: unique name of the camera within its rig.
-        intrinsics: [3, 3] float64 in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
-        world_to_camera: [4, 4] float64, OpenCV axes.
+        intrinsics: [3, 3] float64 intrinsic matrix ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, in pixels.
+        world_to_camera: [4, 4] float64 transform from world to camera coordinates, with OpenCV axes.
         width, height: image size in pixels.
 
     Raises:
@@ -64,7 +64,7 @@ class Camera:
             if value.shape != shape:
                 raise CameraError(f"camera {self.name!r}: {field} has shape {value.shape}", f"give {shape}")
             if not np.isfinite(value).all():
-                raise CameraError(f"camera {self.name!r}: {field} holds NaN or infinity", "give finite numbers")
+                raise CameraError(f"camera {self.name!r}: {field} contains NaN or infinity", "give finite numbers")
             value.setflags(write=False)
             object.__setattr__(self, field, value)
         with np.errstate(over="ignore", invalid="ignore"):  # values that overflow fail the checks below
@@ -79,20 +79,20 @@ class Camera:
             )
         if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
             raise CameraError(
-                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]", "undo skew first"
+                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]", "remove the skew first"
             )
         turns = np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE
         if turns and np.linalg.det(r) < 0:
             raise CameraError(
                 f"camera {self.name!r}: the rotation world_to_camera[:3,:3] has determinant -1: a left-handed frame",
                 "mirror one axis: if the world is left-handed, negate one of its axes for all cameras (that column of "
-                "every rotation) and in the points; if the camera's axes are, negate the wrong row of the rotation and "
-                "of the translation",
+                "every rotation) and in the points; if the camera axes are left-handed, negate the wrong row of the "
+                "rotation and of the translation",
             )
         if not turns:
             raise CameraError(
                 f"camera {self.name!r}: world_to_camera[:3,:3] is not a rotation (determinant {np.linalg.det(r):.4g})",
-                "give the rotation of world-to-camera with OpenCV axes",
+                "give the world-to-camera rotation with OpenCV axes",
             )
         if not np.allclose(self.world_to_camera[3], (0, 0, 0, 1)):
             raise CameraError(
@@ -174,10 +174,10 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class WorldFrame:
-    """The similarity from the user's world to the internal world: ``inside = (user − origin) · metres_per_unit``.
+    """Similarity transform from the user's world to the internal one: ``inside = (user − origin) · metres_per_unit``.
 
     Attributes:
-        origin: [3] float64, in the user's units.
+        origin: [3] float64 origin of the internal world, in the user's world and units.
         metres_per_unit: metres per user unit.
 
     >>> world = WorldFrame(origin=np.array([10.0, 0, 0]), metres_per_unit=0.01)  # the user's unit is 1 cm
@@ -208,18 +208,18 @@ class WorldFrame:
 
 
 AUTO_RIG_RADIUS_M = 3.0
-"""Rig radius in metres that ``metres_per_unit="auto"`` assumes, as for a room-sized stage."""
+"""Rig radius in metres that ``metres_per_unit="auto"`` assumes, typical of a room-sized stage."""
 ONE_PLACE = 1e-8
-"""Rig radius, in user units or metres, below which all cameras count as being at one place.
-"""
+"""Rig radius, in user units or metres, below which all cameras count as being at the same position."""
 
 LONG_LENS = 2.0
-"""Ratio of focal length to the longer image side above which a lens counts as long: 72 mm on 36 mm film."""
+"""Ratio of focal length to the longer image side above which a lens counts as long; equivalent to 72 mm on 36 mm film.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """An ordered set of cameras that observe the same scene; names are unique.
+    """Ordered set of cameras that observe the same scene and have unique names.
 
     >>> lens, pose = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside = pose.copy()
@@ -240,7 +240,7 @@ class Rig:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise CameraError(
-                f"camera names must be unique within a rig, given twice: {', '.join(twice)}", "rename all but one"
+                f"camera names must be unique within a rig, duplicates: {', '.join(twice)}", "rename all but one"
             )
 
     def __len__(self) -> int:
@@ -266,26 +266,26 @@ class Rig:
 
     @property
     def radius(self) -> float:
-        """1.1 x the largest distance of a camera centre from the mean centre: the scene radius of Dynamic3DGaussians.
+        """1.1 times the largest distance of a camera from the mean camera centre, as in Dynamic3DGaussians.
 
-        A single camera, or several at one place, cannot determine the scene size, and a radius of 0 would give learning
-        rates of 0. In this case the radius is ``AUTO_RIG_RADIUS_M`` in the unit of the cameras.
+        A single camera, or several at the same position, cannot determine the scene size, and a radius of 0 would give
+        learning rates of 0. In these cases, the radius is ``AUTO_RIG_RADIUS_M`` in the unit of the cameras.
         """
         return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread
 
     @property
     def reach(self) -> float:
-        """The radius, reduced if the median focal ratio exceeds ``LONG_LENS``: long lenses show only part of the scene.
+        """Rig radius, reduced if the median lens exceeds ``LONG_LENS``, because long lenses see only part of the scene.
 
-        Position learning rates scale with it. A step that moves a point by one pixel in a normal lens moves it by ten
-        pixels in a lens that is ten times as long.
+        Position learning rates are proportional to it. A step that moves a point by one pixel with a normal lens moves
+        it by ten pixels with a lens ten times as long.
         """
         lens = float(np.median([camera.intrinsics[0, 0] / max(camera.width, camera.height) for camera in self.cameras]))
         return self.radius * min(1.0, LONG_LENS / lens)
 
     @property
     def at_one_place(self) -> bool:
-        """True if the camera centres have no extent that could determine the scene scale."""
+        """Whether all camera centres coincide, so that they do not determine the scene scale."""
         return self._spread < ONE_PLACE
 
     @cached_property
@@ -293,24 +293,25 @@ class Rig:
         return float(1.1 * max(np.linalg.norm(camera.centre - self.centre) for camera in self.cameras))
 
     def world_frame(self, metres_per_unit: float | str = 1.0) -> WorldFrame:
-        """Returns the similarity to the internal world, which is centred on the rig.
+        """Returns the similarity transform to the internal world, which is centred on the rig.
 
         Args:
             metres_per_unit: metres per calibration unit, or "auto" to assume a rig radius of 3 m.
 
         Raises:
-            CameraError: the value is not positive, "auto" is used with all cameras at one place, or the poses overflow.
+            CameraError: the value is not positive, "auto" is used although all cameras are at the same position, or the
+                poses overflow.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             far = not np.isfinite(self._spread)
         if far:
-            raise CameraError("camera centres are too far from the origin", "give world_to_camera in other units")
+            raise CameraError("camera centres are too far from the origin", "give world_to_camera in larger units")
         if metres_per_unit == "auto":
             if self.at_one_place:
                 raise CameraError(
-                    f"metres_per_unit 'auto' depends on the distances between cameras, and {len(self)} camera(s) are "
+                    f"metres_per_unit 'auto' depends on the distances between cameras, but {len(self)} camera(s) are "
                     "at one place",
-                    f"give metres_per_unit as a number, such that what they see is about {AUTO_RIG_RADIUS_M:g} m away",
+                    f"give metres_per_unit as a number that places the subject about {AUTO_RIG_RADIUS_M:g} m away",
                 )
             metres = AUTO_RIG_RADIUS_M / self.radius
         else:
@@ -325,7 +326,7 @@ class Rig:
 
 
 def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
-    """Returns a rig of the cameras, transformed to the internal world.
+    """Returns a rig with the cameras transformed to the internal world.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> rig_inside(WorldFrame(np.array([0.0, 0, 2]), 0.1), [camera])["front"].centre
@@ -335,7 +336,7 @@ def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
 
 
 def farthest_first(centres: NDArray[np.floating], count: int) -> list[int]:
-    """Returns indices of ``count`` of the points [N, 3] by farthest-point sampling, starting with the first point.
+    """Returns the indices of ``count`` of the points [N, 3], selected by farthest-point sampling from the first point.
 
     >>> farthest_first(np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
     [0, 2]

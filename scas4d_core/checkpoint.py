@@ -1,11 +1,11 @@
-"""Checkpoints of the update state that is not part of Θ_{t−1}, and the commit from which a scene is resumed.
+"""Checkpoints of the update state beyond Θ_{t−1}, and selection of the commit from which a scene is resumed.
 
-After a crash, a scene continues with bit-identical results.
+A scene that is resumed after a crash gives bit-identical results.
 
 Each of the newest commits of a ``History`` has a file ``checkpoint_<index>.npz`` next to its frame. The file is
 written, synced and renamed *before* the frame itself is renamed, which is the commit. Every committed frame therefore
 has a checkpoint, and a checkpoint without a frame is ignored. The second newest checkpoint is kept in case the newest
-state or checkpoint is damaged. Constant data (exposures, presence of masks) is in the report of the first frame.
+state or checkpoint is damaged. Constant data (exposures, presence of masks) is stored in the report of the first frame.
 Clusters and neighbours are rebuilt from the first frame, and a digest shows whether they changed.
 """
 
@@ -36,25 +36,24 @@ from scas4d_core.update.warm_start import Motion
 
 
 class CheckpointError(ValueError):
-    """A missing or damaged checkpoint. The message gives the file and the fault."""
+    """Raised if a checkpoint is missing or damaged; the message names the file and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
 class CarryOver:
-    """The state, in addition to Θ, that one update passes to the next.
+    """State, in addition to Θ, that one update passes to the next.
 
     Attributes:
         motion: motion of the last update; None if the next update is a cold start.
-        labels: [N] true for Gaussians that have been seen to move, in scenes without masks; None before the first
-            motion.
-        seen: views of the last accepted frame in scenes without masks; the views of the next frame are compared with
-            them. Until the first motion is detected, they stay those of the first frame, so that slow motion
-            accumulates.
-        structure: digest of the clusters and neighbours that the motion belongs to.
-        past: usual values of the scene and its cameras.
-        shown: fingerprint of each image of the last accepted frame (``checks``).
-        switches: on/off states of the effects for the next update. effects: arrays that the effects carry over, by
-            effect.
+        labels: [N] bool, true for Gaussians that have moved at least once; None in scenes with masks, and before the
+            first motion.
+        seen: views of the last accepted frame, with which the next frame is compared, in scenes without masks. Until
+            the first motion is detected, the views of the first frame are kept, so that slow motion accumulates.
+        structure: digest of the clusters and neighbours for which ``motion`` is valid.
+        past: statistics of the scene and its cameras over the previous frames.
+        shown: fingerprint of each camera's image in the last accepted frame (``robust.checks``).
+        switches: on/off state of each effect for the next update.
+        effects: arrays that each effect carries over, keyed by effect name.
     """
 
     motion: Motion | None = None
@@ -77,8 +76,11 @@ class CarryOver:
         """Returns the carry-over for the next frame; the images of a rejected frame are not kept.
 
         Args:
-            result: of the current frame. past: usual values after the frame. time: of the frame, in seconds.
-            views: used by the update, or None in scenes with masks. shown: fingerprints of the frame's images.
+            result: update result of the current frame.
+            past: statistics that include the current frame.
+            time: time of the current frame in seconds.
+            views: views used by the update, or None in scenes with masks.
+            shown: fingerprint of each camera's image.
         """
         carried = replace(
             self,
@@ -88,8 +90,8 @@ class CarryOver:
         )
         if result.outcome.rejected:
             return carried
-        # A lighting change is not motion. Motion that is too small between two frames adds up if the reference views
-        # are kept.
+        # A lighting change is not motion. Motion too small to detect between two frames accumulates if the reference
+        # views are kept.
         resting = self.labels is None and result.outcome is FrameOutcome.UNCHANGED and bool(self.seen)
         if views is not None and result.exposure == 1.0 and not resting:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
@@ -142,7 +144,8 @@ class Checkpoints:
         """Reads the state that frame ``index`` passed to the next frame.
 
         Args:
-            factory: creates views from the stored images.
+            index: index of the frame.
+            factory: factory that creates views from the stored images.
 
         Raises:
             CheckpointError: the checkpoint is missing or damaged.
@@ -171,7 +174,7 @@ class Checkpoints:
         """Removes all checkpoints except those of the newest commits; call it after a commit.
 
         Args:
-            committed: indices of the committed frames, ascending.
+            committed: indices of the committed frames, in ascending order.
         """
         kept = set(committed[-NEWEST_KEPT:])
         for index in self.indices():
@@ -179,7 +182,7 @@ class Checkpoints:
                 self._file(index).unlink(missing_ok=True)
 
     def indices(self) -> list[int]:
-        """Returns the indices of frames that have a checkpoint, ascending."""
+        """Returns the indices of all frames that have a checkpoint, in ascending order."""
         listed = (checkpoint_of(file.name) for file in self.directory.iterdir())
         return sorted(index for index in listed if index is not None)
 
@@ -201,7 +204,7 @@ def _packed(motion: Motion) -> dict[str, Any]:
 
 
 def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
-    """Returns the effects' arrays in a checkpoint, by effect and array name."""
+    """Returns the arrays of the effects in a checkpoint, keyed by effect and array name."""
     effects: dict[str, Arrays] = {}
     for key, array in arrays.items():
         kind, _, rest = key.partition(".")
@@ -227,6 +230,8 @@ def cold_start(history: History, index: int, masked: bool) -> CarryOver:
     """Returns the carry-over that can be rebuilt from a committed frame: learnt labels, switches and effect arrays.
 
     Args:
+        history: history of the scene.
+        index: index of the committed frame.
         masked: whether the scene has masks.
 
     Raises:
@@ -243,7 +248,7 @@ def cold_start(history: History, index: int, masked: bool) -> CarryOver:
 
 
 class ResumeError(ValueError):
-    """A history from which no scene can be resumed. The message describes the damage."""
+    """Raised if no scene can be resumed from a history; the message describes the damage."""
 
 
 @dataclass(frozen=True)
@@ -251,11 +256,11 @@ class ResumePoint:
     """The commit from which a scene was resumed.
 
     Attributes:
-        index: index of the commit.
-        undone: indices of later committed frames that were rolled back; each must be sent again or is lost.
+        index: frame index of the commit.
+        undone: indices of later committed frames that were rolled back; they are lost unless they are sent again.
         faults: one sentence per file that could not be used; empty after a normal shutdown.
-        cold: true if the state is intact but its checkpoint is not. The next update then starts without motion, and the
-            results are no longer bit-identical to those of an undisturbed scene.
+        cold: whether the state is intact but its checkpoint is not. The next update then starts without motion, and the
+            results are no longer bit-identical to those of an uninterrupted scene.
     """
 
     index: int
@@ -270,11 +275,13 @@ def find_commit(
     """Finds the commit to resume from.
 
     Args:
-        history, checkpoints: of the scene. factory: creates its views.
-        held: returns true for a committed frame whose images can be sent again.
+        history: history of the scene.
+        checkpoints: checkpoints of the scene.
+        factory: factory that creates views from stored images.
+        held: returns whether the images of a committed frame can be sent again.
 
     Returns:
-        The index of the commit, its carry-over (None for a cold start), and a description of each damage found.
+        The index of the commit, its carry-over (None for a cold start), and one sentence per fault that was found.
 
     Raises:
         ResumeError: no state can be read.

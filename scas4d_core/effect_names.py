@@ -1,7 +1,7 @@
-"""Names and modules of all effects, and the modes that settings can give them.
+"""Names and modules of all effects, and the modes that settings can assign to them.
 
-To add an effect, add a file in ``effects/`` and an entry here. This module imports no effect: settings validate names
-with it, and ``effects.effect.effect`` imports an effect's module on first use.
+To add an effect, add a file in ``effects/`` and an entry here. This module imports no effects, because settings use it
+to validate names; ``effects.effect.effect`` imports the module of an effect on first use.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 Mode = Literal["auto", "on", "off"]
-""""auto" decides from the evidence in the images; "on" and "off" are fixed."""
+"""With "auto", evidence in the images decides; "on" and "off" are fixed."""
 
 EFFECTS = {
     "cluster_rotation": "scas4d_core.effects.motion.cluster_rotation",

@@ -1,4 +1,4 @@
-"""Errors with a fault and a remedy, and error messages without local paths. Standard library only."""
+"""Errors that state a fault and a remedy, and error messages without local paths. Standard library only."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ slash.
 
 
 class InputError(ValueError):
-    """An unusable input. The message is "fault; remedy".
+    """Raised for unusable input; the message is "fault; remedy".
 
     Attributes:
-        fault: what is wrong, including the value. remedy: what to give instead, or "".
+        fault: description of the problem, including the value.
+        remedy: what to provide instead; may be empty.
     """
 
     def __init__(self, fault: str, remedy: str = "") -> None:
@@ -24,7 +25,7 @@ class InputError(ValueError):
 
 
 def without_paths(text: str) -> str:
-    """Shortens each absolute path on this machine to its last component; ``/v1/scenes`` is unchanged.
+    """Shortens each absolute path on this machine to its last component; URL paths such as ``/v1/scenes`` are kept.
 
     >>> without_paths("cannot read /usr/share/scenes/a.npz of /v1/scenes/a")
     'cannot read a.npz of /v1/scenes/a'
@@ -33,7 +34,7 @@ def without_paths(text: str) -> str:
 
 
 def message_of(error: BaseException) -> str:
-    """Returns an error's message without paths; an ``OSError`` gives only the system's text.
+    """Returns an error's message without paths; for an ``OSError``, only the system's error text.
 
     >>> message_of(OSError(28, "No space left on device", "/usr/share/a.npz"))
     'No space left on device'
@@ -54,4 +55,4 @@ def _last_part(found: re.Match[str]) -> str:
 
 
 class StepError(ValueError):
-    """A frame that cannot be processed; the state is unchanged."""
+    """Raised if a frame cannot be processed; the state is unchanged."""

@@ -1,4 +1,4 @@
-"""The data of one frame during ``Reconstruction.step``; each stage adds its results."""
+"""Data of one frame while ``Reconstruction.step`` processes it; each stage adds its results."""
 
 from __future__ import annotations
 
@@ -17,15 +17,18 @@ from scas4d_core.update.result import Stopwatch, UpdateResult
 
 @dataclass(frozen=True, eq=False)
 class FrameInput:
-    """The measurements taken from a frame's images before its update.
+    """Measurements taken from the images of a frame before its update.
 
     Attributes:
-        seconds: since the last committed frame. views: views of all cameras that have an image.
-        bright: mean brightness of each camera's image, 0…1. fingerprints: fingerprints of each camera's image.
-        exposure: brightness of the frame relative to the usual brightness. left_out: excluded cameras, with the reason.
-            unusable: why the frame cannot be used, or None (``robust.checks.check_brightness``).
-        light_changes: whether the lighting changes from frame to frame.
-        past: usual values of the scene, including this frame's brightness.
+        seconds: time since the last committed frame, in seconds.
+        views: views of all cameras that have an image.
+        bright: mean brightness of each camera's image, 0…1.
+        fingerprints: fingerprint of each camera's image.
+        exposure: brightness of the frame relative to the usual brightness.
+        left_out: excluded cameras, with the reason.
+        unusable: reason why the frame cannot be used, or None (``robust.checks.check_brightness``).
+        light_changes: whether the lighting keeps changing from frame to frame.
+        past: statistics of the scene, including the brightness of this frame.
     """
 
     seconds: float
@@ -40,25 +43,31 @@ class FrameInput:
 
     @property
     def believed(self) -> list[TrainingView]:
-        """The views that the update learns from."""
+        """Views that the update learns from."""
         return [view for view in self.views if view.name not in self.left_out]
 
     @property
     def steady(self) -> bool:
-        """True if image differences from the previous frame are due to motion and not to lighting."""
+        """Whether image differences from the previous frame are due to motion rather than lighting."""
         return self.unusable is None and self.exposure == 1.0
 
 
 @dataclass(eq=False)
 class FrameContext:
-    """A frame during processing; each stage of ``Reconstruction.step`` fills in its fields.
+    """Frame being processed; each stage of ``Reconstruction.step`` fills in its fields.
 
     Attributes:
-        frame: with decoded images. watch: times the stages. dropped: cameras excluded by the caller, with the reason.
-            notes: additional data to commit, as JSON.
-        frame_input: set by the "observe" stage. prepared, update_input: the updater and its input, set by "prepare".
-        result, past: of the update, set by "solve". check_seconds: time of the checks outside the update, in seconds.
-        birth_fit_time: time for fitting added Gaussians, spent by "populate".
+        frame: the frame, with decoded images.
+        watch: stopwatch for the stages.
+        dropped: cameras excluded by the caller, with the reason.
+        notes: additional JSON data to commit.
+        frame_input: measurements of the images, set by the "observe" stage.
+        prepared: updater and carry-over, set by the "prepare" stage.
+        update_input: input of the updater, set by the "prepare" stage.
+        result: result of the update, set by the "solve" stage.
+        past: statistics after the update, set by the "solve" stage.
+        check_seconds: duration of the checks outside the update, in seconds.
+        birth_fit_time: time for fitting added Gaussians, used by the "populate" stage.
     """
 
     frame: Frame

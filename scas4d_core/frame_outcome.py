@@ -1,4 +1,4 @@
-"""Frame outcomes and alarms as enums, and their texts for people; imports are light enough for every process."""
+"""Frame outcomes, alarms and their user-facing messages; cheap to import in every process."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from enum import StrEnum
 from typing import Any, TypedDict
 
 REJECTED_TEXT = "previous state kept: "
-"""Prefix of the text for a frame that keeps the previous state."""
+"""Prefix of the message for a frame that keeps the previous state."""
 
 
 OTHER_ORDERS = "other orders"
-"""Report stage: time that a first update spent on view orders that were discarded."""
+"""Name of the report stage for the time that a first update spends on discarded view orders."""
 
 
 class Candidate(StrEnum):
-    """A candidate for Θ_t; the one with the smallest error on the probe views is kept. Values are stored on disk."""
+    """Candidate for Θ_t; the one with the smallest error on the probe views is kept. Values are stored on disk."""
 
     END = "end"
     """The state at the end of the update."""
     PREVIOUS = "previous"
     """Θ_{t−1}, unchanged."""
     WARM = "warm"
-    """Θ_{t−1} moved by the warm start only."""
+    """Θ_{t−1}, moved only by the warm start."""
 
 
 class FrameOutcome(StrEnum):
-    """The outcome of a frame.
+    """Outcome of a frame.
 
     >>> FrameOutcome.REJECTED_MISFIT.rejected, FrameOutcome.RELOCATED.degraded, FrameOutcome.UNCHANGED.learnt
     (True, True, False)
@@ -38,9 +38,7 @@ class FrameOutcome(StrEnum):
     UNCHANGED = "unchanged"
     """Θ_{t−1} already matches the frame; no iteration was needed and nothing was learnt."""
     RETRIED = "retried"
-    """Committed by a later attempt, with smaller steps or rigid layers, because the first attempts gave no plausible
-    state.
-    """
+    """Committed by a later attempt with smaller steps or rigid layers, because earlier ones gave no plausible state."""
     RELOCATED = "relocated"
     """Committed after a longer search, because the regular update did not match the frame."""
     ACCEPTED = "accepted"
@@ -74,11 +72,11 @@ class AlarmKind(StrEnum):
     CAMERA_LEFT_OUT = "camera_left_out"
     """Nothing was learnt from the camera: its image is missing or was excluded."""
     CAMERA_MISFIT = "camera_misfit"
-    """The camera's image fits worse than usual, compared with the other cameras: moved, dirty or late."""
+    """The camera's image fits worse than usual compared with the other cameras: it may have moved, be dirty or lag."""
     CAMERA_COLOURS = "camera_colours"
-    """The camera's colours differ from its own past and from the other cameras: exposure or white balance."""
+    """The camera's colours deviate from its earlier images and from the other cameras: exposure or white balance."""
     CAMERA_SHARPNESS = "camera_sharpness"
-    """The camera's image is blurrier or noisier than its own past and the other cameras."""
+    """The camera's image is blurrier or noisier than its earlier images and those of the other cameras."""
     CAMERA_FROZEN = "camera_frozen"
     """The camera repeats a bit-identical image while the other cameras change."""
     LIGHT = "light"
@@ -86,17 +84,19 @@ class AlarmKind(StrEnum):
     FRAME_REPEATED = "frame_repeated"
     """All cameras repeat bit-identical images."""
     FRAME_IN_PART = "frame_in_part"
-    """The frame was committed in part, or after a longer search."""
+    """The frame was committed only partially, or after a longer search."""
     FRAME_REJECTED = "frame_rejected"
     """The frame was rejected, and the previous state is kept."""
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """A condition that needs a person's attention; an entry of a frame's report.
+    """Condition that needs a person's attention; an entry of a frame report.
 
     Attributes:
-        kind: subject of the alarm. camera: affected camera, or None. evidence: text for people, with figures.
+        kind: subject of the alarm.
+        camera: affected camera, or None.
+        evidence: user-facing explanation with figures.
     """
 
     kind: AlarmKind
@@ -105,11 +105,11 @@ class Alarm:
 
 
 class CameraTiming(TypedDict):
-    """The estimated capture time of a camera relative to the others; a row of the report on disk.
+    """Estimated capture time of a camera relative to the others; an entry of the report on disk.
 
     Keys:
-        frames: delay in frames after (+) or before (−) the median of the cameras, which is 0. error: its standard
-            error.
+        frames: delay relative to the median of all cameras, in frames; negative if the camera is early.
+        error: standard error of the delay, in frames.
         out_of_step: whether the camera is clearly out of step.
     """
 
@@ -119,7 +119,7 @@ class CameraTiming(TypedDict):
 
 
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
-    """Returns the report's sentence for people; None if the frame is not degraded.
+    """Returns the user-facing explanation of a degraded outcome; None if the outcome is not degraded.
 
     >>> degraded_text(FrameOutcome.REJECTED_MISFIT, "the pictures are met at 12.0 dB")
     'previous state kept: the pictures are met at 12.0 dB'
@@ -130,13 +130,13 @@ def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
 
 
 COVERS_LITTLE = 0.25
-"""Minimum share of the images that the initial points confirmed by several cameras cover. Below it, frame 0 is partly a
+"""Minimum fraction of the images covered by initial points that several cameras confirm. Below it, frame 0 is partly a
 guess; above it, no other methods are needed (``first_frame.initial_points``).
 """
 
 
 def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
-    """Returns sentences on how uncertain frame 0 is because of its initial points; empty if it is certain.
+    """Returns warnings if the initial points of frame 0 are unreliable; otherwise empty.
 
     Args:
         cloud: record of a ``FirstCloud``; None for any frame but the first.
@@ -144,48 +144,48 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
     >>> cloud_warnings({"method": "agreement + pairs", "points": 900, "coverage": 0.12})[0][:75]
-    'frame 0 is in part a guess: the points on which cameras agree cover 12 % of'
+    'frame 0 is partly a guess: the points on which cameras agree cover 12 % of '
     """
     if cloud is None or cloud.get("coverage") is None:
         return []
     remedy = (
-        "if its views are poor, begin the reconstruction again with points, masks, more cameras that look at the same "
-        "place, or a plain backdrop"
+        "if its renders are poor, restart the reconstruction with points, masks, more cameras that see the same area, "
+        "or a plain backdrop"
     )
     if cloud["coverage"] == 0:
-        return [f"frame 0 is a guess: no two cameras agree on any of its first points; {remedy}"]
+        return [f"frame 0 is a guess: no two cameras agree on any of its initial points; {remedy}"]
     if cloud["coverage"] < COVERS_LITTLE:
-        share = f"cover {100 * cloud['coverage']:.0f} % of the pictures"
-        return [f"frame 0 is in part a guess: the points on which cameras agree {share}; {remedy}"]
+        share = f"cover {100 * cloud['coverage']:.0f} % of the images"
+        return [f"frame 0 is partly a guess: the points on which cameras agree {share}; {remedy}"]
     return []
 
 
 def time_warnings(shortened: Sequence[str]) -> list[str]:
-    """Returns a sentence on the steps that frame 0 had no time for; empty if the time was sufficient.
+    """Returns a warning about steps of frame 0 that were cut for lack of time; empty if the time was sufficient.
 
     >>> time_warnings(["no stereo", "1500 of 3000 iterations"])[0][:75]
-    'frame 0 had too little time: no stereo; 1500 of 3000 iterations; if its vie'
+    'frame 0 had too little time: no stereo; 1500 of 3000 iterations; if its ren'
     """
     if not shortened:
         return []
-    remedy = "if its views are poor, begin the reconstruction again with more static.seconds, or with points"
+    remedy = "if its renders are poor, restart the reconstruction with a larger static.seconds, or with points"
     return [f"frame 0 had too little time: {'; '.join(shortened)}; {remedy}"]
 
 
 def grey_warnings(grey: Sequence[str]) -> list[str]:
-    """Returns a sentence on grayscale cameras mixed with colour cameras; empty if there are none.
+    """Returns a warning about grayscale cameras mixed with colour cameras; empty if there are none.
 
     Args:
         grey: names of the grayscale cameras.
 
     >>> grey_warnings(["left"])[0][:41]
-    'grey cameras beside colour ones: left; th'
+    'grayscale cameras among colour ones: left'
     """
     if not grey:
         return []
     return [
-        f"grey cameras beside colour ones: {', '.join(grey)}; their grey stands for all three channels, which dulls "
-        "colours; hold them out (--test, or leave their pictures out) where the others are enough"
+        f"grayscale cameras among colour ones: {', '.join(grey)}; their grey values are used for all three channels, "
+        "which dulls colours; if the other cameras suffice, hold them out (--test, or leave out their images)"
     ]
 
 
@@ -193,7 +193,7 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
     """Returns the warnings in the report of the first frame, one sentence each.
 
     Args:
-        record: the report as JSON, or its ``cloud``, ``calibration``, ``shortened`` and ``grey`` alone.
+        record: report as JSON, or only its entries ``cloud``, ``calibration``, ``shortened`` and ``grey``.
 
     >>> first_warnings({"calibration": {"warnings": ["camera 'a' is off"]}})
     ["camera 'a' is off"]
@@ -207,13 +207,13 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
 
 
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
-    """Returns a sentence on the cameras that are clearly out of step; empty if there are none.
+    """Returns a warning about cameras that are clearly out of step; empty if there are none.
 
-    This is a lasting fault of the rig, not news of a frame. The scene status shows it in constant words while it lasts;
-    the figures, which change from frame to frame, are in the report.
+    This is a lasting fault of the rig rather than of one frame. The scene status shows a constant message while the
+    fault lasts; the report has the figures, which change from frame to frame.
 
     Args:
-        timing: timing of the newest report; None if it has none.
+        timing: ``timing`` entry of the newest report; None if it has none.
 
     >>> in_step = {"frames": 0.02, "error": 0.03, "out_of_step": False}
     >>> late = {"frames": 0.41, "error": 0.03, "out_of_step": True}

@@ -1,4 +1,4 @@
-"""Report of frame 0 or of an update; it is committed together with the state."""
+"""Report of frame 0 or of an update, committed together with the state."""
 
 from __future__ import annotations
 
@@ -34,17 +34,18 @@ from scas4d_core.update.result import CameraFit, Stopwatch, UpdateResult
 REPORTED_ITERATIONS = 24
 """Number of final iterations over which the report averages PSNR: about one pass over the rig's cameras."""
 REPORTED_LOSSES = 100
-"""Maximum number of averaged losses that the report keeps from the thousands of frame 0."""
+"""Maximum number of losses in the report; the thousands of losses of frame 0 are averaged in groups."""
 CHECKPOINTS = 10
-"""Maximum number of points on an update's curve."""
+"""Maximum number of points on the loss curve of an update."""
 
 
 class CurvePoint(TypedDict):
-    """A point on an update's loss curve, as stored on disk.
+    """Point on the loss curve of an update, as stored on disk.
 
     Keys:
-        iterations: completed so far. milliseconds: since the update began, without decoding. loss: mean training loss
-            since the previous point.
+        iterations: number of completed iterations.
+        milliseconds: time since the start of the update, without decoding, in milliseconds.
+        loss: mean training loss since the previous point.
     """
 
     iterations: int
@@ -57,36 +58,42 @@ class FrameReport:
     """Report of frame 0 or of the update of a frame.
 
     Attributes:
-        outcome: outcome of the frame.
-        seconds: by stage; ``report`` is the time for this report and for writing the previous one.
+        index: index of the frame.
+        time: time of the frame in seconds.
+        iterations: number of iterations.
+        seconds: duration of each stage in seconds; ``report`` covers this report and the writing of the previous one.
         loss: weighted loss of each iteration; for frame 0, at most ``REPORTED_LOSSES`` means.
-        psnr: dB, mean over the training views of the last iterations, as rendered at the time; NaN if not measured.
-        moving, gaussians: numbers of moving and of present Gaussians. born, retired, revived: numbers of such Gaussians
-            in this frame.
-        postponed: work that did not fit the time budget, in words; the next frame has time for some of it.
-        alarms: conditions that need attention (``robust/alarms.py``).
-        timing: by camera, estimated delay in frames relative to the others, from all frames so far. Only cameras whose
-            delay the motion determines well are included (``robust/timing.py``).
-        cloud: frame 0 only: origin of the initial points. calibration: frame 0 only: check of the calibration against
-            the images.
-        cameras: by name, how well each camera's image was matched when last rendered; reveals a bumped camera.
-        used: cameras that were learnt from; empty for a rejected or skipped frame. dropped: excluded cameras, with the
-            reason.
-        degraded: explanation for people if the outcome is degraded; None if it is not.
-        attempts: each attempt at the frame, with its result.
+        psnr: mean PSNR in dB over the views of the last iterations, as rendered at the time; NaN if not measured.
+        moving: number of moving Gaussians.
+        gaussians: number of present Gaussians.
+        cameras: how well each camera's image was matched when last rendered; reveals a bumped camera.
+        used: cameras from which the update learnt; empty for a rejected or skipped frame.
+        dropped: excluded cameras, with the reason.
+        outcome: outcome of the frame.
+        degraded: user-facing explanation of a degraded outcome; None if the outcome is not degraded.
+        attempts: description and result of each attempt at the frame.
         exposure: brightness of the frame relative to the lighting in which the colours were learnt. For a frame that
-            was not tried, it is estimated from the mean image brightness. A lasting light change is learnt into the
+            was not attempted, it is estimated from the mean image brightness. A lasting light change is learnt into the
             colours.
-        frozen: number of single Gaussians that keep their previous state. guards: number of times each guard acted, by
-            name.
-        planned: (iteration, total iterations) for each change of plan by the stopping rule or the time limit of frame
-            0.
-        shortened: frame 0 only: steps for which ``StaticSettings.seconds`` was too short, in words; small reductions of
-            the iterations appear only in ``planned``. grey: frame 0 only: grayscale cameras in a rig with colour
-            cameras.
-        curve: curve of the last attempt.
-        errors: mean image loss on the probe views by candidate, on images without the gain of ``exposure``.
-        candidate: the candidate that became the state; "previous" if the frame was rejected.
+        frozen: number of individual Gaussians that keep their previous state.
+        guards: number of times each guard acted.
+        planned: (iteration, total iterations) each time the stopping rule or the time limit of frame 0 changes the
+            total.
+        curve: loss curve of the last attempt.
+        errors: mean image loss of each candidate on the probe views, for images without the ``exposure`` gain.
+        candidate: candidate that became the state; "previous" if the frame was rejected.
+        born: number of Gaussians added in this frame.
+        retired: number of Gaussians retired in this frame.
+        revived: number of Gaussians revived in this frame.
+        postponed: descriptions of work that exceeded the time budget; the next frame has time for some of it.
+        alarms: conditions that need attention (``robust/alarms.py``).
+        timing: estimated delay of each camera relative to the others, from all frames so far. Includes only cameras
+            whose delay is well determined by motion (``robust/timing.py``).
+        cloud: origin of the initial points; frame 0 only.
+        shortened: descriptions of steps for which ``StaticSettings.seconds`` was too short; frame 0 only. Small
+            reductions of the iterations appear only in ``planned``.
+        calibration: comparison of the calibration with the images; frame 0 only.
+        grey: grayscale cameras in a rig that also has colour cameras; frame 0 only.
     """
 
     index: int
@@ -123,7 +130,7 @@ class FrameReport:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences on likely faults and on steps that had no time (``first_warnings``, ``timing_warnings``)."""
+        """Warnings about likely faults and steps cut for lack of time (``first_warnings``, ``timing_warnings``)."""
         named = {"cloud": self.cloud, "calibration": self.calibration}
         given = {name: asdict(value) for name, value in named.items() if value is not None}
         first = first_warnings({**given, "shortened": self.shortened, "grey": self.grey})
@@ -158,8 +165,13 @@ def report_of_first(
     """Returns the report of frame 0.
 
     Args:
-        names: names of the rig's cameras. moving: number of Gaussians in the hierarchy. seconds: by stage.
-        dropped: cameras excluded by the caller, with the reason. calibration: check of the calibration, if measured.
+        frame: the first frame.
+        result: fit of the first frame.
+        names: names of the rig's cameras.
+        moving: number of Gaussians in the hierarchy.
+        seconds: duration of each stage in seconds.
+        dropped: cameras excluded by the caller, with the reason.
+        calibration: comparison of the calibration with the images; None if not measured.
     """
     return FrameReport(
         index=frame.index,
@@ -195,10 +207,14 @@ def report_of_update(
     """Returns the report of an update.
 
     Args:
-        result: that is committed. before: the previously committed state.
+        frame: the updated frame.
+        result: update result to be committed.
+        before: previously committed state.
         left_out: cameras excluded by the first checks, with the reason.
-        names: names of the rig's cameras. watch: has the stages "decode", "judge", "update" and optionally "presence".
-        dropped: cameras excluded by the caller, with the reason. postponed: see ``FrameReport``.
+        names: names of the rig's cameras.
+        watch: stopwatch with the stages "decode", "judge", "update" and optionally "presence".
+        dropped: cameras excluded by the caller, with the reason.
+        postponed: descriptions of work that exceeded the time budget.
     """
     trace, gaussians = result.trace, result.gaussians
     began = perf_counter()
@@ -251,12 +267,12 @@ def _last(psnr: Sequence[float]) -> float:
 
 
 def means(values: list[float], most: int) -> list[float]:
-    """Returns at most ``most`` means of consecutive values."""
+    """Splits the values into at most ``most`` consecutive groups and returns their means."""
     return [float(np.mean(part)) for part in np.array_split(values, max(1, min(len(values), most))) if len(part)]
 
 
 def curve(losses: list[float], moments: list[float]) -> list[CurvePoint]:
-    """Returns the curve of an update from each iteration's loss and end time in seconds."""
+    """Returns the loss curve of an update, given the loss and the end time in seconds of each iteration."""
     ends = np.unique(np.linspace(0, len(moments), CHECKPOINTS + 1).round().astype(int))
     return [
         CurvePoint(iterations=int(end), milliseconds=1000 * moments[end - 1], loss=float(np.mean(losses[begin:end])))

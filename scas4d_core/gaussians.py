@@ -15,34 +15,36 @@ Array = NDArray[np.float32]
 WHOLE: Mapping[str, Any] = MappingProxyType({"whole": True})
 """Metadata of a ``Gaussians`` field without a row per Gaussian; the field may be None."""
 ONCE: Mapping[str, Any] = MappingProxyType({"once": True})
-"""Metadata of a field whose values are fixed from the frame in which a Gaussian is added."""
+"""Metadata of a field whose values do not change after a Gaussian is added."""
 UNBORN = -1
-"""Id of a Gaussian that is not committed yet."""
+"""Id of a Gaussian that has not been committed yet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians at one time. Row order is identity: row i is the same piece of matter in every frame.
+    """N Gaussians at one point in time. Rows identify Gaussians: row i is the same piece of matter in every frame.
 
     New Gaussians are appended (``concatenate``). A Gaussian that leaves the scene is retired but keeps its row, so it
     can return with the same identity. A retired Gaussian is not rendered, does not move and does not count as moving.
 
     Attributes:
-        means: [N, 3] float32, metres in the internal world.
-        factors: [N, 3, 3] float32; Σ = F Fᵀ; the columns are the transported axes in metres.
-        rotations: [N, 4] float32 unit quaternions (w, x, y, z): material rotation since frame 0, or since the Gaussian
-            was added.
-        opacities: [N] float32 in (0, 1), fixed after the Gaussian's first frame; as rendered, so 0 for retired
-            Gaussians.
-        colours: [N, 3] float32 RGB, nominally 0…1.
-        foreground: [N] float32 in 0…1: the learnt label; the Gaussian moves if it is above 0.5.
-        ids: [N] int64, permanent; −1 until the first frame of the Gaussian is committed.
-        retired: [N] bool; defaults to all false.
-        own_opacities: [N] float32 in (0, 1), without the zeros of retired Gaussians; derived from ``opacities``.
-        gloss: [M, 3] float32, for the first M Gaussians: world-space normal times the strength of the reflection;
-            Gaussians added later have none. environment: float32, the reflected surroundings
-            (``kernels.appearance.direction``). Both are None if colours do not depend on the viewing direction;
-            otherwise ``colours`` exclude the gloss.
+        means: [N, 3] float32 centres in metres, in the internal world.
+        factors: [N, 3, 3] float32 factors F of the covariances Σ = F Fᵀ; the columns are the transported axes in
+            metres.
+        rotations: [N, 4] float32 unit quaternions (w, x, y, z) of the material rotation since frame 0, or since the
+            Gaussian was added.
+        opacities: [N] float32 opacities as rendered: 0 for retired Gaussians, otherwise in (0, 1). Fixed after a
+            Gaussian's first frame.
+        colours: [N, 3] float32 RGB colours, nominally 0…1; exclude the gloss if there is any.
+        foreground: [N] float32 learnt labels in 0…1; a Gaussian moves if its label is above 0.5.
+        ids: [N] int64 permanent ids; −1 until a Gaussian's first frame is committed.
+        retired: [N] bool, true for retired Gaussians; defaults to all false.
+        own_opacities: [N] float32 opacities in (0, 1), without the zeros of retired Gaussians; derived from
+            ``opacities``.
+        gloss: [M, 3] float32 world-space normals of the first M Gaussians, scaled by reflection strength; Gaussians
+            added later have no gloss. None if colours do not depend on the viewing direction.
+        environment: [ROWS, 3] float32 reflected environment (``kernels.appearance.direction``). None if colours do not
+            depend on the viewing direction.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [0.5, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> len(state), state.moving
@@ -80,9 +82,9 @@ class Gaussians:
         """Returns isotropic moving Gaussians, one per point, for hand-made scenes.
 
         Args:
-            points: [N, 3] metres in the internal world.
+            points: [N, 3] centres in metres, in the internal world.
             radius: standard deviation along each axis, in metres.
-            colours: [N, 3] RGB in 0…1, or one colour for all.
+            colours: [N, 3] RGB colours in 0…1, or one colour for all points.
         """
         means = np.array(points, np.float32).reshape(-1, 3)
         count = len(means)
@@ -116,12 +118,12 @@ class Gaussians:
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """[N] bool: true for Gaussians that are not retired."""
+        """[N] bool, true for Gaussians that are not retired."""
         return ~self.retired
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[N] bool: true for moving Gaussians, according to their labels; false for retired ones."""
+        """[N] bool, true for Gaussians whose label is above 0.5; false for retired ones."""
         moving: NDArray[np.bool_] = (self.foreground > 0.5) & ~self.retired
         return moving
 
@@ -129,7 +131,7 @@ class Gaussians:
         """Returns the Gaussians of the selected rows, with their ids.
 
         Args:
-            which: [N] bool, or row indices in any order.
+            which: [N] bool mask, or row indices in any order.
         """
         chosen = np.asarray(which)
         gloss = self.gloss
@@ -143,11 +145,11 @@ class Gaussians:
         return replace(self, **{name: np.concatenate([own, others[name]]) for name, own in self._by_row().items()})
 
     def retire(self, rows: ArrayLike) -> Gaussians:
-        """Returns the state with the given rows ([N] bool, or indices) retired."""
+        """Returns the state with the given rows ([N] bool mask, or indices) retired."""
         return self._with_retired(rows, True)
 
     def revive(self, rows: ArrayLike) -> Gaussians:
-        """Returns the state with the given retired rows ([N] bool, or indices) restored unchanged."""
+        """Returns the state with the given retired rows ([N] bool mask, or indices) restored unchanged."""
         return self._with_retired(rows, False)
 
     def _with_retired(self, rows: ArrayLike, value: bool) -> Gaussians:
@@ -156,11 +158,11 @@ class Gaussians:
         return self.replace(retired=retired)
 
     def _by_row(self) -> dict[str, NDArray[Any]]:
-        """Returns the arrays with a row per Gaussian, named as in the constructor."""
+        """Returns the arrays with one row per Gaussian, keyed by field name."""
         return {item.name: getattr(self, item.name) for item in fields(self) if not item.metadata.get("whole")}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Returns the arrays by constructor name, for files and messages.
+        """Returns the arrays for files and messages, keyed by field name.
 
         ``opacities`` are the unmasked ``own_opacities``. ``retired`` is omitted if no Gaussian is retired, and so are
         fields that are None.
@@ -173,13 +175,13 @@ class Gaussians:
 
 
 FIXED = tuple(item.name for item in fields(Gaussians) if item.metadata.get("once"))
-"""Arrays whose values are fixed from the first frame of a Gaussian."""
+"""Names of the arrays whose values do not change after a Gaussian's first frame."""
 WHOLES = tuple(item.name for item in fields(Gaussians) if item.metadata.get("whole"))
-"""Arrays without a row per Gaussian, which may be None."""
+"""Names of the arrays without a row per Gaussian, which may be None."""
 PER_FRAME = tuple(
     item.name for item in fields(Gaussians) if item.name not in (*FIXED, *WHOLES, "retired", "own_opacities")
 )
-"""Arrays with a row per Gaussian that can change from frame to frame."""
+"""Names of the arrays with one row per Gaussian that can change from frame to frame."""
 
 
 def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
@@ -194,7 +196,7 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
 
 
 def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
-    """Converts unit quaternions by component, [4, ...], to rotation matrices as three rows of three arrays [...]."""
+    """Converts unit quaternions [4, ...], one array per component, to rotation matrices: 3 rows of 3 arrays [...]."""
     w, x, y, z = quaternion
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -204,12 +206,12 @@ def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
 
 
 def quaternion_products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Returns the quaternion products a∘b, [M, 4] (w, x, y, z): b is applied first."""
+    """Returns the quaternion products a∘b, [M, 4] (w, x, y, z), where b is applied first."""
     return np.stack(product_components(a.T, b.T), axis=1)
 
 
 def turned_rotations(rotations: NDArray[Any], rows: NDArray[np.int64], turns: NDArray[Any]) -> NDArray[Any]:
-    """Returns a copy of unit quaternions [N, 4] in which the given rows [M] are turned by [M, 4] (w, x, y, z)."""
+    """Returns a copy of unit quaternions [N, 4] with the given rows [M] rotated by ``turns`` [M, 4] (w, x, y, z)."""
     made = rotations.copy()
     turned = quaternion_products(turns, rotations[rows])
     made[rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
@@ -217,7 +219,7 @@ def turned_rotations(rotations: NDArray[Any], rows: NDArray[np.int64], turns: ND
 
 
 def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
-    """Returns the components (w, x, y, z), [M] each, of a∘b for quaternions [4, M]: b is applied first."""
+    """Returns the components (w, x, y, z), [M] each, of a∘b for quaternions [4, M], where b is applied first."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return [
@@ -229,12 +231,12 @@ def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def moving_extent(gaussians: Gaussians) -> float:
-    """Returns the longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis.
+    """Returns the longest side, in metres, of the box with the central 98 % of the moving Gaussians along each axis.
 
     If none is moving, all present Gaussians are used; if none is present, all Gaussians.
 
-    Tolerances and features use it as a unit so that they do not depend on the scene size. A few stray Gaussians do not
-    change it.
+    Tolerances and features use the extent as their unit, so that they do not depend on the scene size. A few stray
+    Gaussians hardly affect it.
 
     >>> points = np.linspace(0, 1, 101)[:, None] * [2, 1, 0]
     >>> round(moving_extent(Gaussians.of_points(points, 0.01)), 3)

@@ -16,11 +16,11 @@ Bool = NDArray[np.bool_]
 
 
 BLOCK = 32_768
-"""Number of points whose colours are gathered at once; limits memory."""
+"""Number of points whose colours are sampled at once; limits memory."""
 
 
 class InitialPointsError(ValueError):
-    """A point cloud that cannot be computed. The message gives the field, the value and the remedy."""
+    """Raised if a point cloud cannot be computed; the message names the field, the value and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class PosedPicture:
     """A camera and its image.
 
     Attributes:
-        camera: calibrated, in the user's world.
-        image: [H, W, 3] uint8.
-        mask: [H, W] bool, true on the foreground; None if the capture has no mask.
+        camera: calibrated camera in the user's world.
+        image: [H, W, 3] uint8 RGB image.
+        mask: [H, W] bool, true on the foreground; None if the image has no mask.
     """
 
     camera: Camera
@@ -44,7 +44,7 @@ def collect_views(
     """Returns the views of all cameras that have an image, in rig order.
 
     Raises:
-        InitialPointsError: fewer than two images, or an image or mask does not have its camera's size.
+        InitialPointsError: there are fewer than two images, or an image or mask does not have its camera's size.
     """
     views = []
     for camera in rig.cameras:
@@ -59,12 +59,12 @@ def collect_views(
         mask = masks.get(camera.name)
         if mask is not None and mask.shape != image.shape[:2]:
             raise InitialPointsError(
-                f"masks[{camera.name!r}]: shape {mask.shape}; give {image.shape[:2]}, the size of its picture"
+                f"masks[{camera.name!r}]: shape {mask.shape}; give {image.shape[:2]}, the size of its image"
             )
         views.append(PosedPicture(camera, image, None if mask is None else np.asarray(mask) > 0))
     if len(views) < 2:
         raise InitialPointsError(
-            f"images: {len(views)} of the rig's {len(rig)} cameras have a picture; points from pictures need at least 2"
+            f"images: {len(views)} of the rig's {len(rig)} cameras have an image; initial points need at least 2"
         )
     return views
 
@@ -84,7 +84,7 @@ def halved(view: PosedPicture, width: int) -> PosedPicture:
 
 
 class Posed(Protocol):
-    """An object that has a camera."""
+    """Protocol of objects that have a camera."""
 
     @property
     def camera(self) -> Camera:
@@ -105,7 +105,7 @@ def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDAr
     """Projects world points [P, 3] to whole pixels of an image.
 
     Returns:
-        Columns and rows [P] of the pixel of each point (0 if outside), depths [P], and [P] true for points inside.
+        Column and row [P] of each point (0 if outside the image), its depth [P], and whether it is inside [P].
     """
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
@@ -121,10 +121,9 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 
     Args:
         camera: viewing camera.
-        occluders: [M, 3] in the world, each a disc with a diameter of ``spacing`` (world units) or one pixel, whichever
-            is larger.
-        spacing: distance between neighbouring occluders.
-        points: [P, 3] in the world.
+        occluders: [M, 3] world positions of discs with a diameter of ``spacing`` or one pixel, whichever is larger.
+        spacing: distance between neighbouring occluders, in world units.
+        points: [P, 3] world positions of the points.
 
     Returns:
         [P] depths; infinity if nothing occludes the point or the point is outside the image.
@@ -133,7 +132,7 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
     column, line, depth, inside = pixels_inside(camera, occluders)
     if not inside.any():
         return front
-    # Cells are two discs wide, so that each holds a piece of every surface over it but little of the neighbours' slope.
+    # Cells are two discs wide: each contains a point of every surface that covers it, but slopes hardly change in it.
     cell = 2.0 * max(1.0, camera.fx * spacing / float(np.median(depth[inside])))
     shape = (int(camera.height / cell) + 1, int(camera.width / cell) + 1)
     nearest = np.full(shape, np.inf)
@@ -146,9 +145,9 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 
 
 def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
-    """Returns the visibility of points [P, 3] in each camera; the points themselves are the occluders.
+    """Returns the visibility of points [P, 3] in each view; the points themselves are the occluders.
 
-    A point is hidden if it lies more than four disc diameters behind the nearest one; see ``front_depth``. Surfaces
+    A point is hidden if it is more than four disc diameters behind the nearest one; see ``front_depth``. Surfaces
     seen at more than about 60 degrees from their normal may count as hidden, but their colour is unreliable anyway.
 
     Returns:
@@ -164,12 +163,12 @@ def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -
 
 @dataclass(frozen=True, eq=False)
 class PointColours:
-    """Colours of points across the cameras that can see them.
+    """Colours of points, over all cameras that see them.
 
     Attributes:
-        colours: [P, 3] float32 in 0…1, median over these cameras.
-        spread: [P] median absolute deviation from the median, maximum over channels, 0…1.
-        count: [P] number of cameras that see the point.
+        colours: [P, 3] float32 median RGB over these cameras, 0…1.
+        spread: [P] median absolute deviation of the colours, maximum over channels, 0…1.
+        count: [P] number of cameras that see each point.
     """
 
     colours: NDArray[np.float32]
@@ -178,9 +177,7 @@ class PointColours:
 
 
 def observe(views: Sequence[PosedPicture], points: Float, visible: Bool) -> PointColours:
-    """Returns the median colour of points [P, 3] over the cameras in ``visible`` [V, P]; NaN if no camera sees the
-    point.
-    """
+    """Returns the colours of points [P, 3], given their visibility [V, P]; NaN for points that no camera sees."""
     if len(points) > BLOCK:  # limits the memory of the samples
         blocks = [slice(start, start + BLOCK) for start in range(0, len(points), BLOCK)]
         parts = [observe(views, points[block], visible[:, block]) for block in blocks]

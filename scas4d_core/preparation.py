@@ -35,7 +35,7 @@ from scas4d_core.effects.switches import (
     register_effects,
     switches_after_first_frame,
 )
-from scas4d_core.engines.choose import engine_of
+from scas4d_core.engines.choose import engine_of, resolve_device
 from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
@@ -53,23 +53,24 @@ from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import motion_between
 
 SMALLEST_CLUSTER = 8
-"""Minimum mean number of Gaussians per cluster, which limits the layers: smaller clusters fit noise."""
+"""Minimum average number of Gaussians per cluster, which caps the number of clusters: smaller ones fit noise."""
 NEIGHBOURS = 20
 """Number of neighbours per Gaussian in the neighbour terms (Dynamic3DGaussians)."""
 NEIGHBOUR_FALLOFF = 2000.0
-"""1/m²: the weight of a neighbour at distance d is exp(−falloff d²) (Dynamic3DGaussians)."""
+"""Falloff of neighbour weights in 1/m²: a neighbour at distance d has weight exp(−falloff d²) (Dynamic3DGaussians)."""
 
 MAX_BORN_SHARE = 0.5
-"""Maximum number of Gaussians added to a scene, as a share of those of frame 0; bounds memory."""
+"""Maximum number of Gaussians added to a scene, as a fraction of the number in frame 0; limits memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedUpdate:
-    """The input of the next update in addition to Θ_{t−1}. It is replaced as a whole or not at all.
+    """Input of the next update in addition to Θ_{t−1}, always replaced as a whole.
 
     Attributes:
-        updater: updates frames with the active effects.
-        carried: state carried over from the previous update. roots: Θ_0 plus the Gaussians added since.
+        updater: updater with the active effects.
+        carried: state carried over from the previous update.
+        roots: Θ_0 plus the Gaussians added since.
     """
 
     updater: FrameUpdate
@@ -78,11 +79,11 @@ class PreparedUpdate:
 
     @property
     def plan(self) -> UpdatePlan:
-        """The plan of the updater."""
+        """Plan of the next update."""
         return self.updater.plan
 
     def with_carry_over(self, **changes: Any) -> PreparedUpdate:
-        """Returns a copy with changes to the carry-over."""
+        """Returns a copy in which the given fields of the carry-over are replaced."""
         return replace(self, carried=replace(self.carried, **changes))
 
 
@@ -90,8 +91,10 @@ class Preparation:
     """Prepares the updates of a scene.
 
     Args:
-        factory: creates the scene's views. settings: of the scene. world: user to internal transform. renderer: renders
-            views.
+        factory: factory of the scene's views.
+        settings: settings of the scene.
+        world: transform from the user's to the internal world.
+        renderer: renderer of the scene's views.
     """
 
     def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, renderer: Renderer) -> None:
@@ -107,7 +110,8 @@ class Preparation:
         """Returns the switches of the effects after the first frame, and the arrays that the effects keep from it.
 
         Args:
-            frame: the first frame, at the rig's resolution. result: its fit.
+            frame: first frame, at the resolution of the rig.
+            result: fit of the first frame.
         """
         switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
@@ -124,7 +128,9 @@ class Preparation:
         Masks are not read if no term uses them.
 
         Args:
-            fixed: [3, 2] gain and offset of each camera from frame 0.
+            frame: frame at its original resolution.
+            fixed: [3, 2] colour gain and offset of each camera, as estimated in frame 0.
+            prepared: current input of the next update.
 
         Raises:
             ValueError: see ``ViewFactory.views``.
@@ -135,18 +141,19 @@ class Preparation:
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
     def rebuild(self, roots: Gaussians, carried: CarryOver) -> PreparedUpdate:
-        """Rebuilds the next update; carried-over motion of other clusters is dropped.
+        """Rebuilds the next update; carried-over motion is dropped if the clusters have changed.
 
         Args:
             roots: Θ_0 plus all Gaussians added since.
+            carried: state carried over from the previous update.
         """
-        # if a report was lost, no switches are carried
+        # no switches are carried over if a report was lost
         known = {**first_switches(self._settings, 0), **carried.switches}
         switches = {
             name: replace(switch, on=switch.on and effect(name).refusal(self._settings) is None)
             for name, switch in known.items()
         }
-        carried = replace(carried, switches=switches)  # a replay can have other settings than the scene
+        carried = replace(carried, switches=switches)  # a replay may use other settings than the scene
         updater, structure = self._updater(with_labels(roots, carried.labels), switches)
         if carried.structure != structure:
             carried = replace(carried, motion=None, structure=structure)
@@ -156,15 +163,16 @@ class Preparation:
         """Returns the updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
 
         Args:
-            roots: with the labels of the moving Gaussians.
+            roots: roots with the current labels of moving Gaussians.
+            switches: on/off state of each effect.
         """
         hierarchy = self._clusters(roots)
         builder = PlanBuilder(self._scene, self._settings.update, self._factory, hierarchy, roots)
         built = register_effects(builder, names_on(switches))
-        if not built.plan.freedom.clusters:  # the cascade is not needed either
+        if not built.plan.freedom.clusters:  # no cluster moves, so the cascade is not needed
             hierarchy = built.hierarchy = hierarchy.without_layers
         neighbours = self._neighbour_graph(roots, hierarchy) if built.plan.neighbour_terms else None
-        updater = FrameUpdate(engine_of(self._settings.device), built, neighbours)
+        updater = FrameUpdate(engine_of(resolve_device(self._settings.device)), built, neighbours)
         return updater, digest(hierarchy, neighbours)
 
     def _neighbour_graph(self, roots: Gaussians, hierarchy: Hierarchy) -> Neighbours:
@@ -174,9 +182,7 @@ class Preparation:
         return self._neighbours
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
-        """Returns the hierarchy of the moving Gaussians; the previous one and its neighbours are reused if nothing
-        changed.
-        """
+        """Returns the hierarchy of the moving Gaussians; rebuilds it, and its neighbours, only after changes."""
         made = self._hierarchy_inputs
         if made is None or not all(map(np.array_equal, made, (first.means, first.moving))):
             update = self._settings.update
@@ -187,14 +193,16 @@ class Preparation:
     def learn_labels(
         self, prepared: PreparedUpdate, newest: Gaussians, believed: Sequence[TrainingView]
     ) -> PreparedUpdate:
-        """Rebuilds the update with the Gaussians that are seen to move, for scenes without masks.
+        """Rebuilds the update with newly detected moving Gaussians, for scenes without masks.
 
         A Gaussian that has moved once stays in the hierarchy. The labels become part of the state when the frame is
-        committed. Changed labels give a new hierarchy that the previous motion does not fit, so the update is a cold
-        start.
+        committed. Changed labels give a new hierarchy to which the previous motion does not apply, so the update is a
+        cold start.
 
         Args:
-            newest: Θ_{t−1}. believed: views of the frame to learn from.
+            prepared: current input of the next update.
+            newest: previous state Θ_{t−1}.
+            believed: views of the frame to learn from.
         """
         carried = prepared.carried
         labels = learn_labels_from_motion(newest, carried.labels, carried.seen, believed, self._renderer)
@@ -208,7 +216,9 @@ class Preparation:
         """Returns the result of a learnt frame, and the input of the next update.
 
         Args:
-            seen: the observed frame. may_change_population: whether Gaussians may be added or retired.
+            prepared: input of the update that gave the result.
+            seen: observation of the frame, with the result of its update.
+            may_change_population: whether Gaussians may be added or retired.
         """
         on, seen = names_on(prepared.carried.switches), record_arrays(prepared.carried.switches, self._settings, seen)
         switches = decide_switches(prepared.carried.switches, self._settings, seen)
@@ -228,7 +238,8 @@ class Preparation:
         """Applies the effects that add, retire or revive Gaussians to a result; non-finite results are skipped.
 
         Args:
-            names: effects that took part in the update. seen: the observed frame.
+            names: names of the effects that took part in the update.
+            seen: observation of the frame, with the result of its update.
 
         Raises:
             ValueError: an effect changed rows in a way that is not allowed.
@@ -245,17 +256,20 @@ class Preparation:
         return seen.result
 
     def _is_motion(self, result: UpdateResult) -> bool:
-        """Returns true if the difference between two states is a motion and not a jump."""
+        """Returns whether the difference between the two states is a motion rather than a jump."""
         return self._settings.update.cluster_map == "centred" and result.outcome is not FrameOutcome.RELOCATED
 
 
 def _with_changed_rows(
     prepared: PreparedUpdate, before: Gaussians, result: UpdateResult, other_rows: bool
 ) -> PreparedUpdate:
-    """Updates the roots, labels and effect arrays to the Gaussians of a result.
+    """Extends the roots, labels and effect arrays to match the Gaussians of a result.
 
     Args:
-        before: the Gaussians before the change. other_rows: whether any were added, retired or revived.
+        prepared: input of the next update.
+        before: Gaussians before the change.
+        result: update result with the changed Gaussians.
+        other_rows: whether Gaussians were added, retired or revived.
     """
     now, labels = result.gaussians, prepared.carried.labels
     effects = {
@@ -271,7 +285,7 @@ def _with_changed_rows(
 
 
 def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: UpdateResult) -> PreparedUpdate:
-    """Adds the motion between the two states, in the updater's clusters."""
+    """Adds the motion between the previous and the new state, in the clusters of the updater."""
     if seen.result.motion is None:
         return prepared
     before, now, hierarchy = seen.result.gaussians, result.gaussians, prepared.updater.hierarchy
@@ -282,22 +296,22 @@ def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: Updat
 
 
 def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
-    """Raises an error if an effect changed rows that it must not change."""
+    """Raises ``ValueError`` if an effect changed rows that it must not change."""
     count, born = len(before.gaussians), len(after.gaussians) - len(before.gaussians)
     kept = born >= 0 and np.array_equal(after.gaussians.ids[:count], before.gaussians.ids)
     if not kept or (after.gaussians.ids[count:] != UNBORN).any():
         raise ValueError(
-            f"effect {name}: rows were removed or reordered; append with Gaussians.concatenate, retire the others"
+            f"effect {name}: rows were removed or reordered; use Gaussians.concatenate to add rows, or retire them"
         )
     had = 0 if before.parents is None else len(before.parents)
     if (0 if after.parents is None else len(after.parents)) != had + born:
-        raise ValueError(f"effect {name}: parents has not one parent for each of {had + born} that are born")
+        raise ValueError(f"effect {name}: parents must have one entry for each of {had + born} new Gaussians")
     if after.parents is not None and not ((after.parents >= NO_PARENT) & (after.parents < count - had)).all():
         raise ValueError(f"effect {name}: a parent is not a row of the previous frame")
 
 
 def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
-    """Returns an effect's array with rows for the added Gaussians, if it has one row per Gaussian."""
+    """Returns an array of an effect, extended by the added Gaussians if it has one row per Gaussian."""
     if parents is None or not array.ndim or len(array) != count:
         return array
     rows = array[np.maximum(parents, 0)]
@@ -309,7 +323,8 @@ def room_for_births(first: int, now: int) -> int:
     """Returns the number of Gaussians that may still be added.
 
     Args:
-        first: number of Gaussians in frame 0. now: current number, including retired ones.
+        first: number of Gaussians in frame 0.
+        now: current number of Gaussians, including retired ones.
 
     >>> room_for_births(1000, 1400), room_for_births(1000, 1600)
     (100, 0)

@@ -1,4 +1,4 @@
-"""Named presets of the settings, and changes to them."""
+"""Named presets of the settings, and functions that apply changes to settings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
     # Half the iterations after the first motion, and none if nothing has moved (docs/accuracy-and-time.md).
     "adaptive": Settings(update=UpdateSettings(iterations=50, cold_start_iterations=6.0, skip_tolerance=0.02)),
-    # Even fewer iterations and a third of the Gaussians, in a third of the default's time.
+    # Even fewer iterations and a third of the Gaussians; takes a third of the default's time.
     "fast": Settings(
         static=StaticSettings(detail=0.3),
         update=UpdateSettings(iterations=45, cold_start_iterations=6.0, skip_tolerance=0.02),
@@ -81,7 +81,7 @@ PRESETS: dict[str, Settings] = {
         ),
         effects=_pinned(on=("static_colour",), off=OURS),
     ),
-    # Per kind of scene: some effects are pinned, all others are "auto"; weights and rates are unchanged
+    # Presets for kinds of scenes: some effects are pinned, all others are "auto"; weights and rates are unchanged
     # (docs/effects.md). Pin a new effect here if a kind of scene always or never needs it.
     "rigid": Settings(effects=_pinned(on=TIES, off=("cluster_scaling", "own_rotation", "own_scale"))),
     "articulated": Settings(effects=_pinned(on=("cluster_rotation", "own_position", *TIES))),
@@ -92,14 +92,14 @@ PRESETS: dict[str, Settings] = {
 
 
 class SettingError(InputError):
-    """An unknown setting, or a value that is out of range.
+    """Raised for an unknown setting, a value that is out of range, or contradictory effects.
 
     Attributes:
-        setting: dotted name, such as "update.iterations".
-        value: the rejected value.
-        fault: what is wrong, as text for people.
-        remedy: what to give instead, as text for people.
-        validation: pydantic's own error; None for an unknown preset.
+        setting: dotted name of the setting, such as "update.iterations".
+        value: rejected value.
+        fault: user-facing description of the problem.
+        remedy: user-facing description of valid input.
+        validation: error raised by pydantic; None for an unknown preset or contradictory effects.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
     """Returns the preset ``name`` with changes as nested mappings; later changes take precedence.
 
     Raises:
-        SettingError: the preset or setting does not exist, or a value is out of range.
+        SettingError: the preset or a setting does not exist, a value is out of range, or effects contradict each other.
 
     >>> preset("adaptive").update.iterations
     50
@@ -133,7 +133,7 @@ def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
     """Returns the settings with changes as nested mappings; later changes take precedence.
 
     Raises:
-        SettingError: the setting does not exist, or a value is out of range.
+        SettingError: a setting does not exist, a value is out of range, or effects contradict each other.
 
     >>> changed(preset("adaptive"), {"update": {"iterations": 20}}).update.iterations
     20
@@ -153,7 +153,7 @@ def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested mappings merged; values of the second take precedence."""
+    """Merges two nested mappings; values in ``changes`` take precedence."""
     result = dict(base)
     for name, value in changes.items():
         old = result.get(name)
@@ -162,15 +162,15 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
 
 
 def _setting_error(error: ValidationError) -> SettingError:
-    """Returns the first validation error; for an unknown name, the remedy suggests the closest known name."""
+    """Converts the first validation error; for an unknown name, the remedy suggests the most similar setting."""
     details = error.errors(include_url=False)
     first = details[0]
     setting = _place(first["loc"])
-    others = len({_place(one["loc"]) for one in details}) - 1  # each member of a union reports its own error
+    others = len({_place(one["loc"]) for one in details}) - 1  # every member of a union reports an error
     more = f" (and {others} more)" if others else ""
     remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":
-        fault = "there is no setting of this name"
+        fault = "there is no setting with this name"
         if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):
             remedy = f"did you mean {near[0]}? {remedy}"
     elif first["type"] == "value_error":
@@ -192,7 +192,7 @@ def _description(loc: Iterable[int | str]) -> str:
     """Returns the documented description of a setting; empty if it has none.
 
     >>> _description(("scene", "image_scale", "float"))
-    'Pictures are resized by this before anything else.'
+    'Factor by which images are resized before any other step.'
     """
     said = ""
     model: type[BaseModel] = Settings
@@ -208,7 +208,7 @@ def _description(loc: Iterable[int | str]) -> str:
 
 
 def _of_union(part: int | str) -> bool:
-    """Returns true if a part of the location is a union member, such as ``literal['auto']``, and not a setting."""
+    """Returns whether a part of a location is a union member, such as ``literal['auto']``, rather than a setting."""
     return isinstance(part, str) and (not part.isidentifier() or part in ("bool", "float", "int", "str"))
 
 

@@ -10,7 +10,10 @@ class Progress:
     """Progress of a long task.
 
     Attributes:
-        stage: in words. done, total: numbers of steps. detail: figures by name, such as the loss.
+        stage: description of the current stage.
+        done: number of completed steps.
+        total: total number of steps.
+        detail: further named values, such as the loss.
     """
 
     stage: str

@@ -1,7 +1,7 @@
-"""Recomputes a committed state that was damaged on disk from the images of its frame.
+"""Recomputes a committed state from the images of its frame after the state was damaged on disk.
 
 The recomputed state is a cold start from the previous state. It looks the same but is not bit-identical, and its report
-has ``recomputed``. Later states, which were computed from the original, do not change.
+contains ``recomputed``. Later states were computed from the original state and do not change.
 """
 
 from __future__ import annotations
@@ -35,11 +35,14 @@ def recompute(
     """Recomputes the state of a frame and replaces the damaged one.
 
     Args:
-        rig: training cameras, user's world. settings: settings of the scene.
+        rig: training cameras in the user's world.
+        settings: settings of the scene.
         history: history of the scene, in the process that appends to it.
-        base: index of the previous committed frame. frame: with the images of the damaged frame.
-        budget: that applied to the frame (``Reconstruction.set_budget``).
-        dropped, notes: see ``Reconstruction.step``.
+        base: index of the previous committed frame.
+        frame: damaged frame with its images.
+        budget: budget that applied to the frame, as keyword arguments of ``Reconstruction.set_budget``.
+        dropped: cameras excluded by the caller, with the reason.
+        notes: additional JSON data to commit.
 
     Returns:
         The report written with the state.
@@ -57,7 +60,7 @@ def recompute(
     report = scratch.history.report(frame.index)
     arrays = history.complete_state(frame.index, scratch.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
-    # The presence effects are left out: the births of this frame are those in the history, not those of this update.
+    # Presence effects are omitted, because the births of this frame are those in the history, not of this update.
     left = scratch.history.effects(frame.index)
     left = {name: given for name, given in left.items() if effect(name).group is not EffectGroup.PRESENCE}
     history.replace(frame.index, frame.time, kept, report, left)

@@ -1,7 +1,7 @@
-"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises an error and changes nothing.
+"""Reconstruction of a scene: ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises an error and changes nothing.
 
-A commit is one rename, because a frame's state and report are in one file. The checkpoint for the next update is
-written first. Therefore ``resume`` can continue after any crash, on the CPU with bit-identical results.
+A commit is a single rename, because the state and the report of a frame are in one file. The checkpoint for the next
+update is written first. Therefore ``resume`` can continue after any crash, with bit-identical results on the CPU.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePo
 from scas4d_core.effects.evidence import FitTime, FrameObservation
 from scas4d_core.effects.presence.motion_mask import first_labels, with_labels
 from scas4d_core.effects.switches import committed_arrays, encode_switches
-from scas4d_core.engines.choose import renderer_of
+from scas4d_core.engines.choose import renderer_of, resolve_device
 from scas4d_core.engines.engine import REPORT
 from scas4d_core.engines.limits import rig_limits
 from scas4d_core.engines.views import TrainingView
@@ -65,15 +65,20 @@ __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePo
 
 
 class Reconstruction(CommittedScene):
-    """One scene from frame 0 onward. Created by ``start`` or, from the files of another process, by ``resume``.
+    """Reconstruction of one scene from frame 0 onward; created by ``start``, or from an existing history by ``resume``.
 
     A process should call ``warm_up.compile_in_processes`` first; otherwise kernels may be compiled in this process.
 
     Attributes:
-        calibrated: the training cameras as given or as refined with frame 0. rig: the same cameras in the internal
-            world at the scaled image size.
-        world: user to internal world, from the given cameras. history: the committed states. report: of the last frame
-            committed by this object. resumed: the resume point, or None.
+        calibrated: training cameras in the user's world, as given or as refined with frame 0.
+        rig: training cameras in the internal world, at the scaled image size.
+        settings: settings of the scene.
+        device: device that fits and updates the scene.
+        world: transform from the user's to the internal world.
+        history: committed states.
+        static: fit of frame 0; None after ``resume`` and ``fork``.
+        report: report of the last frame committed by this object, or None.
+        resumed: commit from which the scene was resumed, or None.
         may_change_population: whether effects may add, retire and revive Gaussians.
 
     >>> from scas4d_core.captures import open_capture
@@ -88,8 +93,13 @@ class Reconstruction(CommittedScene):
     """
 
     def __init__(self, rig: Rig, settings: Settings, history: History, found: CalibrationReport | None = None) -> None:
-        """Creates a scene without frames. ``rig`` is as given, at image size. ``found``: None to use the history's
-        calibration.
+        """Creates a scene without frames.
+
+        Args:
+            rig: training cameras in the user's world, at the size of the images.
+            settings: settings of the scene.
+            history: history to commit to.
+            found: calibration found in frame 0; None to use the calibration in the history.
         """
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
@@ -100,7 +110,8 @@ class Reconstruction(CommittedScene):
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
-        self._renderer = renderer_of(settings.device, settings.scene.background_rgb, limits)
+        self.device = resolve_device(settings.device)
+        self._renderer = renderer_of(self.device, settings.scene.background_rgb, limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._renderer)
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
@@ -130,12 +141,15 @@ class Reconstruction(CommittedScene):
 
         Args:
             rig: training cameras in the user's world and units, at the size of the frame's images.
-            frame: with an image of every camera, or of most; with masks if available.
-            points: initial point cloud in the user's world; None to compute it from the images. progress: called in
-                each stage.
-            history: to commit to; None for one in memory. static: an existing fit of frame 0, used unchanged.
-            dropped, notes, started: see ``step``. The stage "load" is the time since ``started``: decoding and loading
-                kernels.
+            frame: first frame, with images of all, or at least most, cameras; with masks if available.
+            settings: settings of the scene.
+            points: initial point cloud in the user's world; None to compute it from the images.
+            progress: function called with the progress of each stage.
+            history: history to commit to; None for a new one in memory.
+            static: existing fit of frame 0, used unchanged.
+            dropped: cameras excluded by the caller, with the reason; committed with the report.
+            notes: additional JSON data to commit.
+            started: ``perf_counter`` value at which decoding and loading of kernels began, for the stage "load".
 
         Raises:
             RigError: the rig cannot work with these settings.
@@ -183,19 +197,20 @@ class Reconstruction(CommittedScene):
         """Resumes a scene from its last commit; on the CPU, it continues with bit-identical results.
 
         If the newest state or its checkpoint is damaged, the scene resumes from the previous one. Later frames are
-        rolled back from the history, and ``resumed.undone`` lists the frames to send again. If one of them is not
-        ``held``, an intact newest state is preferred to bit-identical results: the scene resumes from that state with a
-        cold start.
+        rolled back, and ``resumed.undone`` lists the frames to send again. If one of them cannot be sent again, an
+        intact newest state is preferred to bit-identical results: the scene resumes from that state with a cold start.
 
         Args:
-            rig, settings: as given to ``start``. history: of the scene, on disk, opened with ``History.open``.
+            rig: training cameras as given to ``start``.
+            settings: settings as given to ``start``.
+            history: history of the scene on disk, opened with ``History.open``.
             held: returns whether the images of a committed frame can be sent again.
 
         Raises:
             ResumeError: the history has no frame, or its first state or every state is damaged.
         """
         if history.directory is None or not history.indices:
-            raise ResumeError("the history holds no committed frame; start the scene with its first frame")
+            raise ResumeError("the history contains no committed frame; start the scene with its first frame")
         self = cls(rig, with_recorded_background(settings, history), history)
         assert self._checkpoints is not None
         try:
@@ -207,7 +222,7 @@ class Reconstruction(CommittedScene):
             index, cold_start(history, index, self._fixed.masked) if left is None else left
         )
         if left is not None and not same:
-            faults.append("clusters came out otherwise than before: the next update starts without a motion")
+            faults.append("the clusters differ from those before the restart: the next update starts without motion")
         self.resumed = ResumePoint(index, history.truncate(index), faults, cold=left is None or not same)
         self._checkpoints.clean(history.indices)
         if self.resumed.cold:
@@ -227,7 +242,10 @@ class Reconstruction(CommittedScene):
         """Returns an in-memory copy that continues from a committed frame with a cold start; ``history`` is only read.
 
         Args:
-            rig, settings: as given to ``start``; the update settings may differ. index: of a committed frame.
+            rig: training cameras as given to ``start``.
+            settings: settings as given to ``start``; the update settings may differ.
+            history: history of the scene.
+            index: index of a committed frame.
 
         Raises:
             HistoryError: the frame or the first frame cannot be read.
@@ -256,16 +274,17 @@ class Reconstruction(CommittedScene):
         """Updates the state to a frame and commits it; a frame that does not fit is rejected entirely or in part.
 
         Args:
-            frame: later than the last frame, with images of at least one camera.
+            frame: next frame, later than the last one, with an image of at least one camera.
             dropped: cameras excluded by the caller, with the reason; committed with the report.
-            notes: additional data to commit, as JSON. started: start of the work, from which a time budget counts.
+            notes: additional JSON data to commit.
+            started: ``perf_counter`` value at which work on the frame began and its time budget starts; None for now.
 
         Raises:
-            StepError: the frame is not later than the last one, has no image of the rig, or an image has a different
-                size.
+            StepError: the frame is not later than the last one, has no image of a camera of the rig, or an image has a
+                different size.
         """
         seconds, watch = self._seconds_to(frame), Stopwatch(started)
-        frame = replace(frame, images=dict(frame.images))  # a capture decodes its images on every access
+        frame = replace(frame, images=dict(frame.images))  # a capture decodes images on every access
         context = FrameContext(frame, watch, dropped, notes or {})
         self._observe(context, seconds)
         self._prepare(context)
@@ -343,7 +362,7 @@ class Reconstruction(CommittedScene):
         context.notes = {"cold": context.update_input.motion is None, "learn_labels": learn_labels, **context.notes}
         context.prepared = replace(context.prepared, carried=carried)
         context.birth_fit_time = FitTime(self._budget.end_of_births(context.watch.began))
-        if not result.outcome.learnt or result.exposure != 1.0:  # after compensation of a light change, much looks new
+        if not result.outcome.learnt or result.exposure != 1.0:  # after a light change, much of the image looks new
             return
         learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
         names = {view.name for view in learnt}
@@ -381,11 +400,11 @@ class Reconstruction(CommittedScene):
 
     @property
     def _learns_labels(self) -> bool:
-        """True if moving Gaussians are detected from motion: there are no masks and an effect requires it."""
+        """Whether moving Gaussians are detected from motion: there are no masks, and an effect requires it."""
         return self._prepared.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
-        """Returns the seconds from the last committed frame to a later one."""
+        """Returns the time in seconds from the last committed frame to a later frame."""
         last = self.history.indices[-1]
         if frame.index <= last:
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
@@ -409,8 +428,16 @@ class Reconstruction(CommittedScene):
         stop_gain: float | None = None,
         skip_tolerance: float | None = None,
     ) -> None:
-        """Changes the budget of later updates; None resets to the settings. ValueError: out of ``UpdateSettings``'
-        range.
+        """Changes the budget of later updates; each value that is None is reset to the settings.
+
+        Args:
+            iterations: number of iterations per frame.
+            budget_ms: time budget per frame in milliseconds.
+            stop_gain: relative reduction of the error below which an update ends early.
+            skip_tolerance: relative increase of the error up to which an update is skipped.
+
+        Raises:
+            ValueError: a value is out of the range given in ``UpdateSettings``.
         """
         given = {
             "iterations": iterations,
@@ -425,15 +452,16 @@ class Reconstruction(CommittedScene):
     def _commit(
         self, report: FrameReport, gaussians: Gaussians, prepared: PreparedUpdate, more: Mapping[str, Any], **birth: Any
     ) -> None:
-        """Writes the checkpoint, then state and report in one rename; for ``birth`` see ``History.append``."""
+        """Writes the checkpoint, then commits state and report; see ``History.append`` for ``birth``."""
         carried = prepared.carried
         if self._checkpoints is not None:
             self._checkpoints.save(report.index, carried)
         began = perf_counter()
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
         effects = encode_switches(carried.switches)
-        record = {**report.record(), "effects": effects, "threads": get_num_threads(), "resumed": resumed, **more}
-        seconds = report.seconds  # a record cannot time its own writing, so it includes that of the previous one
+        computed = {"device": self.device, "threads": get_num_threads()}
+        record = {**report.record(), "effects": effects, **computed, "resumed": resumed, **more}
+        seconds = report.seconds  # a record cannot time its own write, so it includes the previous one
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
         kept = committed_arrays(carried.effects) if self.history.indices else carried.effects

@@ -1,8 +1,8 @@
 """Replays the last frames of a scene in memory, to measure the cost and error of a different number of iterations.
 
-Every budget starts with a cold start from the same committed state. The first frame is a warm-up and is not counted;
-each later update starts from a motion, as in the scene. The time budget and stopping rule are disabled, so that every
-update runs all iterations. Nothing is written to disk.
+Every replay begins with a cold start from the same committed state. The first frame is a warm-up and is not counted;
+each later update starts from the previous motion, as in the live scene. The time budget and stopping rule are disabled,
+so that every update runs all iterations. Nothing is written to disk.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 Decode = Callable[[], tuple[Frame, Mapping[str, str]]]
-"""Decodes a frame's images on each call; also returns the excluded cameras, with the reason."""
+"""Decodes the images of a frame on each call; also returns the excluded cameras, with the reason."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,10 @@ class ReplayResult:
     """Cost and error of a frame for a given number of iterations.
 
     Attributes:
-        milliseconds: median time of a frame from decoding to the end of the update, without writing.
-        error: mean image loss on the probe views of the kept state; None if the settings disable the checks.
-        psnr: dB, of the training views as last rendered; None if not measured.
+        iterations: number of iterations per frame.
+        milliseconds: median time per frame from decoding to the end of the update, without writing.
+        error: mean image loss of the kept state on the probe views; None if the settings disable the checks.
+        psnr: mean PSNR in dB of the training views as last rendered; None if not measured.
         frames: number of measured frames.
     """
 
@@ -55,11 +56,13 @@ def replay(
     """Replays frames with a different number of iterations.
 
     Args:
-        rig: training cameras, user's world. settings: settings of the scene.
+        rig: training cameras in the user's world.
+        settings: settings of the scene.
         history: history of the scene; only ``base`` and the first frame are read.
-        base: index of the committed frame that the first of ``frames`` follows.
-        frames: at least two, in order; the first is a warm-up. iterations: per frame.
-        over: called at the end of each update.
+        base: index of the committed frame that precedes ``frames``.
+        frames: decoders of at least two frames, in order; the first frame is a warm-up.
+        iterations: number of iterations per frame.
+        over: function called at the end of each update.
 
     Raises:
         HistoryError: ``base`` cannot be read.

@@ -19,44 +19,43 @@ SMALLEST_SIDE = 11
 """Minimum image side in pixels after scaling: SSIM uses windows of 11 pixels, and a smaller image has no full window.
 """
 FOCAL_LENGTHS = (0.05, 1000.0)
-"""Allowed focal length as a multiple of the longer image side: fields of view from 169° to 0.06°. Only
-near-orthographic lenses are excluded; that of a fly rig has 17."""
+"""Range of focal lengths as multiples of the longer image side, for fields of view from 169° to 0.06°. Only
+near-orthographic lenses are excluded; a rig that films flies has 17."""
 RADII = (1e-6, 1e9)
-"""Allowed rig radius in metres: outside this range a unit is wrong, and float32 is too coarse for the scene."""
+"""Range of rig radii in metres; outside it, the unit is wrong, and float32 is too coarse for the scene."""
 
 FEW_SEE, MAX_SEE = 0.25, 0.9
-"""Share of cameras whose image contains the common point. Poses are suspect if few cameras see it as given, but nearly
-all would see it with inverted poses."""
+"""Fractions of cameras that see the common point of all viewing axes. Poses are suspect if few cameras see it with the
+given poses, but nearly all would see it with inverted poses."""
 POINTS_SEEN = 0.2
-"""Minimum share of camera–point pairs in view with inverted poses; the share as given must be at most ``FEW_SEE`` times
-as large. Point clouds of rooms extend beyond the images: a third of `basketball` is in view."""
+"""Minimum fraction of camera–point pairs in view with inverted poses; with the given poses, it must be at most
+``FEW_SEE`` times as large. Point clouds of rooms extend beyond the images: a third of `basketball` is in view."""
 LEAST_CAMERAS = 3
-"""Minimum number of cameras for a check without points: two axes always come close to each other somewhere."""
+"""Minimum number of cameras for a check without points, because any two axes come close to each other somewhere."""
 NOT_PARALLEL = 1e-3
-"""Smallest mean squared sine between the axes and any direction; below it, they are parallel and have no common point.
-"""
+"""Minimum mean squared sine of the angles between the axes and any direction; below it, the axes count as parallel."""
 LEAST_DEPTH = 0.05
-"""Minimum depth of the common point as a share of the rig's extent; a nearer point lies among the cameras themselves.
-"""
+"""Minimum depth of the common point as a fraction of the rig's extent; a nearer point is between the cameras."""
 MAX_POINTS = 2000
-"""Maximum number of points that are checked, sampled evenly from the cloud."""
+"""Approximate number of points that are checked, sampled evenly from the cloud."""
 SEEN_AT_ALL = 0.1
-"""Minimum share of a cloud that must be in view of at least one camera."""
+"""Minimum fraction of a cloud that must be in view of at least one camera."""
 FAR = 100.0
-"""Median distance of the points from the rig centre, in rig radii, above which their unit or world is questioned. Not
-used if all cameras look in the same direction, because then nothing limits the distance."""
+"""Median distance of the points from the rig centre, in rig radii, above which their unit or world is probably wrong.
+Not used if all cameras look in the same direction, because the distance is then unlimited."""
 ONE_WAY = 0.9
-"""Length of the mean viewing direction above which the cameras look in the same direction."""
+"""Length of the mean viewing direction above which the cameras count as looking in the same direction."""
 
 USUAL_RADIUS = 60.0
 """Rig radius in metres above which the unit is probably wrong. Small rigs are plausible for small objects."""
 
 
 class RigError(CameraError):
-    """A rig, or settings for it, that cannot work.
+    """Raised if a rig, or settings for it, cannot work.
 
     Attributes:
-        field: dotted name, as in a request to the service. value: as given.
+        field: dotted name of the field, as in a request to the service.
+        value: rejected value.
     """
 
     def __init__(self, fault: str, remedy: str, field: str, value: object) -> None:
@@ -65,11 +64,12 @@ class RigError(CameraError):
 
 
 def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
-    """Rejects a rig, settings and points of a first frame that cannot work, before its images are read.
+    """Rejects rigs, settings and initial points that cannot work, before images are read.
 
     Args:
-        rig: rig in the user's world, at image size. scene: unit and image scale.
-        positions: [P, 3] point cloud in the same world, or None.
+        rig: rig in the user's world, at image size.
+        scene: scene settings, of which the unit and the image scale are used.
+        positions: [P, 3] point cloud in the user's world, or None.
 
     Raises:
         RigError: see ``check_scene``, ``check_start`` and ``check_points``.
@@ -84,7 +84,8 @@ def check_scene(rig: Rig, scene: SceneSettings) -> None:
     """Rejects rigs and settings that cannot work with any images.
 
     Args:
-        rig: rig in the user's world, at image size. scene: unit and image scale.
+        rig: rig in the user's world, at image size.
+        scene: scene settings, of which the unit and the image scale are used.
 
     Raises:
         RigError: the focal lengths, the image size or the extent of the rig are out of range.
@@ -100,8 +101,8 @@ def check_scene(rig: Rig, scene: SceneSettings) -> None:
         for focal in (camera.fx, camera.fy):
             if not FOCAL_LENGTHS[0] <= focal / longer <= FOCAL_LENGTHS[1]:
                 raise RigError(
-                    f"camera {camera.name!r}: focal length {focal:g} px is {focal / longer:.3g} times its longer side "
-                    f"of {longer} px",
+                    f"camera {camera.name!r}: focal length {focal:g} px is {focal / longer:.3g} times the longer image "
+                    f"side of {longer} px",
                     f"give focal lengths in pixels, {FOCAL_LENGTHS[0] * longer:g} to {FOCAL_LENGTHS[1] * longer:g}",
                     f"rig.cameras.{number}.intrinsics",
                     focal,
@@ -117,7 +118,7 @@ def _too_small(camera: Camera, small: Camera, number: int, scale: float) -> None
     if least > 1:
         raise RigError(
             f"camera {camera.name!r} has {camera.width}x{camera.height} pixels",
-            f"give pictures of at least {SMALLEST_SIDE} pixels a side",
+            f"give images of at least {SMALLEST_SIDE} pixels per side",
             f"rig.cameras.{number}",
             f"{camera.width}x{camera.height}",
         )
@@ -136,18 +137,18 @@ def _check_extent(rig: Rig, scene: SceneSettings) -> None:
     radius = rig.radius * scene.metres_per_unit
     if not RADII[0] <= radius <= RADII[1]:
         raise RigError(
-            f"metres_per_unit {scene.metres_per_unit:g} makes the rig's radius {radius:.3g} m",
-            "give the metres in one unit of the calibration, or 'auto'",
+            f"metres_per_unit {scene.metres_per_unit:g} gives a rig radius of {radius:.3g} m",
+            "give the number of metres per calibration unit, or 'auto'",
             "settings.scene.metres_per_unit",
             scene.metres_per_unit,
         )
 
 
 def check_start(rig: Rig, has_points: bool) -> None:
-    """Rejects a start without points if no two cameras are apart, because no depth can be found.
+    """Rejects a start without points if all cameras are at the same position, because depth cannot be estimated.
 
     Raises:
-        RigError: there is one camera, or all cameras are at one place, and there are no points.
+        RigError: there are no points, and only one camera or all cameras at the same position.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> check_start(Rig((Camera("front", lens, np.eye(4), 64, 48),)), has_points=False)
@@ -159,14 +160,14 @@ def check_start(rig: Rig, has_points: bool) -> None:
     which = "one camera" if len(rig) == 1 else f"all {len(rig)} cameras are at one place"
     raise RigError(
         f"{which}, and no points: distances are unknown",
-        "give points of the first frame, or cameras at different places",
+        "give points of the first frame, or cameras at different positions",
         "points",
         "nothing",
     )
 
 
 def check_points(rig: Rig, positions: Float) -> None:
-    """Rejects points [P, 3] in the user's world if every point lies behind every camera.
+    """Rejects points [P, 3] in the user's world if all of them are behind all cameras.
 
     Raises:
         RigError: no camera can see any point.
@@ -175,9 +176,9 @@ def check_points(rig: Rig, positions: Float) -> None:
         if any((camera.to_camera(cloud)[:, 2] > 0).any() for camera in rig.cameras):
             return
     raise RigError(
-        "all points lie behind all cameras",
-        "give world_to_camera with OpenCV axes (z forward), and points in the same world; poses from camera to world "
-        "have to be inverted",
+        "all points are behind all cameras",
+        "give world_to_camera with OpenCV axes (z forward), and points in the same world; camera-to-world poses must "
+        "be inverted",
         "points",
         f"{len(positions)} points",
     )
@@ -187,7 +188,9 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
     """Returns warnings about a usable rig: its unit, its poses and its point cloud.
 
     Args:
-        rig: rig in the user's world. scene: unit. positions: [P, 3] point cloud in the same world, or None.
+        rig: rig in the user's world.
+        scene: scene settings, of which the unit is used.
+        positions: [P, 3] point cloud in the user's world, or None.
     """
     poses = pose_warnings(rig, positions)
     cloud = [] if poses or positions is None else cloud_warnings(rig, positions)
@@ -195,13 +198,13 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
 
 
 def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
-    """Returns a warning if the size of the rig suggests that its unit is not the metre; otherwise empty.
+    """Returns a warning if the size of the rig suggests that ``metres_per_unit`` is wrong; otherwise empty.
 
     >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> there[0, 3] = 4000
     >>> rig = Rig((Camera("0", lens, np.eye(4), 64, 48), Camera("1", lens, there, 64, 48)))
     >>> unit_warnings(rig, SceneSettings())
-    ["the cameras are up to 2e+03 m from their middle with scene.metres_per_unit 1: for a calibration in milli..."]
+    ["the cameras are up to 2e+03 m from their centre with scene.metres_per_unit 1: for a calibration in milli..."]
     >>> unit_warnings(rig, SceneSettings(metres_per_unit=0.001))
     []
     """
@@ -212,13 +215,13 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
     if radius <= USUAL_RADIUS:
         return []
     return [
-        f"the cameras are up to {radius:.3g} m from their middle with scene.metres_per_unit {unit:g}: "
+        f"the cameras are up to {radius:.3g} m from their centre with scene.metres_per_unit {unit:g}: "
         "for a calibration in millimetres give 0.001, in centimetres 0.01, or 'auto'; some limits are in metres"
     ]
 
 
 def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
-    """Returns a warning about points [P, 3] that no camera sees or that are far away; empty if they fit.
+    """Returns a warning if hardly any points [P, 3] are in view, or if they are far away; otherwise empty.
 
     >>> lens, beside = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside[0, 3] = -0.2
@@ -226,31 +229,33 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
     >>> cloud_warnings(rig, np.array([[0.1, 0, 3]]))
     []
     >>> cloud_warnings(rig, np.array([[8, 0, 3]]))
-    ['the cameras have only 0% of the points in view: give them in the world and the unit of the calibration']
+    ['the cameras see only 0% of the points: give points in the world and unit of the calibration']
     """
     if len(rig) < 2 or rig.at_one_place or not len(positions):
         return []
     some = _some(positions)
-    world = "give them in the world and the unit of the calibration"
+    world = "give points in the world and unit of the calibration"
     away = float(np.median(np.linalg.norm(some - rig.centre, axis=1))) / rig.radius
     if away > FAR and np.linalg.norm(np.mean([camera.rotation[2] for camera in rig.cameras], axis=0)) < ONE_WAY:
-        return [f"the points are {away:.0f} radii of the rig away from it: {world}"]
+        return [f"the points are {away:.0f} rig radii away from the rig: {world}"]
     seen = float(np.mean(np.any(_seen(rig.cameras, some), axis=0)))
     if seen < SEEN_AT_ALL:
-        return [f"the cameras have only {seen:.0%} of the points in view: {world}"]
+        return [f"the cameras see only {seen:.0%} of the points: {world}"]
     return []
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     """Returns warnings about poses that appear to be inverted (camera to world); empty without evidence.
 
-    With points: few of them are in view, but many would be with inverted poses. Without points: the viewing axes meet
-    neither in front of nor behind the cameras, but would meet in nearly all images with inverted poses. The axes of
-    outward-looking rigs meet behind the cameras; those of rigs that look in one direction never meet. Poses relative to
-    one of the cameras often meet both ways. In this case nothing is reported, because only the images could decide.
+    The evidence with points: few of them are in view, but many would be with inverted poses. The evidence without
+    points: the viewing axes meet neither in front of nor behind the cameras, but would meet in nearly all images with
+    inverted poses. The axes of outward-looking rigs meet behind the cameras; those of rigs that look in one direction
+    never meet. With poses relative to one of the cameras, the axes often meet in both cases. Nothing is reported then,
+    because only the images could decide.
 
     Args:
-        rig: rig of at least three cameras if there are no points. positions: [P, 3] in its world, or None.
+        rig: rig in the user's world; without points, it is checked only if it has at least three cameras.
+        positions: [P, 3] point cloud in the user's world, or None.
 
     >>> lens, ring = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], []
     >>> for i, angle in enumerate((0, 2, 4)):
@@ -261,7 +266,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     >>> pose_warnings(Rig(tuple(ring)))
     []
     >>> pose_warnings(Rig(tuple(_inverted(camera) for camera in ring)))[0]
-    'the poses seem to be the wrong way round, camera to world where world to camera is meant: the viewing axes ...'
+    'the poses seem to be inverted, camera to world instead of world to camera: the viewing axes ...'
     """
     if positions is not None and len(positions):
         some = _some(positions)
@@ -271,7 +276,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
         other = float(np.mean(_seen([_inverted(camera) for camera in rig.cameras], some)))
         if other < POINTS_SEEN or given > FEW_SEE * other:
             return []
-        evidence = f"{given:.0%} of the points are in view of a camera on average, inverted {other:.0%}"
+        evidence = f"{given:.0%} of the points are in view of a camera on average, {other:.0%} with inverted poses"
     else:
         if len(rig) < LEAST_CAMERAS:
             return []
@@ -279,10 +284,9 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
         given, other = _come_together(rig.cameras, behind=True), _come_together(turned, behind=False)
         if given > FEW_SEE or other < MAX_SEE:
             return []
-        evidence = f"the viewing axes of {given:.0%} of the cameras come together, inverted those of {other:.0%}"
+        evidence = f"the viewing axes of {given:.0%} of the cameras meet, {other:.0%} with inverted poses"
     return [
-        f"the poses seem to be the wrong way round, camera to world where world to camera is meant: {evidence}; "
-        "invert them if that is so"
+        f"the poses seem to be inverted, camera to world instead of world to camera: {evidence}; if so, invert them"
     ]
 
 
@@ -293,7 +297,7 @@ def _inverted(camera: Camera) -> Camera:
 
 
 def _seen(cameras: Sequence[Camera], points: Float) -> NDArray[np.bool_]:
-    """Returns [C, P] visibility as in `_sees`, for all cameras at once: a service may check hundreds of rigs."""
+    """Evaluates `_sees` for all cameras at once, [C, P], because a service may check hundreds of rigs."""
     poses, lenses = np.stack([one.world_to_camera for one in cameras]), np.stack([one.intrinsics for one in cameras])
     sizes = np.array([(one.width, one.height) for one in cameras])[:, None]
     there = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
@@ -304,7 +308,7 @@ def _seen(cameras: Sequence[Camera], points: Float) -> NDArray[np.bool_]:
 
 
 def _sees(camera: Camera, points: Float) -> NDArray[np.bool_]:
-    """Returns true for each point [P, 3] that is in front of the camera and within its image."""
+    """Returns whether each point [P, 3] is in front of the camera and within its image."""
     uv, _ = camera.project(points)  # NaN for points behind the camera
     with np.errstate(invalid="ignore"):
         inside = (uv >= 0) & (uv <= (camera.width, camera.height))
@@ -312,11 +316,11 @@ def _sees(camera: Camera, points: Float) -> NDArray[np.bool_]:
 
 
 def _come_together(cameras: Sequence[Camera], *, behind: bool) -> float:
-    """Returns the share of cameras whose image contains the point nearest to all viewing axes; 0 if there is no such
-    point.
+    """Returns the fraction of cameras that see the point nearest to all viewing axes; 0 if there is no such point.
 
     Args:
-        behind: also count a point behind a camera if its mirror image is within the camera's image.
+        cameras: cameras to check.
+        behind: whether a point behind a camera also counts as seen, if the camera sees its mirror image.
     """
     axes = np.array([camera.rotation[2] for camera in cameras])
     centres = np.array([camera.centre for camera in cameras])

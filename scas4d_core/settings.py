@@ -1,6 +1,6 @@
 """Settings of a scene: every value that a user can change, with its unit, range and the reason for its default.
 
-Values that only developers of the method would change are constants in the modules that use them.
+Values that only developers of the method would change are constants in the modules where they are used.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class SettingsModel(BaseModel):
-    """Base of all settings: instances are immutable, and an unknown name is an error."""
+    """Base class of all settings; instances are immutable, and unknown names are rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -38,28 +38,28 @@ class SceneSettings(SettingsModel):
 
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
-        description="Metres per unit of the calibration. 'auto' scales the rig's radius to 3 m. A single camera does "
-        "not determine a size: give a number that puts the subject about 3 m away.",
+        description="Metres per unit of the calibration. 'auto' scales the rig radius to 3 m. A single camera does not "
+        "determine the scale: give a number that places the subject about 3 m away.",
     )
-    image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
+    image_scale: float = Field(1.0, gt=0, le=1, description="Factor by which images are resized before any other step.")
     background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
         "auto",
-        description="RGB in 0…1 behind the scene. 'auto': the colour of a plain backdrop, else the mean of frame 0's "
-        "pictures.",
+        description="Background colour, RGB in 0…1. 'auto' uses the colour of a plain backdrop, or the mean of the "
+        "images of frame 0 if there is none.",
     )
     near: Positive | Literal["auto"] = Field(
         default="auto",
-        description="Near plane in metres: nothing closer to a camera is drawn. 'auto': a tenth of the rig's radius.",
+        description="Near plane in metres: nothing closer to a camera is rendered. 'auto': a tenth of the rig radius.",
     )
     floor: tuple[float, float, float, float] | None = Field(
         None,
-        description="Plane (a, b, c, d) in the user's world: a·x + b·y + c·z + d > 0 lies below the floor. None: no "
-        "floor term.",
+        description="Floor plane (a, b, c, d) in the user's world: points with a·x + b·y + c·z + d > 0 are below the "
+        "floor. If None, there is no floor term.",
     )
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
-        """The background as RGB; black until 'auto' is resolved (``fit_first_frame.with_background``)."""
+        """Background colour as RGB; black until 'auto' is resolved (``fit_first_frame.with_background``)."""
         return (0.0, 0.0, 0.0) if self.background == "auto" else self.background
 
     @field_validator("floor")
@@ -77,45 +77,45 @@ class StaticSettings(SettingsModel):
     1.0
     """
 
-    iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations of frame 0, one training view each.")
+    iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations for frame 0, one view each.")
     seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
         110.0,
-        description="Time limit for frame 0 in seconds, covering the initial points and the fit. With too few seconds, "
+        description="Time limit for frame 0 in seconds, covering the initial points and the fit. If it is too short, "
         "points are searched coarsely and the fit has fewer iterations (at least 500), so the result depends on the "
-        "machine. None: no limit.",
+        "machine. No limit if None.",
     )
     stop_gain: Share = Field(
         0.0,
-        description="Frame 0 stops early when no Gaussians are added any more and five rounds over all views lower the "
-        "mean training loss by less than this share. 0: never; 0.01 saves a simple scene part of its wait.",
+        description="Frame 0 stops early when no more Gaussians are added and five passes over all views reduce the "
+        "mean training loss by less than this fraction. 0 never stops early; 0.01 saves time on simple scenes.",
     )
     max_gaussians: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
         None,
-        description="Budget of Gaussians; densification stops there. None: 0.34 per pixel of a training picture and "
-        "0.27 more per foreground pixel, at most 100,000 (25,000 for an object at 256x256).",
+        description="Maximum number of Gaussians, at which densification stops. If None, 0.34 per pixel of a training "
+        "image and 0.27 more per foreground pixel, at most 100,000 (25,000 for an object at 256x256).",
     )
     detail: float = Field(
-        1.0, gt=0, le=1, description="Factor on that number of Gaussians where max_gaussians is None."
+        1.0, gt=0, le=1, description="Factor on the default number of Gaussians, used if max_gaussians is None."
     )
     exposure: bool | Literal["auto"] = Field(
         default="auto",
-        description="Learn a colour gain and offset per training camera; held-out cameras are scored without. 'auto': "
-        "stop learning them after 30 % of the iterations where the cameras agree, because then they only "
+        description="Learn a colour gain and offset per training camera; held-out cameras are evaluated without them. "
+        "'auto' stops learning them after 30 % of the iterations if the cameras agree, because they then only "
         "fit noise.",
     )
     refine_calibration: bool = Field(
         default=False,
-        description="Refine the cameras' poses on features of frame 0. The result is used only where it lowers the "
+        description="Refine the camera poses on image features of frame 0. The result is used only if it reduces the "
         "error of held-out features.",
     )
-    seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
+    seed: int = Field(0, ge=0, description="Random seed for the order of views and the splitting of Gaussians.")
 
 
 class LayerRates(SettingsModel):
     """Adam learning rates of one layer of clusters."""
 
-    rotation: Positive = Field(description="Per iteration, in units of tan(angle/2).")
-    translation: Positive = Field(description="Metres per iteration, for a scene radius of 4 m.")
+    rotation: Positive = Field(description="Rotation rate per iteration, in units of tan(angle/2).")
+    translation: Positive = Field(description="Translation rate in metres per iteration, for a scene radius of 4 m.")
 
 
 class Weights(SettingsModel):
@@ -123,20 +123,28 @@ class Weights(SettingsModel):
 
     mask: NotNegative = Field(
         1.0,
-        description="Weight of the same loss on the rendered label, where masks are given and at least a tenth of the "
-        "Gaussians is static. It separates moving from static Gaussians.",
+        description="Weight of the image loss between the rendered label and the mask, if masks are given and at least "
+        "a tenth of the Gaussians are static. It separates moving from static Gaussians.",
     )
     mask_alone: NotNegative = Field(
         0.3,
-        description="The same where nearly all Gaussians move: the pictures show the silhouette already, and hard mask "
-        "edges pull it off.",
+        description="Weight of the mask loss if nearly all Gaussians move: the images already show the silhouette, and "
+        "hard mask edges would distort it.",
     )
-    rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
+    rigidity: NotNegative = Field(
+        4.0,
+        description="Weight of the rigidity loss, as in Dynamic3DGaussians; the paper's ratio to the image loss is "
+        "0.19 to 0.05.",
+    )
     isometry: NotNegative = Field(
-        6.0, description="Three times the authors' weight: it ties distances, allows bending, and only helps."
+        6.0,
+        description="Weight of the isometry loss, three times the authors' weight: it preserves distances, allows "
+        "bending, and only helps.",
     )
-    rotation: NotNegative = Field(4.0, description="Likewise.")
-    scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
+    rotation: NotNegative = Field(4.0, description="Weight of the rotation loss, as in Dynamic3DGaussians.")
+    scale: NotNegative = Field(
+        10.0, description="Weight of the axis-length loss; the paper's ratio to the image loss is 0.48 to 0.05."
+    )
 
 
 class UpdateSettings(SettingsModel):
@@ -146,54 +154,57 @@ class UpdateSettings(SettingsModel):
     (64, 320, 1280)
     """
 
-    iterations: int = Field(100, ge=1, le=100_000, description="Iterations per frame.")
+    iterations: int = Field(100, ge=1, le=100_000, description="Number of iterations per frame.")
     views: int = Field(
         1,
         ge=1,
         le=8,
-        description="Training views per iteration; losses and gradients are their mean. The paper does not give a "
-        "number; its code base, Dynamic3DGaussians, uses one.",
+        description="Training views per iteration, over which losses and gradients are averaged. The paper does not "
+        "give a number; its code base, Dynamic3DGaussians, uses one.",
     )
     budget_ms: Annotated[float, Field(gt=0, le=3_600_000)] | None = Field(
         None,
-        description="Milliseconds that a frame may take, with decoding and commit. The number of iterations follows "
-        "from it, whatever `iterations` says. None: no limit.",
+        description="Time budget per frame in milliseconds, including decoding and commit. It determines the number of "
+        "iterations and overrides `iterations`. No limit if None.",
     )
     stop_gain: Share = Field(
         0.0,
-        description="An update decays its rates and ends once ten iterations lower its error on probe views by less "
-        "than this share, after all layers have started. 0: never.",
+        description="An update decays its learning rates and ends once ten iterations reduce its error on the probe "
+        "views by less than this fraction, after all layers have started. 0 never ends an update early.",
     )
     skip_tolerance: float = Field(
         0.0,
         ge=-1,
-        description="Skip the update when the previous state's error on probe views is at most (1 + skip_tolerance) "
-        "times the error after the last update. -1: never skip.",
+        description="Skip the update if the previous state's error on the probe views is at most (1 + skip_tolerance) "
+        "times the error after the last update. -1 never skips.",
     )
     reject_outliers: bool = Field(
         True,
-        description="Exclude outlying cameras, reject frames that do not fit, and never commit a state that is worse "
-        "than not moving. The frame's report gives the reasons.",
+        description="Exclude outlying cameras, reject frames that do not fit, and never commit a state that fits worse "
+        "than the unchanged previous state. The frame report gives the reasons.",
     )
     max_rejected_frames: int = Field(
         10,
         ge=1,
         le=1_000_000,
         description="After this many consecutive rejected frames, accept the next one as a new scene. Dark frames do "
-        "not count. A light that lasts this long is learnt as the scene's own.",
+        "not count. Lighting that lasts this long is learnt as that of the scene.",
     )
     clusters: tuple[Count, ...] = Field(
         (64, 320, 1280),
         max_length=16,
-        description="Clusters per layer, coarse to fine (the paper's). Empty: each Gaussian moves alone.",
+        description="Number of clusters per layer, coarse to fine, as in the paper. If empty, each Gaussian moves "
+        "independently.",
     )
     cluster_map: Literal["centred", "published"] = Field(
-        "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."
+        "centred",
+        description="Scale about the pivot ('centred', translation-equivariant) or the world origin ('published', as "
+        "in the paper).",
     )
     covariance: Literal["entangled", "separate"] = Field(
         "entangled",
-        description="A Gaussian's covariance follows the Jacobian of its map (paper), or is learnt separately by its "
-        "own ΔR and Δs (the paper's ablation).",
+        description="The covariance of a Gaussian follows the Jacobian of its map ('entangled', as in the paper), or "
+        "is learnt separately by its own ΔR and Δs ('separate', the paper's ablation).",
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (
@@ -202,49 +213,51 @@ class UpdateSettings(SettingsModel):
             LayerRates(rotation=0.002, translation=0.0004),
         ),
         min_length=1,
-        description="One per layer, coarse to fine; with more layers the last is repeated.",
+        description="Learning rates of each layer, coarse to fine; the last entry is repeated for further layers.",
     )
     deltas_start: Share = Field(
         0.4,
-        description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs start to learn. The cluster "
-        "layers start one after the other before.",
+        description="Fraction of the iterations after which each Gaussian's own Δp, ΔR and Δs are learnt. The cluster "
+        "layers start earlier, one after another.",
     )
     cold_start_iterations: Positive = Field(
-        3.0, description="Factor on the iterations of an update without a previous motion."
+        3.0, description="Factor on the number of iterations of an update without previous motion."
     )
     cold_start_rates: float = Field(
-        2.0, ge=1, description="Factor on the layers' rates in an update without a previous motion."
+        2.0, ge=1, description="Factor on the learning rates of the layers in an update without previous motion."
     )
-    rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
-    rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
-    rate_scale: NotNegative = Field(0.001, description="Δs, log.")
+    rate_position: Positive = Field(1.6e-4, description="Learning rate of Δp, per metre of scene radius.")
+    rate_rotation: Positive = Field(0.002, description="Learning rate of ΔR, in units of tan(angle/2).")
+    rate_scale: NotNegative = Field(0.001, description="Learning rate of Δs, on a logarithmic scale.")
     rate_colour: NotNegative = Field(0.0025, description="Learning rate of the RGB of moving Gaussians.")
     rate_static_colour: NotNegative = Field(
         0.01,
-        description="Learning rate of the RGB of static Gaussians, where static_colour is on. 0: they keep their "
+        description="Learning rate of the RGB of static Gaussians, if static_colour is on. If 0, they keep their "
         "colours.",
     )
     final_rate: float = Field(
         0.05,
         gt=0,
         le=1,
-        description="Each learning rate decays to this share on a half-cosine and ends when its layer is frozen. 1: "
-        "constant.",
+        description="Each learning rate decays along a half-cosine to this fraction, until its layer is frozen. 1 "
+        "keeps the rates constant.",
     )
-    beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
-    beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
+    beta1: float = Field(0.8, ge=0, lt=1, description="Decay rate of Adam's first moment.")
+    beta2: Share = Field(
+        0.95, description="Decay rate of Adam's second moment; 100 iterations are too few for the usual 0.999."
+    )
     momentum: Unit = Field(
-        0.0, description="Share of the previous residual motion, beyond the layers', from which Δp starts."
+        0.0, description="Fraction of the previous residual motion, beyond that of the layers, with which Δp starts."
     )
     weights: Weights = Field(default_factory=Weights)
-    use_masks: bool = Field(True, description="Use the frame's masks where it has any.")
-    seed: int = Field(0, ge=0, description="Seed of the order of views and of the sampled neighbours.")
+    use_masks: bool = Field(True, description="Use the masks of frames that have any.")
+    seed: int = Field(0, ge=0, description="Random seed for the order of views and the sampling of neighbours.")
 
     @field_validator("clusters")
     @classmethod
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
         if list(clusters) != sorted(set(clusters)):
-            raise InputError(f"clusters {clusters} do not ascend", "give the coarsest layer's first, the finest's last")
+            raise InputError(f"clusters {clusters} are not ascending", "give the coarsest layer first, the finest last")
         return clusters
 
 
@@ -266,16 +279,19 @@ class Settings(SettingsModel):
     update: UpdateSettings = Field(default_factory=UpdateSettings)
     effects: dict[str, Mode] = Field(
         default_factory=dict,
-        description='Effects (docs/effects.md) that are pinned "on" or "off", by name; the others are "auto": on where '
-        "the scene calls for them.",
+        description='Effects (docs/effects.md) that are pinned "on" or "off", keyed by name; all others are "auto" and '
+        "switched on if the scene needs them.",
     )
-    device: Literal["cpu"] = Field("cpu", description="Where the update runs: the CPU; it is the only engine so far.")
+    device: Literal["auto", "cpu", "gpu"] = Field(
+        "auto",
+        description="Device that fits and updates the scene (docs/gpu.md). `auto` uses an NVIDIA GPU if there is one.",
+    )
 
     @field_validator("device", mode="before")
     @classmethod
     def _has_an_engine(cls, device: object) -> object:
-        if device != "cpu":
-            raise InputError(f"device {device!r} has no engine; updates run on the CPU so far", "give 'cpu'")
+        if device not in ("auto", "cpu", "gpu"):
+            raise InputError(f"device {device!r} is not supported", "give 'auto', 'cpu' or 'gpu'")
         return device
 
     @field_validator("effects")

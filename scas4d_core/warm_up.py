@@ -20,10 +20,12 @@ _settled: set[KernelGroup] = set()
 def compile_in_processes(
     wanted: Iterable[KernelGroup] = EVERY, *, then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> None:
-    """Waits until the cache has the kernels of the groups ``wanted``; each group is requested once per process.
+    """Waits until all kernels of the groups ``wanted`` are in the cache; requests each group once per process.
 
     Args:
-        wanted, then, on_progress: see ``wait_for_kernels``.
+        wanted: kernel groups to wait for.
+        then: kernel groups that are compiled afterwards, without waiting for them.
+        on_progress: function called with the progress of the compilation.
     """
     asked = tuple(group for group in wanted if group not in _settled)
     if asked:
@@ -32,20 +34,20 @@ def compile_in_processes(
 
 
 def first_frame_groups(*, points: bool) -> tuple[KernelGroup, ...]:
-    """Returns the kernel groups that a first frame needs; ``points``: whether initial points are given."""
+    """Returns the kernel groups that a first frame needs, with or without initial points."""
     return (KernelGroup.FIRST_FRAME,) if points else (KernelGroup.FIRST_FRAME, KernelGroup.STEREO)
 
 
 def update_groups(covariance: str) -> tuple[KernelGroup, ...]:
-    """Returns the kernel groups that updates need; ``covariance`` is as in ``UpdateSettings``."""
+    """Returns the kernel groups that updates need for a ``covariance`` mode of ``UpdateSettings``."""
     return groups_of_update(covariance)
 
 
 def warm_up(on_progress: OnProgress) -> None:
-    """Waits until the cache has the kernels of a first frame; those of updates are compiled afterwards."""
+    """Waits until the kernels of a first frame are in the cache; those of updates are compiled afterwards."""
     compile_in_processes((KernelGroup.FIRST_FRAME,), then=groups_of_update("entangled"), on_progress=on_progress)
 
 
 def warm_up_updates() -> None:
-    """Waits until the cache has the kernels of updates."""
+    """Waits until the kernels of updates are in the cache."""
     compile_in_processes(groups_of_update("entangled"))

@@ -1,4 +1,4 @@
-"""Writes the table of effects in docs/effects.md from the effects: `PYTHONPATH=. python scripts/effects_table.py`."""
+"""Writes the table of effects in docs/effects.md: `PYTHONPATH=. python scripts/effects_table.py`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BEGIN, END = "<!-- effects -->\n", "<!-- end -->"
 
 
 def table() -> str:
-    """One row per effect, in the order of the registry."""
+    """Returns a Markdown table with one row per effect, in registry order."""
     lines = ["| effect | group | models | on by default |", "|---|---|---|---|"]
     for one in map(effect, EFFECTS):
         on = "by evidence" if one.auto else "yes"

@@ -25,12 +25,12 @@ def first_line(package: Path) -> str:
     """
     docstring = ast.get_docstring(ast.parse((package / "__init__.py").read_text(encoding="utf-8")))
     if not docstring:
-        raise ValueError(f"{package}/__init__.py has no docstring; give it one line that says what the folder holds")
+        raise ValueError(f"{package}/__init__.py has no docstring; give it one line that says what the folder contains")
     return docstring.splitlines()[0].replace("``", "`")
 
 
 def folders() -> Iterator[Path]:
-    """Yields every package of the product, parents before children, and `studies` without its parts."""
+    """Yields every product package, parents before children, then `studies` without its subpackages."""
     for name in PACKAGES:
         yield from sorted(path.parent for path in (ROOT / name).rglob("__init__.py"))
     yield ROOT / "studies"

@@ -1,9 +1,9 @@
-"""Makes samples/robot: fewer cameras and no tail of a capture in the Dynamic3DGaussians layout.
+"""Makes samples/robot from a capture in the Dynamic3DGaussians layout, with fewer cameras and frames.
 
     python scripts/make_sample.py CAPTURE samples/robot --cameras 16 --tests 2 --frames 14
 
-Frames are cut from the end only. Camera ids stay as they are, so that ``visible`` in gt_tracks.npz stays indexed by
-them; pictures, masks and labels are copied byte by byte.
+Frames are removed from the end only. Camera ids do not change, because ``visible`` in gt_tracks.npz is indexed by
+them. Images, masks and labels are copied byte for byte.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LIMIT_MB = 6.0
 
 
 def spread(centres: NDArray[np.float64], count: int) -> list[int]:
-    """Indices of ``count`` camera centres far from each other: farthest-point sampling from the first, in order."""
+    """Returns ``count`` sorted indices of camera centres far apart, by farthest-point sampling from the first."""
     chosen = [0]
     while len(chosen) < count:
         distances = np.linalg.norm(centres[:, None] - centres[chosen], axis=-1).min(axis=1)
@@ -30,7 +30,7 @@ def spread(centres: NDArray[np.float64], count: int) -> list[int]:
 
 
 def cut_meta(meta: dict[str, Any], frames: int, cameras: list[int]) -> dict[str, Any]:
-    """The first frames and some cameras of a train_meta or test_meta."""
+    """Returns a train_meta or test_meta reduced to the first ``frames`` frames and the given cameras."""
     return {
         key: [[row[camera] for camera in cameras] for row in value[:frames]] if isinstance(value, list) else value
         for key, value in meta.items()
@@ -38,7 +38,7 @@ def cut_meta(meta: dict[str, Any], frames: int, cameras: list[int]) -> dict[str,
 
 
 def main() -> None:
-    """Cut, copy, and check the size."""
+    """Writes the reduced capture and checks its size."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)
@@ -70,7 +70,7 @@ def main() -> None:
     scene = json.loads((options.source / "scene.json").read_text())
     scene["frames"] = options.frames
     scene["train_cams"], scene["test_cams"] = kept["train_meta.json"], kept["test_meta.json"]
-    # Measured on the whole capture, and no longer true of the sample: cameras and frames are missing.
+    # Measured on the whole capture; not valid for the sample, which has fewer cameras and frames.
     del scene["motion_px_per_frame"], scene["test_to_nearest_train_deg"]
     for part in scene["parts"]:
         if part.get("pose") is not None:

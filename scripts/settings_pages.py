@@ -1,7 +1,7 @@
-"""Writes the tables of settings into docs/service-settings.md and docs/settings.md, from the fields themselves.
+"""Writes the settings tables of docs/service-settings.md and docs/settings.md from the field definitions.
 
 python scripts/settings_pages.py            # writes
-python scripts/settings_pages.py --check    # says whether they are up to date
+python scripts/settings_pages.py --check    # exits with an error if a page is out of date
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ BEGIN, END = "<!-- settings: written by scripts/settings_pages.py -->", "<!-- en
 
 
 def cell(value: object) -> str:
-    """Text that stays one cell of a table."""
+    """Escapes a value so that it stays within one table cell."""
     return str(value).replace("|", "\\|").replace("\n", " ")
 
 
 def default(field: FieldInfo) -> str:
-    """As it would be written."""
+    """Returns the default value of a field as it appears in the table."""
     value: Any = field.get_default(call_default_factory=True)
     if value is PydanticUndefined:
         return "required"
@@ -43,7 +43,7 @@ def default(field: FieldInfo) -> str:
 
 
 def server_table() -> str:
-    """Of the service."""
+    """Returns the table of the service settings."""
     rows = ["| `SCAS4D_…`, in TOML in lower case | default | |", "|---|---|---|"]
     for name, field in ServerSettings.model_fields.items():
         rows.append(f"| `{name.upper()}` | {default(field)} | {cell(field.description)} |")
@@ -52,7 +52,7 @@ def server_table() -> str:
 
 
 def method_rows(model: type[BaseModel], path: str = "") -> Iterator[str]:
-    """Of the method, nested names with dots."""
+    """Yields one row per method setting; nested names are joined with dots."""
     for name, field in model.model_fields.items():
         inner = field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
@@ -62,7 +62,7 @@ def method_rows(model: type[BaseModel], path: str = "") -> Iterator[str]:
 
 
 def preset_rows() -> Iterator[str]:
-    """Of the presets, what each changes."""
+    """Yields one row per preset, with the settings that it changes."""
     usual = Settings().model_dump(mode="json")
     for name, settings in PRESETS.items():
         changes = format_changes(settings.model_dump(mode="json"), usual)
@@ -71,20 +71,20 @@ def preset_rows() -> Iterator[str]:
 
 
 def method_table() -> str:
-    """Of the method, and its presets."""
+    """Returns the table of the method settings, followed by the table of the presets."""
     settings = ["| setting | default | |", "|---|---|---|", *method_rows(Settings)]
     return "\n".join([*settings, "", "| preset | changes |", "|---|---|", *preset_rows()])
 
 
 def written(page: Path, table: str) -> str:
-    """The page with its table anew."""
+    """Returns the page with its table replaced."""
     before, _, rest = page.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
     return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
 
 
 def main() -> None:
-    """Writes, or checks."""
+    """Writes the pages, or with `--check` only compares them."""
     stale = []
     for name, table in (("service-settings.md", server_table()), ("settings.md", method_table())):
         page = DOCS / name
@@ -94,7 +94,7 @@ def main() -> None:
             if "--check" not in sys.argv:
                 page.write_text(text)
     if "--check" in sys.argv and stale:
-        raise SystemExit(f"docs/{', docs/'.join(stale)}: not up to date; run python scripts/settings_pages.py")
+        raise SystemExit(f"docs/{', docs/'.join(stale)}: out of date; run python scripts/settings_pages.py")
     print("written: " + ", ".join(stale) if stale else "up to date")
 
 

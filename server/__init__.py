@@ -1,1 +1,1 @@
-"""HTTP service that accepts frames, runs scenes in worker processes, and serves views, tracks and parts."""
+"""HTTP service that ingests frames, reconstructs scenes in worker processes, and serves views, tracks and parts."""

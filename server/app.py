@@ -58,11 +58,11 @@ from server.settings import ServerSettings
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
-    """Returns the application of the service.
+    """Creates the ASGI application of the service.
 
-    Run it with `server.connections.config.uvicorn_config`, as `scas4d serve` does. It also works with
-    `uvicorn --factory server.app:create_app`, but then nothing limits the data that a peer can send before its token is
-    checked.
+    Run it with `server.connections.config.uvicorn_config`, as `scas4d serve` does. It also runs under
+    `uvicorn --factory server.app:create_app`, but then nothing limits how much data a peer can send before its token
+    is checked.
     """
     settings = settings or ServerSettings.from_environment()
     if logging.getLogger("scas4d").level == logging.NOTSET:  # otherwise `serve` has set it
@@ -94,7 +94,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         summary="Online 4D reconstruction of calibrated multi-camera rigs.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
-        docs_url=None,  # `routes.reference` serves both pages
+        docs_url=None,  # `routes.reference` serves the API reference
         redoc_url=None,
     )
     app.state.settings = settings
@@ -171,7 +171,7 @@ def _answer_plain_requests(app: FastAPI, router: APIRouter) -> None:
     async def upgrade(request: Request) -> Response:
         raise Problem(
             426,
-            "this address is a WebSocket",
+            "this URL is a WebSocket endpoint",
             field="Upgrade",
             remedy="connect with ws:// or wss://",
             headers={"Upgrade": "websocket", "Connection": "Upgrade"},

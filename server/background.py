@@ -8,10 +8,10 @@ from typing import Any
 
 
 class Background:
-    """Set of a scene's background tasks, kept alive until they finish.
+    """Background tasks of a scene, with strong references so that they are not garbage-collected.
 
     Args:
-        failed: called with the exception that a task raised.
+        failed: called with the exception if a task raises one.
     """
 
     def __init__(self, failed: Callable[[BaseException], None]) -> None:
@@ -28,8 +28,8 @@ class Background:
         """Starts a task; tasks start in the order of the calls.
 
         Args:
-            coroutine: the body of the task.
-            endless: True for a task that runs until it is cancelled; such a task does not count as `busy`.
+            coroutine: coroutine to run.
+            endless: whether the task runs until it is cancelled; such a task does not count as `busy`.
         """
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)

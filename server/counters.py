@@ -1,4 +1,4 @@
-"""Prometheus counters and histograms of this process, updated by the code in which the event happens.
+"""Prometheus counters and histograms of this process, updated by the code that they instrument.
 
 This module imports no other module of the service, so that every part of the service can import it. The gauges are in
 `server.health.metrics`.
@@ -17,65 +17,67 @@ registry = CollectorRegistry()
 
 FRAMES = Counter(
     "scas4d_frames",
-    "Frames by what became of them: acknowledged, committed, failed, skipped, missing.",
+    "Frames that reached each state: acknowledged, committed, failed, skipped, missing.",
     ["state"],
     registry=registry,
 )
-INGEST_BYTES = Counter("scas4d_ingest_bytes", "Encoded pictures and masks of acknowledged frames.", registry=registry)
+INGEST_BYTES = Counter(
+    "scas4d_ingest_bytes", "Bytes of encoded images and masks in acknowledged frames.", registry=registry
+)
 DEGRADED = Counter(
     "scas4d_degraded_frames",
-    "Committed frames that were rejected (the previous state stays) or fitted in part.",
+    "Committed frames that were rejected (keeping the previous state) or only partly fitted.",
     ["how"],
     registry=registry,
 )
 DROPPED_CAMERAS = Counter(
     "scas4d_cameras_left_out",
-    "Cameras of committed frames that were not learnt from: nothing came, or it did not fit.",
+    "Cameras dropped from committed frames because of a missing, undecodable or outlying image.",
     registry=registry,
 )
 ALARMS = Counter(
     "scas4d_alarms",
-    "Alarms of committed frames, by what they are about.",
+    "Alarms raised in committed frames, by kind.",
     ["kind"],
     registry=registry,
 )
 for what in AlarmKind:
     ALARMS.labels(what.value)
 UPDATE_SECONDS = Histogram(
-    "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
+    "scas4d_update_seconds", "Duration of each stage of an update.", ["stage"], buckets=SECONDS, registry=registry
 )
 QUERY_SECONDS = Histogram(
     "scas4d_query_seconds",
-    "From the question to the answer of a scene's reader, by kind (render, tracks, parts, gaussians, ply) and outcome.",
+    "Time until a scene's reader answers a query, by kind (render, tracks, parts, gaussians, ply) and outcome.",
     ["kind", "outcome"],
     buckets=SECONDS,
     registry=registry,
 )
 STREAM_MISSED = Counter(
     "scas4d_stream_missed",
-    "Messages that slow subscribers missed because a newer one took their place.",
+    "Messages that slow subscribers missed because newer messages replaced them.",
     registry=registry,
 )
 RESTARTS = Counter(
     "scas4d_process_restarts",
-    "Processes of scenes that ended by themselves and were replaced.",
+    "Scene processes that exited unexpectedly and were restarted.",
     ["process"],
     registry=registry,
 )
 DAMAGE = Counter(
     "scas4d_damage",
-    "Damage found on disk while the service ran: state, checkpoint, fixed, journal, frame, definition, points.",
+    "Damaged files found while the service was running: state, checkpoint, fixed, journal, frame, definition, points.",
     ["kind"],
     registry=registry,
 )
 SCRUBBED = Counter(
-    "scas4d_scrubbed_bytes", "Read again in the background and compared with their checksums.", registry=registry
+    "scas4d_scrubbed_bytes", "Bytes reread in the background and verified against checksums.", registry=registry
 )
 for kind in ("state", "checkpoint", "fixed", "journal", "frame", "definition", "points"):
     DAMAGE.labels(kind)
 CONNECTIONS_REFUSED = Counter(
     "scas4d_connections_refused",
-    "Connections and requests that were ended before the application was asked, by reason.",
+    "Connections and requests that were refused before they reached the application, by reason.",
     ["reason"],
     registry=registry,
 )

@@ -1,6 +1,6 @@
-"""Hub that publishes the events of scenes to their listeners.
+"""Hub that publishes the events of each scene to its listeners.
 
-Publishing passes an event to every listener of a scene and never waits for a listener.
+Publishing calls every listener of the scene and never waits for one.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class SceneChanged:
-    """Event for a change of the scene's state, progress or queue."""
+    """Event published when a scene's state, progress or queue changes."""
 
 
 @dataclass(frozen=True)
 class FrameFinished:
-    """Event for a frame that was committed, or that finished without a state of its own."""
+    """Event published when a frame is committed, or finishes without a state of its own."""
 
     report: FrameReportModel
 
@@ -40,7 +40,7 @@ Event = SceneChanged | FrameFinished
 
 
 class Listener(Protocol):
-    """Interface of a subscriber to the hub; all methods return immediately."""
+    """Interface of a hub listener; all methods must return immediately."""
 
     def on_event(self, event: Event) -> None:
         """Handles an event of the scene."""
@@ -49,14 +49,14 @@ class Listener(Protocol):
         """Handles the deletion of the scene."""
 
     def on_restart(self) -> None:
-        """Handles the restart of the scene, after which the listener may join it again."""
+        """Handles the restart of the scene, after which the listener can join again."""
 
 
 L = TypeVar("L", bound=Listener)
 
 
 class Channel:
-    """Listeners of one scene and the queries that they share."""
+    """Listeners of one scene and the queries shared between them."""
 
     def __init__(self, ask: AskReaders) -> None:
         self.listeners: list[Listener] = []
@@ -64,7 +64,7 @@ class Channel:
         self._status: str | None = None
 
     def invalidate_status(self) -> None:
-        """Discards the cached status because it has changed."""
+        """Discards the cached status after a change."""
         self._status = None
 
     def status(self, read: Callable[[], SceneStatus]) -> str:
@@ -95,7 +95,7 @@ class Hub:
         if len(channel.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"this scene has the maximum number of subscribers: {len(channel.listeners)}",
+                f"this scene already has the maximum number of subscribers, {len(channel.listeners)}",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
                 remedy="close another subscriber of the scene, or raise the limit",
@@ -141,7 +141,7 @@ class Hub:
             listener.on_close(reason)
 
     def restart(self, scene: str) -> None:
-        """Closes the channel of a scene that restarts; its listeners join again on their own."""
+        """Closes the channel of a restarting scene; its listeners are expected to rejoin."""
         for listener in self._remove_channel(scene):
             listener.on_restart()
 
@@ -151,10 +151,10 @@ class Hub:
 
 
 class Publisher:
-    """Publisher of one scene's events, which also counts its finished frames in the metrics.
+    """Publisher of one scene's events that also updates the frame metrics.
 
     Args:
-        hub: the hub of the service.
+        hub: hub of the service.
         scene: id of the scene.
     """
 
@@ -168,7 +168,7 @@ class Publisher:
         return self._hub.count(self._scene)
 
     def publish_status(self) -> None:
-        """Publishes a change of the scene's status; call it at every change."""
+        """Notifies listeners that the scene's status has changed; call it after every change."""
         self._hub.publish(self._scene, SceneChanged())
 
     def publish_frame(self, report: FrameReportModel) -> None:

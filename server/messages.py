@@ -19,9 +19,9 @@ from server.storage.layout import SceneFolder
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """Description of a scene that its processes receive at start.
+    """Specification of a scene that is passed to its processes at startup.
 
-    A worker's `folder` carries the worker's epoch, if it has one.
+    For a worker that has an epoch, `folder` includes the epoch.
     """
 
     folder: SceneFolder
@@ -31,7 +31,7 @@ class SceneSpec:
     retention: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
     nodes: Mapping[str, str] = field(default_factory=dict)
-    """Labels that a node must have to run the scene's processes."""
+    """Labels required of a node that runs the scene's processes."""
 
 
 # Messages to the worker.
@@ -39,17 +39,17 @@ class SceneSpec:
 
 @dataclass(frozen=True)
 class ChangeRetention:
-    """Request to the worker to apply new retention rules for states, effective immediately."""
+    """Request to the worker to apply new retention rules for states immediately."""
 
     rules: IngestSettings
 
 
 @dataclass(frozen=True)
 class FrameReady:
-    """Announcement of a frame whose images are in records of the frame log (`server.storage.frame_store`).
+    """Notification that a frame's images are available in the frame log (`server.storage.frame_store`).
 
-    `identity` is checked if a single record holds the whole frame. If each camera has its own record, damaged records
-    are left out. `budget` applies to this frame no matter when it is reconstructed.
+    `identity` is verified if a single record contains the whole frame. If each camera has its own record, damaged
+    records are skipped. `budget` applies to this frame no matter when it is reconstructed.
     """
 
     index: int
@@ -61,9 +61,9 @@ class FrameReady:
 
 @dataclass(frozen=True)
 class RepairFiles:
-    """Request to the worker to check damaged or missing files of the states folder and to rewrite them if it can.
+    """Request to the worker to check damaged or missing files of the states folder and to rewrite them if possible.
 
-    `times` and `reports` hold the values for those frames that the service still has in memory.
+    `times` and `reports` have entries for the frames that the service still has in memory.
     """
 
     names: tuple[str, ...]
@@ -89,11 +89,11 @@ class Stop:
 
 @dataclass(frozen=True)
 class Ready:
-    """Notification that the worker accepts frames.
+    """Notification that the worker is ready to accept frames.
 
-    `indices` are the committed frames that it found, `damaged` those that it could not read, and `report` is the newest
-    report. `undone` lists frames whose commit was rolled back and which must be sent again. `faults` gives the reasons,
-    one sentence each.
+    `indices` lists the committed frames that it found, `damaged` maps the unreadable ones to the reason, and `report`
+    is the newest report. `undone` lists frames whose commit was rolled back and which must be sent again. `faults`
+    explains why, in one sentence per fault.
     """
 
     indices: tuple[int, ...] = ()
@@ -138,7 +138,7 @@ class Progressed:
 
 @dataclass(frozen=True)
 class StatesRetained:
-    """Notification that new retention rules are in effect and have deleted the states of these frames."""
+    """Notification that new retention rules are in effect; `deleted` lists the frames whose states were deleted."""
 
     deleted: tuple[int, ...]
 
@@ -178,7 +178,7 @@ class RepairOutcome(StrEnum):
     REPORT_LOST = "report_lost"
     """The state was rewritten with identical contents; its report was damaged and is not in memory."""
     DAMAGED = "damaged"
-    """The file is damaged, and memory holds no copy from which to rewrite it."""
+    """The file is damaged, and there is no copy in memory from which to rewrite it."""
     GONE = "gone"
     """The file is no longer needed: retention deleted its frame, or the frame was rolled back."""
     RECOMPUTED = "recomputed"
@@ -186,9 +186,9 @@ class RepairOutcome(StrEnum):
     LOST = "lost"
     """The state could not be recomputed."""
     LATER = "later"
-    """The state is recomputed once the preceding state has been."""
+    """The state will be recomputed after the preceding state has been recomputed."""
     NO_ROOM = "no_room"
-    """The disk is full; the repair is retried."""
+    """The disk is full; the repair will be retried."""
 
 
 @dataclass(frozen=True)
@@ -206,19 +206,19 @@ class RepairResult:
 
 @dataclass(frozen=True)
 class DamageFound:
-    """Files of the states folder that could not be read: a mapping from name to reason."""
+    """Notification of unreadable files in the states folder; `files` maps each name to the reason."""
 
     files: dict[str, str]
 
 
-# Messages of the replayer, which runs one process per replay.
+# Messages to and from the replay process; each replay has its own process.
 
 
 @dataclass(frozen=True)
 class ReplaySpec:
-    """Frames to update again in memory, once per entry of `iterations`; `base` is the commit before them.
+    """Specification of a replay, which repeats the updates of `frames` in memory for each entry of `iterations`.
 
-    `first` is the scene's first frame, which every update needs.
+    `base` is the committed frame before them, and `first` is the scene's first frame, which every update needs.
     """
 
     scene: SceneSpec
@@ -251,13 +251,14 @@ class ReplayEnded:
     fault: str | None = None
 
 
-# Messages of the exporter, which runs one process per export.
+# Messages to and from the export process; each export has its own process.
 
 
 @dataclass(frozen=True)
 class ExportSpec:
-    """Committed frames to write to `file` in a format of `scas4d_core.exports`; `file` has a folder of its own.
+    """Specification of an export, which writes committed frames to `file` in a format of `scas4d_core.exports`.
 
+    `file` has its own folder.
     `first` is the scene's first frame, whose report every export needs. `ids` selects the Gaussians for the `tracks`
     format; None selects all moving Gaussians.
     """
@@ -272,7 +273,7 @@ class ExportSpec:
 
 @dataclass(frozen=True)
 class ExportProgressed:
-    """Progress of an export: `done` frames are written, and its folder holds `size` bytes."""
+    """Progress of an export: `done` frames have been written, and its folder takes `size` bytes."""
 
     done: int
     size: int

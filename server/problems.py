@@ -1,4 +1,4 @@
-"""Problem documents (RFC 9457) in which every error names the field, the value and the remedy."""
+"""Problem documents (RFC 9457) that report the field, the value and the remedy of every error."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from scas4d_core.rig_checks import RigError
 
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
-"""Length in characters at which a value quoted in a response is cut, since it may be a whole point cloud."""
-SERVICE_FAULT = "this is a fault of the service; its log has the traceback"
-"""Remedy given when the service itself failed."""
+"""Maximum number of characters of a value quoted in a response, since the value may be a whole point cloud."""
+SERVICE_FAULT = "this is a bug in the service; the traceback is in its log"
+"""Remedy reported when the service itself failed."""
 
 
 class Problem(HTTPException):
@@ -28,11 +28,11 @@ class Problem(HTTPException):
 
     Args:
         status: HTTP status, 400…599.
-        detail: description of the fault, one sentence for a human reader.
-        remedy: action that fixes the fault, for a human reader.
-        field: the parameter or field at fault.
-        value: the value given for the field; it is quoted and shortened.
-        headers: additional headers of the response.
+        detail: human-readable description of the fault, in one sentence.
+        remedy: human-readable advice on how to fix the fault.
+        field: name of the invalid parameter or field.
+        value: value that was given for the field; shortened if it is long.
+        headers: additional response headers.
         more: additional members of the document, such as `expected`.
     """
 
@@ -65,7 +65,7 @@ def rig_problem(error: RigError) -> Problem:
 
 
 def count_noun(count: int, noun: str) -> str:
-    """Returns a count with its noun in singular or plural: 1 camera, 2 cameras."""
+    """Returns a count followed by its noun in the singular or plural, such as "1 camera" or "2 cameras"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
@@ -78,7 +78,7 @@ def quote(value: object) -> str:
 def problem_response(document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
     """Returns an HTTP response with the problem document.
 
-    The body is escaped to ASCII so that lone surrogates can be quoted, too.
+    The body is escaped to ASCII so that it can contain lone surrogates.
     """
     body = json.dumps(document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
     return Response(body, document.status, dict(headers or {}), media_type=MEDIA_TYPE)
@@ -87,8 +87,8 @@ def problem_response(document: ProblemDetails, headers: Mapping[str, str] | None
 async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
     """Responds to a request or a WebSocket handshake with a problem, from code outside the routes."""
     if scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
-        # This server cannot send a document in response to a handshake. Code 1008 means a policy violation, and a close
-        # reason holds at most 123 bytes.
+        # This server cannot respond to a handshake with a document. Code 1008 means policy violation, and a close
+        # reason is limited to 123 bytes.
         await send({"type": "websocket.close", "code": 1008, "reason": str(problem.document.detail)[:120]})
         return
     await problem_response(problem.document, problem.headers)(scope, receive, send)
@@ -108,7 +108,7 @@ def simplify_tuples(schema: Any) -> None:
 
 
 def first_sentence(text: str) -> str:
-    """Returns the first sentence of a text, or the part before its semicolon, without the final punctuation mark.
+    """Returns the first sentence of a text, or its part before a semicolon, without the final punctuation mark.
 
     >>> first_sentence("Lists all scenes; wakes none. More.")
     'Lists all scenes'
@@ -119,7 +119,7 @@ def first_sentence(text: str) -> str:
 def openapi_document(app: FastAPI) -> dict[str, Any]:
     """Returns the OpenAPI document of the service.
 
-    Adds to FastAPI's document the summaries, the media type of errors, and bearer authentication if a token is set.
+    Extends FastAPI's document with summaries, the media type of errors, and bearer authentication if a token is set.
     """
     token = app.state.settings.token is not None
     if app.openapi_schema is None:
@@ -136,16 +136,16 @@ def openapi_document(app: FastAPI) -> dict[str, Any]:
             simplify_tuples(schema)
         if token:
             schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
-            schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "SCAS4D_TOKEN of the service."}
+            schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "The service's SCAS4D_TOKEN."}
             written["security"] = [{"bearer": []}]
     assert app.openapi_schema is not None  # FastAPI.openapi caches its result
     return app.openapi_schema
 
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {"description": "The request is wrong: field, value and remedy.", "model": ProblemDetails},
-    "5XX": {"description": "The service failed, or cannot answer now.", "model": ProblemDetails},
-    422: {"description": "A field has a wrong value.", "model": ProblemDetails},
+    "4XX": {"description": "The request is invalid; see field, value and remedy.", "model": ProblemDetails},
+    "5XX": {"description": "The service failed or is temporarily unavailable.", "model": ProblemDetails},
+    422: {"description": "A field has an invalid value.", "model": ProblemDetails},
 }
-"""Responses that the OpenAPI document lists for every route."""
+"""Error responses that the OpenAPI document lists for every route."""
 PROBLEM = {"$ref": "#/components/schemas/ProblemDetails"}

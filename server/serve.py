@@ -1,4 +1,4 @@
-"""Process of the service: logging, signals and uvicorn."""
+"""Entry point of the service process: sets up logging, signal handlers and uvicorn."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ log = logging.getLogger("scas4d.server")
 
 
 class Server(uvicorn.Server):
-    """uvicorn server that logs a greeting with its address once it listens.
+    """Uvicorn server that logs a greeting once it accepts requests.
 
     Args:
-        config: configuration of uvicorn.
-        greeting: sentence that is logged once the server accepts requests.
+        config: uvicorn configuration.
+        greeting: message to log.
     """
 
     def __init__(self, config: uvicorn.Config, greeting: str) -> None:
@@ -48,24 +48,24 @@ class Server(uvicorn.Server):
 def serve(settings: ServerSettings) -> None:
     """Runs the service until SIGTERM or SIGINT.
 
-    On a signal it accepts no more connections, closes WebSockets (1012), responds to pending requests, and asks the
-    scenes' processes to exit within `STOP_SECONDS`. Unfinished frames remain in the frame log and are resumed at the
-    next start.
+    On a signal, it stops accepting connections, closes WebSockets (1012), responds to pending requests, and asks the
+    scenes' processes to exit within `STOP_SECONDS`. Unfinished frames remain in the frame log and are processed after
+    the next start.
 
     Raises:
-        RuntimeError: the address or the data folder is in use or not available.
+        RuntimeError: the address or the data folder is unavailable or already in use.
     """
     prepare = partial(logs.configure, settings.log_format, settings.log_level)
     prepare()
     for name in unknown_names(os.environ):
-        log.warning("%s is not a setting and was ignored; docs/service-settings.md lists them", name)
+        log.warning("%s is not a setting and was ignored; docs/service-settings.md lists all settings", name)
     try:
         lock_data(settings.data).release()  # early check; the application takes the lock at startup
     except OSError as error:
         raise RuntimeError(f"data folder {settings.data}: {error.strerror}; choose another one with --data") from None
     placement = _placement(settings, prepare)
     sockets = listen(settings.host, settings.port)
-    asyncio.run(placement.open())  # early check, too
+    asyncio.run(placement.open())  # another early check
     asyncio.run(placement.announce(settings.host, sockets[0].getsockname()[1]))
     retain_freed_memory()
     config = uvicorn_config(
@@ -79,10 +79,10 @@ def serve(settings: ServerSettings) -> None:
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: None)
     greeting = (
-        f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; Ctrl-C ends the service"
+        f"listening; viewer at {address(settings.host, sockets)}, scenes in {settings.data}; press Ctrl-C to stop"
     )
     Server(config, greeting).run(sockets)
-    log.info("ended")
+    log.info("stopped")
 
 
 def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placement:
@@ -97,18 +97,18 @@ def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placeme
         from server.cluster.ray_placement import RayPlacement
     except ModuleNotFoundError:
         raise RuntimeError(
-            "placement is ray, and Ray is not installed; pip install 'scas4d[ray]', or use --placement local"
+            "placement is ray, but Ray is not installed; pip install 'scas4d[ray]', or use --placement local"
         ) from None
     return RayPlacement(prepare, settings.placement.partition("=")[2] or None, settings)
 
 
 def _limit_to_open_files(settings: ServerSettings) -> ServerSettings:
-    """Returns settings whose connection limit fits the system's limit on open files."""
+    """Returns the settings with the connection limit reduced to what the system's limit on open files allows."""
     room = raise_open_file_limit(settings.max_connections)
     if room < settings.max_connections:
         log.warning(
-            "SCAS4D_MAX_CONNECTIONS is %d, but the limit on open files allows only %d connections; raise that limit "
-            "(ulimit -n)",
+            "SCAS4D_MAX_CONNECTIONS is %d, but the limit on open files allows only %d connections; raise the limit on "
+            "open files (ulimit -n)",
             settings.max_connections,
             room,
         )
@@ -116,15 +116,15 @@ def _limit_to_open_files(settings: ServerSettings) -> ServerSettings:
 
 
 def listen(host: str, port: int) -> list[socket.socket]:
-    """Binds one socket per address of the host on this machine, all to the same port, and returns them.
+    """Binds a socket to each local address of the host, all on the same port, and returns the sockets.
 
     Raises:
-        RuntimeError: this machine has no such address, or the port is not available.
+        RuntimeError: the host is not an address of this machine, or the port is unavailable.
     """
     sockets: list[socket.socket] = []
     try:
         for family, kind, protocol, _, where in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-            # With port 0, all addresses use the port that the first one was assigned.
+            # With port 0, all addresses use the port assigned to the first one.
             free = sockets[0].getsockname()[1] if sockets else port
             with contextlib.suppress(_AddressUnavailableError):
                 sockets.append(_bind(family, kind, protocol, (where[0], free, *where[2:])))
@@ -135,18 +135,18 @@ def listen(host: str, port: int) -> list[socket.socket]:
             opened.close()
         if error.errno == errno.EADDRINUSE:
             raise RuntimeError(
-                f"port {port} of {host} is in use, perhaps by another `scas4d serve`; stop it, or use another port: "
+                f"port {port} of {host} is in use, perhaps by another `scas4d serve`; stop it, or choose another port: "
                 f"--port {port + 1 if port < 65535 else 8000}, or 0 for any free port"
             ) from None
         raise RuntimeError(
-            f"cannot listen at {host}, port {port}: {error.strerror}; give an address of this machine (--host) and a "
-            "port that this user may take (--port)"
+            f"cannot listen on {host}, port {port}: {error.strerror}; choose an address of this machine (--host) and a "
+            "port that this user may bind (--port)"
         ) from None
     return sockets
 
 
 class _AddressUnavailableError(Exception):
-    """Address that this machine does not have, such as ::1 if IPv6 is disabled."""
+    """Error for an address that this machine does not have, such as ::1 if IPv6 is disabled."""
 
 
 def _bind(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> socket.socket:
@@ -157,7 +157,7 @@ def _bind(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> sock
     try:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if family == socket.AF_INET6:
-            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)  # IPv4 has its own socket
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)  # IPv4 has a separate socket
         opened.bind(where)
     except OSError as error:
         opened.close()

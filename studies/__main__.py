@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def remedy(missing: ModuleNotFoundError) -> str:
-    """Prints what to install if a package such as matplotlib is missing; studies need all test dependencies."""
+    """Returns what to install if a package such as matplotlib is missing; studies need all test dependencies."""
     return f"this needs {missing.name}, which is not installed; in the checkout: scripts/setup dev"
 
 

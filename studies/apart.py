@@ -12,7 +12,7 @@ def in_a_process(function: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a function of a module in a new process; returns its result or raises its exception.
 
     Raises:
-        BrokenProcessPool: the process ended before it answered: out of memory, or killed.
+        BrokenProcessPool: the process ended before it returned a result, for example because it ran out of memory.
     """
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as apart:
         return apart.submit(function, *arguments).result()

@@ -12,10 +12,12 @@ from scas4d_core.captures import Capture
 
 
 def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS, **more: Any) -> Capture:
-    """Opens a capture for a study; without test cameras, it measures on the training cameras and prints a note.
+    """Opens a capture for a study. If it has no test cameras, uses the training cameras instead and prints a note.
 
     Args:
-        folder: of the capture. options: how it is read. more: as in `open_source`.
+        folder: folder of the capture.
+        options: how the capture is read.
+        more: further arguments, as for `open_source`.
 
     >>> open_measured("samples/robot").full_test_rig.names
     ('4', '11')

@@ -1,4 +1,4 @@
-"""List of all studies of `scripts/bench`. The modules of a study are imported when it runs."""
+"""All studies of `scripts/bench`. The modules of a study are imported only when it runs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import typer
 
 from studies.cluster.commands import cluster, head
 from studies.compact.commands import compact, opening
+from studies.devices.commands import devices
 from studies.effort.commands import effort
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
@@ -32,11 +33,11 @@ STUDIES = {
     "Rigs": (rigs, calibration, drift),
     "What comes out": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
-    "Speed of the code": (kernels, moving, scale, startup),
+    "Speed of the code": (kernels, moving, scale, startup, devices),
     "Hard cases": (stability, timing),
     "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster, head, simulate),
 }
-"""The commands by the heading under which `scripts/bench --help` lists them."""
+"""Maps each heading of `scripts/bench --help` to its commands."""
 
 app = typer.Typer(
     name="scripts/bench",

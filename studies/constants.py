@@ -1,4 +1,4 @@
-"""Variation of the method's internal constants, each in the module that uses it."""
+"""Temporary changes to the method's internal constants, each in the module that uses it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ def varied(place: str, value: Any) -> Iterator[None]:
     A constant that a compiled kernel reads keeps the value that the kernel was compiled with.
 
     Args:
-        place: dotted name, as ``"scas4d_core.update.rates.LAYER_STARTS"``. value: to be had within the block.
+        place: dotted name, such as ``"scas4d_core.update.rates.LAYER_STARTS"``.
+        value: value of the constant within the block.
 
     Raises:
         AttributeError: the module has no such constant.
@@ -37,7 +38,7 @@ def varied(place: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def all_varied(constants: Iterable[tuple[str, Any]]) -> Iterator[None]:
-    """Temporarily sets several constants, see ``varied``; each is given by its dotted name and the value."""
+    """Temporarily sets several constants, given as pairs of dotted name and value; see ``varied``."""
     with ExitStack() as stack:
         for place, value in constants:
             stack.enter_context(varied(place, value))

@@ -1,4 +1,4 @@
-"""Machine and sources that a figure was measured on, in words."""
+"""Description of the machine and sources that a figure was measured on."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import Any
 import scas4d_core
 
 CPU_INFO = Path("/proc/cpuinfo")
-"""Where Linux names the processor; other systems report it through Python."""
+"""File in which Linux names the processor; other systems report the name through Python."""
 
 
 def machine() -> dict[str, Any]:
-    """Returns processor, usable cores, memory, system and Python version, for a row of a study."""
+    """Returns the processor, usable cores, memory, system and Python version, for a row of a study."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     facts: dict[str, Any] = {"processor": processor(), "cores": cores}
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
@@ -61,7 +61,7 @@ def resident_mb(pid: int | None = None) -> float:
 def core_version() -> str:
     """Returns eight hexadecimal digits that identify the sources of the method (all of ``scas4d_core``).
 
-    Settings name a row; this says which rows come from the same code.
+    Settings identify a row; this version shows which rows come from the same code.
     """
     root = Path(scas4d_core.__file__).parent
     hasher = hashlib.sha256()

@@ -9,29 +9,29 @@ from typing import Annotated
 import typer
 
 Echo = Callable[[str], None]
-"""Takes each line that a study prints."""
+"""Prints one line of a study's output."""
 QUALITY = Path("out/quality")
-"""Folder of the study of quality, which other studies read."""
+"""Folder of the quality study, which other studies read."""
 FRONTIER = Path("out/frontier")
-"""Folder of the study of accuracy against time, which the paper's and the effort's studies share."""
+"""Folder of the study of accuracy against time, which the paper and effort studies share."""
 
 Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
 Repeated = Annotated[
-    Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; a short one is played back and forth.")
+    Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; a short capture is played back and forth.")
 ]
 Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders of captures.")]
 Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
 Changes = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=20. May be repeated."),
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting: update.iterations=20. May be repeated."),
 ]
-Again = Annotated[bool, typer.Option("--again", help="Measure rows anew that are there (kept frames 0 are used).")]
+Again = Annotated[bool, typer.Option("--again", help="Measure existing rows again, from their stored frames 0.")]
 
 
 def write_part(path: Path, text: str) -> None:
-    """Replaces the part of a page between two marks, which are the first and the last line of ``text``.
+    """Replaces the part of a page between two markers, which are the first and the last line of ``text``.
 
-    The rest of the page stays. Without the marks the text goes to the end.
+    The rest of the page is kept. If the markers are missing, the text is appended.
     """
     begin, end = text.splitlines()[0], text.splitlines()[-1]
     old = path.read_text() if path.exists() else ""

@@ -1,8 +1,8 @@
-"""API requests as values, one module per resource, shared by the sync and the async client.
+"""API requests as `Call` objects, one module per resource, shared by the sync and async clients.
 
 In the examples, `client` is a `client.sdk.Client`, and `scene` is the id of a scene with frames 0 to 2 committed. `rig`
-is its rig of two cameras. `open_scene` is the id of a scene that accepts further frames, and `pictures` maps camera
-names to PNG files. `np` is numpy, and `time` is the module.
+is its two-camera rig. `open_scene` is the id of a scene that still accepts frames, and `pictures` maps camera names to
+PNG files. `np` is NumPy, and `time` is the standard library module.
 """
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff

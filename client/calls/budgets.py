@@ -1,4 +1,4 @@
-"""Calls for update budgets and for the measured trade-off between accuracy and time."""
+"""Calls for update budgets and the measured trade-off between accuracy and time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from client.wire.budgets import BudgetFields
 
 
 def budget(id: str) -> Call[SceneBudget]:
-    """Returns the budget of a scene's updates.
+    """Returns the update budget of a scene.
 
     >>> client.budget(scene).effective.iterations
     100
@@ -24,8 +24,8 @@ def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
 
     Args:
         id: id of the scene.
-        budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, still. A field that is omitted or None
-            takes the value from the scene's settings.
+        budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, skip_tolerance. Fields that are
+            omitted or None default to the scene's settings.
 
     >>> found = client.set_budget(scene, iterations=50)
     >>> found.effective.iterations, found.since
@@ -46,9 +46,9 @@ def tradeoff(id: str) -> Call[TradeoffModel]:
 
 
 def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) -> Call[TradeoffModel]:
-    """Measures other iteration counts by replaying the updates of the newest frames in the background, in memory.
+    """Measures other iteration counts by replaying the updates of the newest frames in memory, in the background.
 
-    `tradeoff` reports the progress, and the results when the replay has finished.
+    `tradeoff` reports the progress and, once the replay has finished, the results.
 
     Args:
         id: id of the scene.

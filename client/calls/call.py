@@ -1,4 +1,4 @@
-"""API request as a value (`Call`), with helpers for paths, request bodies and response parsing."""
+"""Description of an API request (`Call`), with helpers for paths, request bodies and response parsing."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ NPZ = "application/vnd.numpy.npz"
 
 @dataclass(frozen=True)
 class Call(Generic[T]):
-    """Single request to the service.
+    """Description of a single request to the service.
 
     Attributes:
         method: HTTP method.
-        path: path relative to the address of the service.
+        path: URL path, relative to the service address.
         parse: converts the response to the return value of the call.
         repeatable: whether the request is idempotent, so that a client may retry it.
-        arguments: further arguments of `httpx.Client.request`.
+        arguments: additional arguments for `httpx.Client.request`.
     """
 
     method: str
@@ -43,12 +43,12 @@ class Call(Generic[T]):
 
 
 def path(*parts: str | int) -> str:
-    """Returns a path below /v1/scenes; each part is URL-quoted."""
+    """Returns the URL path of a resource under /v1/scenes; each part is percent-encoded."""
     return "/".join(["/v1/scenes", *(quote(str(part), safe="") for part in parts)])
 
 
 def json_reader(model: type[M]) -> Callable[[httpx.Response], M]:
-    """Returns a function that parses the JSON of a response as a wire model."""
+    """Returns a function that parses a JSON response as a wire model."""
     return lambda response: model.model_validate_json(response.content)
 
 
@@ -57,22 +57,22 @@ def nothing(response: httpx.Response) -> None:
 
 
 def body(model: BaseModel) -> dict[str, Any]:
-    """Returns the request arguments for a wire model as JSON; unset fields are omitted."""
+    """Returns the request arguments that send a wire model as JSON; unset fields are omitted."""
     return {"json": model.model_dump(mode="json", exclude_unset=True)}
 
 
 def wire_camera(camera: Camera | str) -> CameraModel | str:
-    """Returns a camera name unchanged, or the wire model of a camera."""
+    """Returns the wire model of a camera; camera names are returned unchanged."""
     return camera if isinstance(camera, str) else CameraModel.of(camera)
 
 
 def read_picture(response: httpx.Response) -> NDArray[Any]:
-    """Returns the decoded PNG, JPEG or WebP as [H, W, 3] or [H, W], with 8 bits, or 16 bits for depth."""
+    """Decodes a PNG, JPEG or WebP response to an array [H, W, 3] or [H, W]: uint8, or 16-bit for depth."""
     with Image.open(io.BytesIO(response.content)) as picture:
         return np.array(picture)
 
 
 def read_npz(response: httpx.Response) -> dict[str, NDArray[Any]]:
-    """Returns the arrays of an npz by name; pickled data is refused."""
+    """Returns the arrays in an npz response, keyed by name; refuses pickled data."""
     with np.load(io.BytesIO(response.content), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

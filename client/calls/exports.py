@@ -1,4 +1,4 @@
-"""Calls for exports: files with many frames in third-party formats, which the service writes in the background."""
+"""Calls for exports: multi-frame files in third-party formats, which the service writes in the background."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def begin_export(
     Args:
         id: id of the scene.
         format: format name from docs/exports.md.
-        first, last: first and last frame, inclusive; None for the first and the last committed frame.
-        ids: ids of the Gaussians for the format `tracks`; None for all moving Gaussians.
+        first, last: first and last frame, inclusive; None for the first or last committed frame.
+        ids: ids of the Gaussians to export in the format `tracks`; None for all moving Gaussians.
 
     Raises:
-        Conflict: no frame is committed, or the scene has the maximum number of exports.
-        Busy: the queue of exports is full.
+        Conflict: no frame is committed, or the scene already has the maximum number of exports.
+        Busy: the export queue is full.
 
     >>> begun = client.begin_export(scene, "ply", first=1)
     >>> begun.frames, begun.format
@@ -62,13 +62,13 @@ def export(id: str, export_id: str) -> Call[ExportModel]:
 
 
 def export_file(id: str, export_id: str, begin: int = 0, count: int | None = None) -> Call[bytes]:
-    """Returns the file of a finished export, or a byte range of it, so that large files can be read in pieces.
+    """Returns the file of a finished export, or a byte range of it, so that large files can be read in chunks.
 
     Args:
         id: id of the scene.
         export_id: id of the export.
         begin: offset of the first byte.
-        count: number of bytes; None for all bytes to the end.
+        count: number of bytes; None to read to the end.
 
     Raises:
         Conflict: the export is not finished.

@@ -1,4 +1,4 @@
-"""Calls for frames: upload whole or per camera, closing, declaring missing, reports and downloads."""
+"""Calls for frames: upload (whole or per camera), closing, declaring missing, reports and downloads."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def put_frame(
     masks: Mapping[str, bytes] | None = None,
     time: float | None = None,
 ) -> Call[FrameReceipt]:
-    """Sends frame `index` with the images of all cameras; waits while the queue is full.
+    """Sends a frame with the images of all cameras; waits while the queue is full.
 
     Args:
         id: id of the scene.
         index: frame index: 0, 1, 2, …
-        images: JPEG, PNG or WebP files by camera name, for all cameras of the rig.
-        masks: PNG files by camera name, for all cameras or none.
-        time: time in seconds, increasing from frame to frame; index / frames_per_second if None.
+        images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
+        masks: PNG mask of each camera, keyed by camera name; required for all cameras or none.
+        time: timestamp in seconds, increasing from frame to frame; index / frames_per_second if None.
 
     Raises:
-        FrameGap: another frame must be sent first; `expected` is its index.
+        FrameGap: another frame must be sent first; its index is `expected`.
         Conflict: the frame was already sent with different content.
 
     >>> n = client.scene(open_scene).next_frame
@@ -51,7 +51,7 @@ def put_frame(
 def put_camera(
     id: str, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
 ) -> Call[CameraReceipt]:
-    """Sends one camera's image of frame `index`, for rigs in which each camera has its own sender.
+    """Sends one camera's image of a frame, for rigs in which each camera has its own sender.
 
     The frame closes when all cameras have arrived, on `close_frame`, or after the scene's `ingest.open_frame_seconds`.
     A camera may be a few frames ahead of the others.
@@ -59,10 +59,10 @@ def put_camera(
     Args:
         id: id of the scene.
         index: index of the frame.
-        camera: name of a camera of the rig.
-        image: JPEG, PNG or WebP file.
-        mask: PNG file.
-        time: time of the frame in seconds, equal for all its cameras.
+        camera: name of a camera in the rig.
+        image: contents of a JPEG, PNG or WebP file.
+        mask: contents of a PNG file; None for no mask.
+        time: timestamp of the frame in seconds; must be the same for all its cameras.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
@@ -75,7 +75,7 @@ def put_camera(
 
 
 def close_frame(id: str, index: int) -> Call[FrameReceipt]:
-    """Closes a frame that is sent camera by camera; it is reconstructed without the absent cameras.
+    """Closes a frame that is sent camera by camera, so that it is reconstructed without the absent cameras.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
@@ -87,7 +87,7 @@ def close_frame(id: str, index: int) -> Call[FrameReceipt]:
 
 
 def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportModel]:
-    """Declares the next frame permanently missing; `index` must be the next index, and the following frame comes next.
+    """Declares the next expected frame, which `index` must match, permanently missing, so that the scene moves past it.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.declare_missing(open_scene, n, "cable").state
@@ -137,9 +137,9 @@ def ply(id: str, index: int) -> Call[bytes]:
 
 
 def states(id: str, first: int = 0, limit: int = 120, parts: bool = False) -> Call[tuple[bytes, int | None]]:
-    """Returns committed frames starting at `first` as a compact 4D file, and the next frame to request, or None.
+    """Returns a compact 4D file of committed frames from `first` on, and the next frame to request, or None at the end.
 
-    The file may start before the requested range, at the key frame on which it depends.
+    The file may start before the requested range, at the keyframe on which the range depends.
 
     >>> data, following = client.states(scene)
     >>> data[:4], following
@@ -155,7 +155,7 @@ def states(id: str, first: int = 0, limit: int = 120, parts: bool = False) -> Ca
 
 
 def picture(id: str, index: int, camera: str, kind: FileKind = FileKind.IMAGE) -> Call[bytes]:
-    """Returns one camera's image or mask of a frame, byte for byte as it was sent.
+    """Returns one camera's image or mask of a frame, byte-for-byte as sent.
 
     >>> client.picture(scene, 1, "c0")[1:4]
     b'PNG'

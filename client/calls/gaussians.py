@@ -9,7 +9,7 @@ from client.wire import GaussiansModel
 
 
 def gaussians(id: str, ids: Sequence[int]) -> Call[GaussiansModel]:
-    """Returns the lifetimes of Gaussians by id: the frames in which each was created, retired and revived.
+    """Returns the lifetime of each requested Gaussian: the frames in which it was created, retired and revived.
 
     >>> found = client.gaussians(scene, [1, 0])
     >>> [(one.id, one.born, one.retired) for one in found.gaussians]

@@ -36,16 +36,16 @@ def create_scene(
     ingest: IngestSettings | None = None,
     nodes: Mapping[str, str] | None = None,
 ) -> Call[SceneStatus]:
-    """Creates a scene; the request is never retried, since that could create two scenes.
+    """Creates a scene; the request is not retried after it was sent, because that could create two scenes.
 
     Args:
-        rig: cameras at the resolution of the images that will be sent.
+        rig: camera rig, calibrated for the resolution of the images that will be sent.
         name: display name; the service assigns the id.
         preset: name of a settings preset.
-        settings: nested settings that differ from the preset.
+        settings: nested settings that override the preset.
         frames_per_second: frame rate; frame n without a timestamp gets the time n / frames_per_second.
-        ingest: how the scene accepts frames and which data it keeps.
-        nodes: labels that a cluster node must have to run the scene's processes.
+        ingest: rules for accepting frames and retaining data; None for the defaults.
+        nodes: labels that a cluster node must have in order to run the scene's processes.
 
     >>> new = client.create_scene(rig, name="studio", settings={"update": {"iterations": 50}})
     >>> new.state, new.settings["update"]["iterations"]
@@ -136,10 +136,10 @@ def edit_scene(
     Args:
         id: id of the scene.
         name: display name.
-        archived: whether the scene refuses further frames, and sleeps unless it is viewed.
-        keep_frames, keep_states: retention rules for images and committed states, as in `IngestSettings`; they take
+        archived: whether to archive the scene, which then refuses frames and sleeps unless it is viewed.
+        keep_frames, keep_states: retention rules for images and committed states, as in `IngestSettings`; changes take
             effect immediately.
-        exact_states: number of newest states that stay exact; older ones are moved to compact files.
+        exact_states: number of newest states to keep exactly; older states are moved to compact files.
 
     >>> from client.wire import Retention
     >>> new = client.create_scene(rig)
@@ -154,7 +154,7 @@ def edit_scene(
 
 
 def put_to_sleep(id: str) -> Call[SceneStatus]:
-    """Stops the processes of an idle scene, which wakes automatically on the next request or frame.
+    """Stops the processes of an idle scene; it wakes automatically on the next request or frame.
 
     >>> new = client.create_scene(rig)
     >>> client.put_to_sleep(new.id).asleep
@@ -184,19 +184,19 @@ def begin_again(
     points: bool = True,
     discard: bool = False,
 ) -> Call[SceneStatus]:
-    """Restarts the reconstruction of a scene, e.g. after a first frame that failed or has poor quality.
+    """Restarts the reconstruction of a scene, e.g. if the first frame failed or is of poor quality.
 
-    All frames whose images are still stored are reconstructed again, starting with the first. Ids of Gaussians are
-    assigned anew.
+    All frames whose images are still stored are reconstructed again, starting with the first. Gaussian ids are
+    reassigned.
 
     Args:
         id: id of the scene.
-        n: number of the new reconstruction, `scene(id).reconstruction + 1`; it makes the call idempotent.
+        n: number of the new reconstruction, `scene(id).reconstruction + 1`; makes the call idempotent.
         settings: nested changes to the scene's settings.
-        frame: index of the first frame, already received or still to come; None for the same as before. Earlier frames
-            are marked as failed.
+        frame: index of the first frame, already received or still to come; None keeps the current first frame. Earlier
+            frames are marked as failed.
         points: whether to initialize from the scene's points (`put_points`) instead of the images alone.
-        discard: whether to delete committed states; must be True if a frame after the first is committed.
+        discard: whether to delete committed states; must be True if any frame after the first is committed.
 
     >>> new = client.create_scene(rig)
     >>> receipt = client.put_frame(new.id, 0, pictures)
@@ -213,12 +213,13 @@ def begin_again(
 
 
 def put_points(id: str, points: InitialPoints, *, reconstruction: int | None = None) -> Call[PointsReceipt]:
-    """Uploads the initial point cloud of frame 0; it must be sent before that frame.
+    """Uploads the initial point cloud for frame 0; must be called before that frame is sent.
 
     Args:
         id: id of the scene.
-        points: points in the rig's world frame and units.
-        reconstruction: number of the reconstruction that starts from the points (`begin_again`); None for the current.
+        points: initial points in the rig's world frame and units.
+        reconstruction: number of the reconstruction that starts from the points (`begin_again`); None for the current
+            one.
 
     >>> from scas4d_core.captures import InitialPoints
     >>> new = client.create_scene(rig)

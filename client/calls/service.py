@@ -7,7 +7,7 @@ from client.wire import Cluster, Health, Share, ShareRequest, Ticket
 
 
 def live() -> Call[Health]:
-    """Returns the health of the service process; succeeds whenever the process responds.
+    """Returns the health of the service process; succeeds as long as the process responds.
 
     >>> client.live().status
     'live'
@@ -16,7 +16,7 @@ def live() -> Call[Health]:
 
 
 def ready() -> Call[Health]:
-    """Returns the health of the service once it is ready for scenes; raises an error before.
+    """Returns the health of the service if it is ready for scenes; otherwise raises an error.
 
     >>> client.ready().status
     'ready'
@@ -25,7 +25,7 @@ def ready() -> Call[Health]:
 
 
 def ingest_ready() -> Call[Health]:
-    """Returns the health of the service while it accepts frames; raises an error during recovery or on a full disk.
+    """Returns the health of the service if it accepts frames; raises an error during recovery or if the disk is full.
 
     >>> client.ingest_ready().ingest_ready
     True
@@ -34,7 +34,7 @@ def ingest_ready() -> Call[Health]:
 
 
 def cluster() -> Call[Cluster]:
-    """Returns the machines on which scenes run, and the scenes that wait for resources.
+    """Returns the machines on which scenes run, and the scenes waiting for resources.
 
     >>> [node.alive for node in client.cluster().nodes]
     [True]
@@ -52,7 +52,7 @@ def metrics() -> Call[str]:
 
 
 def ticket() -> Call[Ticket]:
-    """Returns a ticket that opens one WebSocket from a browser, where the token cannot be sent as a header.
+    """Returns a ticket for opening one WebSocket from a browser, where the token cannot be sent as a header.
 
     >>> client.ticket().ticket != client.ticket().ticket
     True
@@ -61,9 +61,9 @@ def ticket() -> Call[Ticket]:
 
 
 def share(scene: str | None = None, seconds: int = 7 * 86_400) -> Call[Share]:
-    """Returns a read-only token for one scene or for all scenes, and a viewer address that contains it.
+    """Returns a read-only token for one scene or for all scenes, and a viewer URL that contains it.
 
-    The service must be protected by a token itself; without one, access is unrestricted anyway.
+    The service itself must be protected by a token; otherwise, access is unrestricted anyway.
 
     >>> client.share(scene)  # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):

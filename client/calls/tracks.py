@@ -28,13 +28,14 @@ def tracks(
 
     Args:
         id: id of the scene.
-        ids: ids of Gaussians.
-        pixels: [Q, 2] u v in the image of `camera` at frame `at`; (0.5, 0.5) is the centre of the first pixel.
-        camera: camera of the pixels.
-        points: [Q, 3] in the rig's world frame and units, at frame `at`.
-        at: frame of the pixels or points; None for the first committed frame.
+        ids: ids of the Gaussians to follow.
+        pixels: [Q, 2] pixel coordinates (u, v) in the image of `camera` at frame `at`; (0.5, 0.5) is the centre of the
+            first pixel.
+        camera: camera to whose image the pixels belong.
+        points: [Q, 3] points in the rig's world frame and units, at frame `at`.
+        at: index of the frame to which the pixels or points refer; None for the first committed frame.
         frames: first and last frame, inclusive; None for all committed frames.
-        project: cameras into which the trajectories are projected, with visibility.
+        project: cameras into which the trajectories are projected, including their visibility.
 
     >>> found = client.tracks(scene, ids=[0, 1], frames=(0, 1))
     >>> np.array(found.positions).shape
@@ -57,7 +58,7 @@ def tracks_arrays(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[dict[str, NDArray[Any]]]:
-    """Returns trajectories as arrays, which is more efficient for many of them; arguments as for `tracks`.
+    """Returns trajectories as arrays, which is more efficient for large queries; takes the same arguments as `tracks`.
 
     >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
     (3, 2, 3)

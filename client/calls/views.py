@@ -25,17 +25,17 @@ def render(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[NDArray[Any]]:
-    """Renders one kind of view and returns the image: [H, W, 3] uint8 for colour, else [H, W].
+    """Renders a view and returns the image: [H, W, 3] uint8 for colour, otherwise [H, W].
 
     Args:
         id: id of the scene.
-        camera: any camera in the rig's world frame, or the name of a camera of the rig.
-        frame: index of a committed frame; None for the last.
-        kind: colour, depth, alpha or parts.
+        camera: any camera in the rig's world frame, or the name of a camera in the rig.
+        frame: index of a committed frame; None for the last one.
+        kind: type of image: colour, depth, alpha or parts.
         format: transfer format: png, jpeg or webp.
         background: RGB in 0…1; None for the scene's background.
-        width: image width in pixels to which the camera is scaled.
-        parts: number of parts; None for the automatic choice.
+        width: image width in pixels, to which the camera is scaled; None for the camera's own width.
+        parts: number of parts; None to choose it automatically.
 
     >>> client.render(scene, "c0").shape
     (16, 24, 3)
@@ -57,7 +57,7 @@ def render_file(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[bytes]:
-    """Renders a view and returns the encoded file; arguments as for `render`, with any format of the service.
+    """Renders a view and returns the encoded file; takes the arguments of `render` and any format of the service.
 
     >>> client.render_file(scene, "c0", format="jpeg")[:2].hex()
     'ffd8'
@@ -76,9 +76,9 @@ def render_arrays(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[dict[str, NDArray[Any]]]:
-    """Renders several kinds of view and returns the arrays by kind.
+    """Renders several image types of one view and returns the array of each, keyed by type.
 
-    Colour is in 0…1, and depth is measured along z in the rig's units. The other kinds are alpha and parts.
+    Colours are in 0…1, and depth is measured along z in the rig's units. The other types are alpha and parts.
 
     >>> views = client.render_arrays(scene, "c0", kinds=["colour", "depth"])
     >>> views["colour"].shape, views["depth"].shape

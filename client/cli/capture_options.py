@@ -1,4 +1,4 @@
-"""Options of every command and study that reads a capture, and the decorator `with_capture_options` that adds them."""
+"""Options shared by all commands and studies that read a capture, and the decorator that adds them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scas4d_core.captures import Capture
 
 
 class PicturesFrom(StrEnum):
-    """Kinds of files that a capture's images can come from."""
+    """Kinds of files from which a capture's images can be read."""
 
     IMAGES = "images"
     VIDEOS = "videos"
@@ -25,7 +25,7 @@ class PicturesFrom(StrEnum):
 
 
 class SizeMismatch(StrEnum):
-    """Ways in which images with another aspect ratio than the calibration were produced."""
+    """How images whose aspect ratio differs from that of the calibration were produced."""
 
     CORNER = "corner"
     CENTRE = "centre"
@@ -34,13 +34,13 @@ class SizeMismatch(StrEnum):
 
 def _options(
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration file or folder, if it is not in CAPTURE; see docs/captures.md.")
+        Path | None, typer.Option(help="Calibration file or folder, if it is not inside CAPTURE; see docs/captures.md.")
     ] = None,
     pictures: Annotated[
-        PicturesFrom | None, typer.Option(help="Kind of pictures to use, if the capture has several.")
+        PicturesFrom | None, typer.Option(help="Kind of image files to use, if the capture has several kinds.")
     ] = None,
     capture_fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames per second, if the files do not say.")
+        float | None, typer.Option(min=0.001, help="Frame rate, if the files do not specify it.")
     ] = None,
     masks: Annotated[bool, typer.Option(help="Use the capture's masks.")] = True,
     test: Annotated[
@@ -50,7 +50,7 @@ def _options(
         SizeMismatch | None,
         typer.Option(
             help=(
-                "How pictures with another aspect ratio than the calibration were made: cropped at the "
+                "How images whose aspect ratio differs from the calibration were produced: cropped at the "
                 "right and bottom (corner), cropped evenly (centre), or resized (stretch)."
             )
         ),
@@ -98,20 +98,20 @@ def with_capture_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Returns a function's parameters by name, with annotations resolved to values."""
+    """Returns a function's parameters, keyed by name, with resolved annotations."""
     hints = get_type_hints(function, include_extras=True)
     parameters = inspect.signature(function).parameters
     return {name: parameter.replace(annotation=hints[name]) for name, parameter in parameters.items()}
 
 
 def open_capture(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
-    """Opens a capture for a command and prints the remarks from reading it; `more` is passed to `open_source`."""
+    """Opens a capture for a command and prints its remarks; `more` is passed to `open_source`."""
     capture = options.open(folder, **more)
     print_remarks(capture)
     return capture
 
 
 def print_remarks(capture: Capture) -> None:
-    """Prints the remarks from reading a capture."""
+    """Prints the remarks that were recorded while reading a capture."""
     for remark in capture.remarks:
         console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)

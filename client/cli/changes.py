@@ -11,7 +11,7 @@ import typer
 from client.wire.base import check_labels
 
 PRESETS = "scas4d, adaptive, fast, paper, dynamic3dgs, rigid, articulated, cloth, people or lights."
-"""Names of the presets for the commands' help texts, which do not load the presets."""
+"""Preset names for the help texts, repeated here because `--help` does not load the presets."""
 Preset = Annotated[str, typer.Option(help=PRESETS)]
 Changes = Annotated[
     list[str] | None,
@@ -34,7 +34,7 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
     """Parses node labels; None means no labels.
 
     Raises:
-        ValueError: a label without `=`, one label with two values, or a label that is not valid for a node.
+        ValueError: a label has no `=`, has two different values, or is not a valid node label.
 
     >>> parse_labels(["rig=stage-a", "disk=fast"])
     {'rig': 'stage-a', 'disk': 'fast'}
@@ -43,17 +43,17 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
     for label in labels or ():
         name, sign, value = (part.strip() for part in label.partition("="))
         if not (name and sign and value):
-            raise ValueError(f"label {label!r} is not valid; write it as rig=stage-a")
+            raise ValueError(f"label {label!r} is not valid; use the form rig=stage-a")
         if result.setdefault(name, value) != value:
-            raise ValueError(f"label {name!r} has two values, {result[name]!r} and {value!r}; give one of them")
+            raise ValueError(f"label {name!r} has two values, {result[name]!r} and {value!r}; give only one")
     return check_labels(result)
 
 
 def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
-    """Parses settings, each value as JSON or else as text; None means no changes.
+    """Parses settings, reading each value as JSON if possible and otherwise as text; None means no changes.
 
     Raises:
-        ValueError: a change without `=`, or a setting nested in another one that already has a value.
+        ValueError: a change has no `=`, or is nested in a setting that already has a value.
 
     >>> parse_changes(["update.iterations=200", "update.clusters=[64]", "device=cpu"])
     {'update': {'iterations': 200, 'clusters': [64]}, 'device': 'cpu'}
@@ -63,12 +63,12 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
         path, sign, text = change.partition("=")
         *groups, last = path.strip().split(".")
         if not sign or not last:
-            raise ValueError(f"setting {change!r} is not valid; write it as update.iterations=200")
+            raise ValueError(f"setting {change!r} is not valid; use the form update.iterations=200")
         inner = result
         for group in groups:
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
-                raise ValueError(f"setting {change!r}: {group!r} already has a value; give one of the two")
+                raise ValueError(f"setting {change!r}: {group!r} already has a value; give only one of the two")
         try:
             inner[last] = json.loads(text)
         except json.JSONDecodeError:
@@ -77,7 +77,7 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
 
 
 def format_changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the nested settings that differ from `usual`, by dotted name; the inverse of ``parse_changes``.
+    """Returns the nested settings that differ from `usual`, keyed by dotted name; the inverse of ``parse_changes``.
 
     >>> format_changes({"update": {"iterations": 200, "seed": 0}}, {"update": {"iterations": 100, "seed": 0}})
     {'update.iterations': 200}

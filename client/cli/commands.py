@@ -1,4 +1,4 @@
-"""Commands that use a service or prepare a capture for it: `scas4d push`, `scenes`, `watch`, `begin-again`, etc."""
+"""Commands that talk to a service or prepare captures for it: `scas4d push`, `scenes`, `watch`, `begin-again`, etc."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
 PUSH_OUTAGE_S = 600.0
-"""Seconds for which a rig keeps retrying, so that a restart of the service does not end a day's capture."""
+"""How long a rig keeps retrying, in seconds, so that a service restart does not end a day's capture."""
 
 
 class Encoding(StrEnum):
-    """Format of re-encoded images."""
+    """File format of re-encoded images."""
 
     JPEG = "jpeg"
     PNG = "png"
@@ -42,11 +42,12 @@ class WhenFull(StrEnum):
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; see docs/captures.md.")]
 Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
 Token = Annotated[
-    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the variable SCAS4D_TOKEN.")
+    str | None,
+    typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the environment variable SCAS4D_TOKEN."),
 ]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
 Encode = Annotated[
-    Encoding, typer.Option(help="Encoding of undistorted pictures and video frames; jpeg uses quality 95.")
+    Encoding, typer.Option(help="Encoding of undistorted images and video frames; jpeg uses quality 95.")
 ]
 
 
@@ -63,36 +64,41 @@ def push(
         float | None,
         typer.Option(
             min=0.001,
-            help="Frames per second to send, as a rig would; default: as fast as the service accepts them.",
+            help="Frame rate at which to send, as a live rig would; default: as fast as the service accepts frames.",
         ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Send frames until the scene has this many.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop once the scene has this many frames.")] = None,
     start: Annotated[int, typer.Option(min=0, help="First frame of the capture to send.")] = 0,
     loop: Annotated[
-        bool, typer.Option("--loop", help="Play the capture back and forth until --frames or Ctrl-C.")
+        bool,
+        typer.Option("--loop", help="Play the capture back and forth until --frames is reached or Ctrl-C is pressed."),
     ] = False,
     jitter: Annotated[float, typer.Option(min=0, help="Delay each frame by up to this many seconds.")] = 0.0,
-    drop: Annotated[float, typer.Option(min=0, max=0.99, help="Share of frames to drop.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of jitter and dropped frames.")] = 0,
+    drop: Annotated[float, typer.Option(min=0, max=0.99, help="Fraction of frames to drop.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Random seed for jitter and dropped frames.")] = 0,
     per_camera: Annotated[
         bool,
-        typer.Option("--per-camera", help="Send each camera's pictures separately; --drop then drops single pictures."),
+        typer.Option("--per-camera", help="Send each camera's images separately; --drop then drops individual images."),
     ] = False,
-    websocket: Annotated[bool, typer.Option("--websocket", help="Send over one WebSocket.")] = False,
+    websocket: Annotated[
+        bool, typer.Option("--websocket", help="Send over a WebSocket instead of HTTP requests.")
+    ] = False,
     when_full: Annotated[
         WhenFull,
-        typer.Option(help="refuse: wait while the queue is full; skip: the newest frame replaces the waiting ones."),
+        typer.Option(help="refuse: wait while the queue is full; skip: replace the queued frames with the newest."),
     ] = WhenFull.REFUSE,
-    outage: Annotated[float, typer.Option(min=0, help="Seconds to wait for an unreachable service.")] = PUSH_OUTAGE_S,
+    outage: Annotated[
+        float, typer.Option(min=0, help="Seconds to keep retrying while the service is unreachable.")
+    ] = PUSH_OUTAGE_S,
     encoding: Encode = Encoding.JPEG,
     preset: Preset = "scas4d",
     changes: Changes = None,
     nodes: Labels = None,
 ) -> None:
-    """Sends a capture to a running service as its rig would, and waits for the last frame."""
+    """Sends a capture to a running service as a live rig would, and waits until the last frame is finished."""
     settings, labels = parse_changes(changes), parse_labels(nodes)
     if labels and scene is not None:
-        raise ValueError("--node is only for new scenes, not together with --scene; leave one out")
+        raise ValueError("--node applies only to new scenes and cannot be combined with --scene; leave one out")
     source = open_capture(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address fails immediately; only later outages are retried
@@ -126,7 +132,7 @@ def push(
 
 
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Prints each frame of a scene when it finishes, until Ctrl-C or until the scene is deleted."""
+    """Prints a line for each finished frame of a scene, until Ctrl-C is pressed or the scene is deleted."""
     from client.stream import Stream, finished_frames, scene_changes
     from client.wire.stream import FrameMessage, SceneMessage
 
@@ -155,13 +161,14 @@ def budget(
     milliseconds: Annotated[
         float | None,
         typer.Option(
-            min=0.001, help="Milliseconds per frame, including decoding and commit; as many iterations run as fit."
+            min=0.001,
+            help="Time budget per frame in ms, including decoding and commit; runs as many iterations as fit.",
         ),
     ] = None,
     stop_gain: Annotated[
         float | None,
         typer.Option(
-            min=0, max=0.999, help="End an update once ten iterations lower its error by less than this share."
+            min=0, max=0.999, help="End an update once ten iterations lower its error by less than this fraction."
         ),
     ] = None,
     skip_tolerance: Annotated[
@@ -175,7 +182,7 @@ def budget(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Prints the compute budget of a scene's updates; with options, changes it from the next frame on."""
+    """Prints the compute budget for a scene's updates; with options, changes it from the next frame on."""
     given = (iterations, milliseconds, stop_gain, skip_tolerance)
     if reset and any(value is not None for value in given):
         raise ValueError("--reset cannot be combined with a budget; leave one out")
@@ -190,11 +197,11 @@ def budget(
     many = (
         f"{now.iterations} iterations"
         if now.budget_ms is None
-        else f"as many iterations as fit into {now.budget_ms:g} ms"
+        else f"as many iterations as fit in {now.budget_ms:g} ms"
     )
     stops = f", or fewer: stop gain {now.stop_gain:g}" if now.stop_gain else ""
     console.print(
-        f"{many} a frame{stops}; skip tolerance {now.skip_tolerance:g}; from frame {budget_now.since} on",
+        f"{many} per frame{stops}; skip tolerance {now.skip_tolerance:g}; from frame {budget_now.since} on",
         highlight=False,
     )
 
@@ -204,7 +211,7 @@ def begin_again(
     frame: Annotated[
         int | None,
         typer.Option(
-            min=0, help="First frame of the new reconstruction, received or still to come; default: as before."
+            min=0, help="First frame of the new reconstruction, already received or still to come; default: unchanged."
         ),
     ] = None,
     changes: Annotated[
@@ -216,17 +223,19 @@ def begin_again(
     points: Annotated[
         Path | None,
         typer.Option(
-            help=("npz with positions and colours (and foreground), or init_pt_cld.npz; default: the scene's points.")
+            help=(
+                "npz file with positions and colours (and foreground), or init_pt_cld.npz; default: the scene's points."
+            )
         ),
     ] = None,
-    no_points: Annotated[bool, typer.Option("--no-points", help="Start from the pictures alone.")] = False,
+    no_points: Annotated[bool, typer.Option("--no-points", help="Start from the images alone.")] = False,
     discard: Annotated[bool, typer.Option("--discard", help="Discard the committed frames.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Restarts the reconstruction of a scene after its first frame failed or came out poor."""
+    """Restarts the reconstruction of a scene, e.g. if its first frame failed or is of poor quality."""
     if points is not None and no_points:
-        raise ValueError("--points and --no-points contradict each other; give one of them")
+        raise ValueError("--points and --no-points contradict each other; give only one")
     settings = parse_changes(changes)
     with Client(url, token=token) as client:
         number = client.scene(scene).reconstruction + 1
@@ -239,14 +248,14 @@ def begin_again(
                     given |= {"foreground": columns[2][:, 0].astype(np.float32)} if columns[2].size else {}
             if missing := {"positions", "colours"} - given.keys():
                 raise ValueError(
-                    f"{points} has no {' and no '.join(sorted(missing))}; write numpy.savez(positions=…, colours=…)"
+                    f"{points} has no {' and no '.join(sorted(missing))}; use numpy.savez(positions=…, colours=…)"
                 )
             client.put_points(scene, InitialPoints(**given), reconstruction=number)
         status = client.begin_again(
             scene, number, settings=settings, frame=frame, points=not no_points, discard=discard
         )
     console.print(
-        f"scene {scene} begins anew with frame {status.first_frame}, reconstruction {number}; {status.queued} queued",
+        f"scene {scene} restarts at frame {status.first_frame}, reconstruction {number}; {status.queued} queued",
         highlight=False,
     )
 
@@ -259,7 +268,7 @@ def import_(
     frames: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames to import.")] = None,
     encoding: Encode = Encoding.JPEG,
 ) -> None:
-    """Undistorts a capture once, so that reading it needs neither OpenCV nor PyAV and keeps up with the rig."""
+    """Writes an undistorted copy of a capture, which can be read at the rig's frame rate without OpenCV and PyAV."""
     from client.importers.write import write_dynamic3dgs
 
     source = open_capture(capture, options, encoding=encoding.value)
@@ -270,21 +279,21 @@ def import_(
 
 
 REPORT_LINE_PARTS = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
-"""Alarms that the frame's report line already states."""
+"""Alarms that are already covered by other parts of a frame's line."""
 
 
 def out_of_step(report: FrameReportModel) -> set[str]:
-    """Returns the names of the cameras that a frame's report marks as out of step."""
+    """Returns the names of the cameras that a frame report marks as out of step."""
     return {name for name, one in report.timing.items() if one.out_of_step}
 
 
 def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] = ()) -> str:
-    """Formats the report of a finished frame as one line.
+    """Formats the report of a finished frame as a single line.
 
     Args:
-        report: the frame's report.
+        report: report of the frame.
         missed: number of preceding frames that are not shown.
-        off: cameras already known to be out of step; only other cameras are named.
+        off: cameras already reported as out of step, which are not reported again.
     """
     parts = [f"frame {report.index}: {report.state}"]
     if report.psnr is not None:

@@ -22,20 +22,19 @@ from client.sdk import Client
 from scas4d_core.captures import Capture
 
 POLL_S = 0.5
-"""Seconds between two checks whether the service is ready."""
-PREPARING = "making the kernels ready"
+"""Interval in seconds at which the readiness of the service is polled."""
+PREPARING = "preparing the kernels"
 
 
 @contextmanager
 def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
     """Runs a service on the loopback interface and yields its URL.
 
-    The service listens at `port`, or at a free port if `port` is taken. Its very first start compiles the kernels of
-    the
-    first frame, so this waits as long as the process is alive.
+    The service listens on `port`, or on any free port if `port` is taken. Its very first start compiles the kernels for
+    the first frame, so this waits without a timeout while the process is alive.
 
     Raises:
-        RuntimeError: the service exited or cannot become ready; the message gives the reason and the log file.
+        RuntimeError: the service exited or cannot become ready; the message contains the reason and the log path.
         ModuleNotFoundError: the service is not installed.
     """
     need_server()
@@ -50,7 +49,7 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
         with Bars() as bars:
             while (left := _compile_progress(url, log)) is not None:
                 if process.poll() is not None:
-                    raise RuntimeError(f"the service has ended: {_last_log_line(log)}; its log is {log}")
+                    raise RuntimeError(f"the service exited: {_last_log_line(log)}; see the log at {log}")
                 done, total = left
                 bars(PREPARING, done, total)
                 time.sleep(POLL_S)
@@ -76,7 +75,7 @@ def _free(port: int) -> int:
 
 
 def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
-    """Returns (compiled kernels, total kernels), or None if the service is ready.
+    """Returns the numbers of compiled kernels and of all kernels, or None once the service is ready.
 
     The result is (0, 1) while the numbers are unknown.
     """
@@ -89,7 +88,7 @@ def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
         said = error.problem.model_extra or {}
         if said.get("warming_up") or said.get("recovering"):  # it becomes ready on its own
             return int(said.get("kernels_compiled", 0)), int(said.get("kernels", 1))
-        raise RuntimeError(f"the service cannot become ready: {error}; its log is {log}") from None
+        raise RuntimeError(f"the service cannot become ready: {error}; see the log at {log}") from None
     return None
 
 
@@ -101,14 +100,14 @@ def _token() -> str | None:
 def _last_log_line(log: Path) -> str:
     """Returns the last human-readable line of a log whose other lines are JSON."""
     said = [line for line in log.read_text(errors="replace").splitlines() if line and not line.startswith("{")]
-    return said[-1].removeprefix("scas4d: ") if said else "it says no reason"
+    return said[-1].removeprefix("scas4d: ") if said else "no reason was logged"
 
 
 def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: str, settings: Mapping[str, Any]) -> str:
-    """Streams the capture through the service at `url`, saves its renders and returns the scene's id.
+    """Streams a capture through the service at `url`, saves renders and returns the scene's id.
 
-    `out` receives ground truth | render | difference for each frame and test camera, and the depth and parts of the
-    last frame. Without test cameras, one training camera is used.
+    `out` receives ground truth | render | difference images for each frame and test camera, and the depth and parts of
+    the last frame. Without test cameras, one training camera is used.
     """
     name = f"demo of {capture.name}"
     with Client(url, token=_token()) as client:
@@ -131,7 +130,7 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
 
 
 def _report(client: Client, id: str, frames: int) -> None:
-    """Prints one line with timings, and one line for each frame that failed."""
+    """Prints a line with timings, and a line for each failed frame."""
     reports = [client.frame(id, index) for index in range(frames)]
     for report in reports:
         if report.state != "committed":
@@ -143,7 +142,7 @@ def _report(client: Client, id: str, frames: int) -> None:
 
 
 def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path) -> list[float]:
-    """Saves images of every committed frame; returns the mean PSNR over the cameras, per frame."""
+    """Saves comparison images of every committed frame and returns the mean PSNR over the cameras for each frame."""
     cameras = capture.full_test_rig.cameras if capture.full_test_rig is not None else capture.full_rig.cameras[:1]
     scores = []
     with Bars() as bars:

@@ -1,4 +1,4 @@
-"""`scas4d evaluate`: reconstructs a capture and scores it on its test cameras and ground truth."""
+"""`scas4d evaluate`: reconstructs a capture and scores the result on test cameras and ground truth."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
 
 Report = Callable[[str], None]
-"""Receives each printed line."""
+"""Callback that receives each printed line."""
 
 
 DEFAULT_OPTIONS = CaptureOptions()
 
 TRAINING = "training cameras"
-"""Marks a row whose scores are those of training images, because there are no test cameras."""
+"""Marks a row that was scored on training images because the capture has no test cameras."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One row to be measured.
+    """Evaluation job that produces one row of the score table.
 
     Attributes:
         capture: folder of the capture.
-        preset: preset name, for the table.
+        preset: name of the preset, shown in the table.
         settings: complete settings of the reconstruction.
         frames: number of frames to reconstruct; None for all.
-        masks: whether the method gets the masks (the evaluation always uses them).
-        points: whether the method gets the initial point cloud.
-        pictures: frames whose comparison images are saved; negative indices count from the end.
-        lpips: whether to compute LPIPS too, which loads torch.
-        constants: constants of the method that a study overrides, as (dotted name, value); recorded with the row.
+        masks: whether the method is given the masks (the evaluation always uses them).
+        points: whether the method is given the initial point cloud.
+        pictures: indices of the frames whose comparison images are saved; negative indices count from the end.
+        lpips: whether to also compute LPIPS, which loads torch.
+        constants: constants of the method that a study overrides, as (dotted name, value); stored with the row.
         options: options for reading the capture.
     """
 
@@ -67,12 +67,12 @@ class Job:
     options: CaptureOptions = DEFAULT_OPTIONS
 
     def open_given(self) -> Capture:
-        """Opens the capture as the method gets it: at full size, without the withheld inputs."""
+        """Opens the capture as the method sees it: at full size, without the withheld inputs."""
         use_masks = self.masks and self.options.use_masks
         return self.options.open(self.capture, use_masks=use_masks, use_points=self.points)
 
     def open_truth(self) -> Capture:
-        """Opens the capture for measuring, at the resolution of the renders.
+        """Opens the capture for evaluation, at the resolution of the renders.
 
         If it has no test cameras, its training cameras are used as test cameras.
         """
@@ -86,7 +86,7 @@ class Job:
 
     @property
     def variant(self) -> str:
-        """Name of the row without its capture: preset, iterations, seed, and a digest of all other settings."""
+        """Row name without the capture: preset, iterations, seed, and a digest of all other settings."""
         update = self.settings.update
         given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
         if self.lpips:
@@ -96,7 +96,7 @@ class Job:
 
     @property
     def changes(self) -> str:
-        """Differences from the preset other than iterations and seed, and withheld inputs, as text for the table."""
+        """Table text that lists withheld inputs and differences from the preset other than iterations and seed."""
         usual = preset(self.preset).model_dump(mode="json")
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
@@ -111,7 +111,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Name of the row; it is unique per combination of settings."""
+        """Unique row name for this capture and combination of settings."""
         return f"{self.capture.resolve().name}-{self.variant}"
 
 
@@ -131,17 +131,17 @@ def evaluate(
     again: bool = False,
     report: Report = print,
 ) -> Row:
-    """Scores a capture and prints the table; `out` receives the row, one line per frame, images and table.md.
+    """Scores a capture, prints the table, and writes the row, per-frame lines, images and table.md to `out`.
 
     Args:
         folder: folder of the capture. Without test cameras, its training cameras are scored and the row is marked.
-        out: output folder; scores that it already contains are printed without another reconstruction.
+        out: output folder; if it already contains the scores, they are printed without another reconstruction.
         options: options for reading the capture.
         frames: number of frames; None for all.
         preset_name: name of the preset.
         changes: nested settings that override the preset.
-        again: measure again even if `out` has the scores.
-        report: receives the printed lines.
+        again: whether to measure again even if `out` already contains the scores.
+        report: callback that receives each printed line.
 
     Raises:
         CaptureError: the capture cannot be read.
@@ -157,7 +157,7 @@ def evaluate(
         _, row = measure(job, store, report)
         store.put(row)
     else:
-        report(f"[1/1] {job.key}: measured already")
+        report(f"[1/1] {job.key}: already measured")
     table = score_tables([row])
     (out / "table.md").write_text(table + "\n")
     report(table)
@@ -182,15 +182,15 @@ def measure(
 ) -> tuple[Reconstruction, Row]:
     """Reconstructs one capture and scores it.
 
-    The times are those of the reconstruction alone, including decoding. Peak memory is that of this process, including
-    the evaluation.
+    Times cover only the reconstruction, including decoding. Peak memory covers the whole process, including the
+    evaluation.
 
     Args:
-        job: what to measure, and with which settings.
-        store: receives one line per frame, and the images.
-        report: receives the printed lines.
-        static: a frame 0 that was fitted before, and the seconds that it took.
-        fitted: called with frame 0 and its time in seconds after it is fitted here.
+        job: capture to measure, with its settings.
+        store: storage for the per-frame lines and the images.
+        report: callback that receives each printed line.
+        static: previously fitted frame 0 and its fitting time in seconds; None to fit it here.
+        fitted: callback that receives frame 0 and its fitting time in seconds, if it is fitted here.
 
     Returns:
         The reconstruction and the measured row.
@@ -198,7 +198,7 @@ def measure(
     truth, given = job.open_truth(), job.open_given()
     unseen = given.full_test_rig is not None
     if not unseen:
-        report("    no test cameras: the scores are those of the training cameras (--test holds some out)")
+        report("    no test cameras: scoring the training cameras instead (use --test to hold some out)")
     # Imported lazily: this loads the kernels, which printing an existing table does not need.
     from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
 
@@ -302,7 +302,7 @@ def _seconds(updates: Sequence[Row]) -> Row:
 
 
 def save_comparisons(reconstruction: Committed, capture: Capture, index: int, folder: Path) -> None:
-    """Saves ground truth | render | difference of every test camera as PNG files."""
+    """Saves ground truth | render | difference images of every test camera as PNG files."""
     rig, truth = capture.test_rig, capture.test_frame(index)
     assert rig is not None
     for camera in rig.cameras:
@@ -312,7 +312,7 @@ def save_comparisons(reconstruction: Committed, capture: Capture, index: int, fo
 
 
 def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: NDArray[Any], folder: Path) -> None:
-    """Saves ground-truth | rendered part labels of every labelled test camera as coloured PNG files."""
+    """Saves ground truth | rendered part labels of every labelled test camera as coloured PNG files."""
     from scas4d_core.metrics.evaluation import render_parts
 
     truth, rig = capture.ground_truth, capture.test_rig

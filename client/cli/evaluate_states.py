@@ -1,6 +1,6 @@
 """`scas4d evaluate --states`: scores stored states on a capture's test cameras and ground truth.
 
-Nothing is reconstructed: a compact file, or an export that contains Gaussian ids, is rendered as is.
+Nothing is reconstructed; the states of a compact file, or of an export with Gaussian ids, are rendered as stored.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scas4d_core.storage.history import History
 
 SHOWN = (0, 1, -1)
-"""Frames whose comparison images are saved; negative values count from the end."""
+"""Indices of the frames whose comparison images are saved; negative indices count from the end."""
 
 
 def evaluate_states(
@@ -47,23 +47,25 @@ def evaluate_states(
     rate: float | None = None,
     report: Report = print,
 ) -> Row:
-    """Scores stored states and prints the table; `out` receives the row, one line per frame, images and table.md.
+    """Scores stored states, prints the table, and writes the row, per-frame lines, images and table.md to `out`.
 
     Args:
-        source: a compact file, its folder, or an export with ids.
+        source: compact file, folder that contains one, or export with Gaussian ids.
         folder: folder of the capture.
         out: output folder.
         options: options for reading the capture.
-        frames: score only this many frames; None for all.
-        rate: frames per second of numbered files.
-        report: receives the printed lines.
+        frames: maximum number of frames to score; None for all.
+        rate: frame rate of numbered files; None for the default of 30.
+        report: callback that receives each printed line.
 
     Raises:
-        InputError: the source cannot be read, or has no frame of the capture.
+        InputError: the source cannot be read, or has no frames in common with the capture.
         CaptureError: the capture cannot be read.
     """
     if not source.exists():
-        raise InputError(f"there is no {str(source)!r}", "give a .s4d file, or an export with ids (docs/exports.md)")
+        raise InputError(
+            f"states {str(source)!r} does not exist", "give a .s4d file, or an export with ids (docs/exports.md)"
+        )
     states = of_path(source, rate)
     truth = options.open(folder, image_scale=Settings().scene.image_scale)
     unseen = truth.full_test_rig is not None
@@ -71,7 +73,7 @@ def evaluate_states(
     for remark in [*states.of.remarks, *([] if states.of.damage is None else [states.of.damage])]:
         report(remark)
     if not unseen:
-        report("no test cameras: the scores are those of the training cameras (--test holds some out)")
+        report("no test cameras: scoring the training cameras instead (use --test to hold some out)")
     row = _measure(states, truth, Store(out), frames, report)
     row["preset"] = source.name
     row["measured_on"] = "test cameras" if unseen else TRAINING
@@ -94,9 +96,9 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
     chosen = [index for index in given.frames if index <= last][:frames]
     if not chosen:
         raise InputError(
-            f"{found.name} begins at frame {given.frames[0]}, and the capture ends at frame {last}"
+            f"{found.name} starts at frame {given.frames[0]}, but the capture ends at frame {last}"
             if given.frames
-            else f"{found.name} has no frame",
+            else f"{found.name} has no frames",
             "give states of this capture",
         )
     world, history = given.head.world, History()
@@ -137,7 +139,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
 
 
 def _with_ids(state: Gaussians, history: History) -> Gaussians:
-    """Returns the state with ids assigned by the history. Rows keep their order; the file's ids are not needed."""
+    """Returns the state with ids assigned by the history. Rows keep their order, so the file's ids are not needed."""
     if not len(history):
         return state
     known = history.ids

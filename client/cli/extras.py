@@ -1,4 +1,4 @@
-"""Optional packages: which extra installs a module that a command is missing."""
+"""Optional packages, and the extra that installs each of them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ SERVER = (
     *("numba", "scipy", "sklearn", "threadpoolctl", "plyfile", "pycolmap", "flip_evaluator"),
     *("fastapi", "uvicorn", "pydantic_settings", "prometheus_client", "httptools", "blake3", "python_multipart"),
 )
-"""Modules that the extra `server` installs."""
+"""Modules installed by the extra `server`."""
 EXPORTS = ("gsply", "pxr")
-"""Modules that the extra `exports` installs."""
+"""Modules installed by the extra `exports`."""
 RERUN = ("rerun",)
-"""Modules that the extra `rerun` installs."""
+"""Modules installed by the extra `rerun`."""
 
 
 def need_server() -> None:
-    """Checks that the service is installed; for commands that start it in another process.
+    """Checks that the dependencies of the service are installed, for commands that start it in another process.
 
     Raises:
         ModuleNotFoundError: a module of the extra `server` is not installed.
@@ -27,10 +27,10 @@ def need_server() -> None:
 
 
 def install_hint(missing: ModuleNotFoundError) -> str | None:
-    """Returns a sentence that says what to install, or None if the module belongs to no extra."""
+    """Returns an installation hint for a missing module, or None if no extra installs it."""
     package = (missing.name or "").partition(".")[0]
     extras = {"server": SERVER, "exports": EXPORTS, "rerun": RERUN}
     extra = next((name for name, packages in extras.items() if package in packages), None)
     if extra is None:
         return None
-    return f"this needs {package}, which is not installed; in the project's folder: pip install -e '.[{extra}]'"
+    return f"this needs {package}, which is not installed; run in the project folder: pip install -e '.[{extra}]'"

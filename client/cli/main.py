@@ -1,4 +1,4 @@
-"""The `scas4d` command line. Sub-commands that need the core or the server import it lazily, when they run."""
+"""The `scas4d` command line. Subcommands that need the core or the server import it lazily."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 @app.command()
 def serve(
     host: Annotated[
-        str | None, typer.Option(help="Address to listen at; other than loopback only with a token (SCAS4D_TOKEN).")
+        str | None, typer.Option(help="Address to listen on; anything but loopback requires a token (SCAS4D_TOKEN).")
     ] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; default: 8000, or the setting.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; default: ./data, or the setting.")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Port; default: the configured port, or 8000.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help="Data folder; default: the configured one, or ./data.")] = None,
     placement: Annotated[
         str | None, typer.Option(help="`local`, or `ray[=HOST:PORT]` to run scenes on a Ray cluster (docs/cluster.md).")
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(
-            help=("TOML file of settings, see docs/service-settings.md. Environment variables take precedence.")
-        ),
+        typer.Option(help=("TOML settings file, see docs/service-settings.md. Environment variables take precedence.")),
     ] = None,
 ) -> None:
     """Starts the service. Settings not given here are read from the environment (SCAS4D_...), then from the file."""
@@ -62,10 +62,10 @@ def demo(
     options: CaptureOptions,
     capture: Annotated[Path, typer.Option(help="Folder of a capture.")] = Path("samples/robot"),
     out: Out = Path("out/demo"),
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; another one is used if it is taken.")] = 8000,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; if it is taken, a free port is used.")] = 8000,
     stay: Annotated[
         bool | None,
-        typer.Option(help="Keep the service running until Ctrl-C; the default in a terminal only."),
+        typer.Option(help="Keep the service running until Ctrl-C; default: only in a terminal."),
     ] = None,
     frames: Frames = None,
     preset: Preset = "scas4d",
@@ -78,18 +78,20 @@ def demo(
     stays = sys.stdout.isatty() if stay is None else stay
     data, log = out / "data", out / "service.log"
     with main_job.running_service(data, log, port) as url:
-        console.print(f"service at {url}, its log in {log}", soft_wrap=True)
+        console.print(f"service at {url}, log at {log}", soft_wrap=True)
         id = main_job.run(given, url, out, frames=frames, preset=preset, settings=settings)
-        console.print(f"pictures (truth | render | difference x4): {out}", soft_wrap=True)
+        console.print(f"images (truth | render | difference x4): {out}", soft_wrap=True)
         if stays:
-            console.print(f"open {url}/#scene={id} (the API: {url}/docs); Ctrl-C ends the service", soft_wrap=True)
+            console.print(
+                f"open {url}/#scene={id} (API docs: {url}/docs); press Ctrl-C to stop the service", soft_wrap=True
+            )
             try:
                 while True:
                     time.sleep(3600)
             except KeyboardInterrupt:
-                console.print("ending the service")
-    console.print("the service has ended (--stay leaves it running); to look at the scene:", soft_wrap=True)
-    console.print(f"scas4d serve --data {data}, and open {DEFAULT_URL}/#scene={id}", highlight=False, soft_wrap=True)
+                console.print("stopping the service")
+    console.print("the service has stopped (use --stay to keep it running); to view the scene:", soft_wrap=True)
+    console.print(f"scas4d serve --data {data}, then open {DEFAULT_URL}/#scene={id}", highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -100,10 +102,10 @@ def reconstruct(
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
-    videos: Annotated[bool, typer.Option("--videos", help="Also write an MP4 per camera.")] = False,
+    videos: Annotated[bool, typer.Option("--videos", help="Also write an MP4 file per camera.")] = False,
     changes: Changes = None,
 ) -> None:
-    """Reconstructs a capture in this process, without a service: images, states, and a .ply of the last frame."""
+    """Reconstructs a capture in this process, without a service; writes images, states and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
     given = parse_changes(changes)
@@ -119,18 +121,18 @@ def evaluate(
     frames: Frames = None,
     preset: Preset = "scas4d",
     changes: Changes = None,
-    again: Annotated[bool, typer.Option("--again", help="Measure again, even if the folder has the scores.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Measure again even if --out already has the scores.")] = False,
     states: Annotated[
         Path | None,
-        typer.Option(help="Score these states without reconstructing: a .s4d file, USD, or numbered .glb files."),
+        typer.Option(help="Score existing states instead of reconstructing: a .s4d file, USD, or numbered .glb files."),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option("--source-fps", help="Frames per second of numbered files in --states. [30]")
+        float | None, typer.Option("--source-fps", help="Frame rate of numbered files in --states. [30]")
     ] = None,
 ) -> None:
-    """Prints a capture's scores on its test cameras and ground truth. Reconstructs it first if `out` has no scores yet.
+    """Prints a capture's scores on its test cameras and ground truth. Reconstructs it first if --out has no scores yet.
 
-    Without test cameras (--test holds some out), the training cameras are scored and the table is marked accordingly.
+    Without test cameras (use --test to hold some out), training cameras are scored and the table is marked accordingly.
     """
     if states is not None:
         from client.cli.evaluate_states import evaluate_states
@@ -150,8 +152,8 @@ def export(
         typer.Argument(
             metavar="SOURCE",
             help=(
-                "A compact file (.s4d), a folder of `scas4d reconstruct`, a scene id, or an export with "
-                "ids: USD, or numbered .glb files in a folder or .zip."
+                "A compact file (.s4d), an output folder of `scas4d reconstruct`, a scene id, or an export "
+                "with ids: USD, or numbered .glb files in a folder or .zip."
             ),
         ),
     ],
@@ -160,29 +162,30 @@ def export(
         typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; see docs/exports.md."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder or .zip for one file per frame, else a file. [named after SOURCE]")
+        Path | None,
+        typer.Option(help="Output file; a folder or .zip if the format has one file per frame. [named after SOURCE]"),
     ] = None,
     player: Annotated[
-        Path | None, typer.Option(metavar="OUT.html", help="Write one page that plays the frames offline.")
+        Path | None, typer.Option(metavar="OUT.html", help="Write a self-contained page that plays the frames offline.")
     ] = None,
     frames: Annotated[str | None, typer.Option(metavar="A:B", help="First and last frame, inclusive.")] = None,
     ids: Annotated[
-        list[int] | None, typer.Option("--id", help="Export only this Gaussian, with tracks. May be repeated.")
+        list[int] | None, typer.Option("--id", help="Export only this Gaussian (tracks only). May be repeated.")
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--source-fps", help="Frames per second of numbered files, which have no times. [30]"),
+        typer.Option("--source-fps", help="Frame rate of numbered files, which have no timestamps. [30]"),
     ] = None,
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Exports reconstructed frames to other formats (splats, glTF, USD, tables), or to a page that plays offline.
+    """Exports reconstructed frames to other formats (splats, glTF, USD, tables) or to an offline player page.
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --player robot.html
     """
     if player is not None:
         if format is not None or out is not None or ids:
-            raise typer.BadParameter("--player stands alone; leave --format, --out and --id out")
+            raise typer.BadParameter("--player cannot be combined with --format, --out or --id; leave them out")
         from client.exports.player import export_player
 
         return export_player(source, player, frames, url=url, token=token)
@@ -201,7 +204,7 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def options(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False) -> None:
-    """Runs before every command."""
+    """Handles the options that precede a command."""
 
 
 def main() -> None:
@@ -213,9 +216,9 @@ def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError]
     """Runs a command line and reports errors that the user can fix as one line instead of a traceback.
 
     Args:
-        commands: the command line.
-        name: the command as the user types it.
-        remedy: returns what to install for a missing module, or None if installing would not help.
+        commands: Typer app to run.
+        name: command name as typed by the user.
+        remedy: callback that returns an installation hint for a missing module, or None if there is none.
     """
     try:
         commands(prog_name=name)

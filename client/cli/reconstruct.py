@@ -29,18 +29,18 @@ if TYPE_CHECKING:
     from scas4d_core.storage.history import History
 
 FRAME_ALARMS = (AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART)
-"""Alarms whose evidence is already in the report's ``degraded`` text."""
+"""Alarms whose evidence is already part of the report's ``degraded`` text."""
 
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """One committed frame, which may be degraded.
+    """A committed frame, which may be degraded.
 
     Attributes:
-        index: frame index in the capture.
+        index: index of the frame in the capture.
         seconds: wall-clock time of this frame alone, including decoding.
-        cpu_seconds: processor time of this frame, summed over all threads.
-        report: report of the update; None for frame 0.
+        cpu_seconds: CPU time of this frame, summed over all threads.
+        report: report on the update; None for frame 0.
     """
 
     index: int
@@ -58,15 +58,15 @@ def reconstruct_frames(
     static: StaticResult | None = None,
     progress: Callable[[str, int, int], None],
 ) -> Iterator[tuple[Reconstruction, ReconstructedFrame]]:
-    """Reconstructs the first `count` frames of a capture in order, and yields after each one.
+    """Reconstructs the first `count` frames of a capture in order, yielding after each one.
 
     Args:
-        capture: the capture at full size; the reconstruction resizes its images itself.
+        capture: capture at full size; the reconstruction resizes its images itself.
         settings: reconstruction settings.
         count: number of frames, at least 1.
-        history: history that stores the states; None keeps them in memory.
-        static: a frame 0 that is already fitted; None fits it here.
-        progress: called with (stage, done, total).
+        history: storage for the states; None to keep them in memory.
+        static: previously fitted frame 0; None to fit it here.
+        progress: callback that receives (stage, done, total).
     """
     from scas4d_core.reconstruction import Reconstruction
 
@@ -105,12 +105,12 @@ def reconstruct(
     the last printed line says so.
 
     Args:
-        given: the capture at full size; the reconstruction resizes its images.
+        given: capture at full size; the reconstruction resizes its images itself.
         out: output folder; created if missing.
         frames: number of frames; None for all.
         preset: name of the preset.
         changes: nested settings that override the preset.
-        videos: also write each camera's comparison images as a video at the capture's frame rate.
+        videos: whether to also write each camera's comparison images as a video at the capture's frame rate.
     """
     from scas4d_core.query.parts import parts
     from scas4d_core.query.ply import write_ply
@@ -172,13 +172,13 @@ def reconstruct(
             writer.add_parts(history.indices[-1], parts(history))
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     seen = (
-        "" if capture.test_rig is not None else f" (dB of training camera {cameras[0].name}; --test holds out others)"
+        "" if capture.test_rig is not None else f" (PSNR of training camera {cameras[0].name}; --test holds out others)"
     )
-    console.print(f"pictures, states, states.s4d and last.ply: {out}{seen}")
+    console.print(f"images, states, states.s4d and last.ply: {out}{seen}")
 
 
 def remarks_on(report: FrameReport | None) -> str:
-    """Returns the printed lines that accompany a frame's PSNR: why the frame is degraded, and its alarms.
+    """Returns the text printed after a frame's PSNR: the reason why it is degraded, and its alarms.
 
     >>> remarks_on(None)
     ''
@@ -193,7 +193,7 @@ def remarks_on(report: FrameReport | None) -> str:
 
 
 def compile_kernels() -> None:
-    """Compiles the kernels in a separate process, unless they are in the cache."""
+    """Compiles the kernels in separate processes, unless they are cached."""
     from scas4d_core.warm_up import EVERY, compile_in_processes
 
     with Bars() as bars:

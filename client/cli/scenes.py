@@ -13,20 +13,21 @@ from client.wire import Retention, SceneStatus
 
 Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
 Token = Annotated[
-    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the variable SCAS4D_TOKEN.")
+    str | None,
+    typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the environment variable SCAS4D_TOKEN."),
 ]
 Scenes = Annotated[list[str], typer.Argument(metavar="SCENE...", help="Ids of scenes.")]
 
-app = typer.Typer(help="Lists the scenes of the service, and manages them.", invoke_without_command=True)
+app = typer.Typer(help="Lists and manages the scenes of the service.", invoke_without_command=True)
 
 
 HEAD = ("scene", "name", "state", "cameras", "next frame", "queued", "committed", "awake", "error")
 
 
 def table(statuses: Sequence[SceneStatus]) -> list[str]:
-    """Formats scenes as lines of a table with a heading.
+    """Formats scenes as the lines of a table with a header.
 
-    Words are never truncated to the terminal's width, because programs parse these lines too.
+    Cells are never truncated to the terminal width, because scripts parse these lines too.
     """
     rows: list[tuple[str, ...]] = [HEAD]
     for status in statuses:
@@ -44,7 +45,7 @@ def listed(
     token: Token = None,
     all: Annotated[bool, typer.Option("--all", help="Include archived scenes.")] = False,
 ) -> None:
-    """Lists the scenes of the service, oldest first. SCENE in other commands is the id shown here."""
+    """Lists the scenes of the service, oldest first. Other commands take the id shown here as SCENE."""
     if context.invoked_subcommand is not None:
         return
     with Client(url, token=token, outage=0) as client:
@@ -52,9 +53,9 @@ def listed(
     shown = [status for status in summaries if all or not status.archived]
     _say(*table(shown))
     if hidden := len(summaries) - len(shown):
-        _say(f"{hidden} archived; scas4d scenes --all lists them, too")
+        _say(f"{hidden} archived; to include them: scas4d scenes --all")
     if not summaries:
-        _say("no scene yet; make one with: scas4d push CAPTURE")
+        _say("no scenes yet; create one with: scas4d push CAPTURE")
 
 
 @app.command()
@@ -106,18 +107,18 @@ def keep(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
     frames: Annotated[
         str | None,
-        typer.Option(metavar="COUNT|all", help="Keep the pictures of this many newest frames, or of all."),
+        typer.Option(metavar="COUNT|all", help="Keep the images of this many newest frames, or of all."),
     ] = None,
     states: Annotated[
         str | None,
         typer.Option(
-            metavar="COUNT|all", help="Keep this many newest committed states; the others are deleted for good."
+            metavar="COUNT|all", help="Keep this many newest committed states; the others are permanently deleted."
         ),
     ] = None,
     exact: Annotated[
         int | None,
         typer.Option(
-            min=24, metavar="COUNT", help="Keep this many newest states exact; older ones move to compact files."
+            min=24, metavar="COUNT", help="Store this many newest states exactly; move older ones to compact files."
         ),
     ] = None,
     url: Url = DEFAULT_URL,
@@ -131,7 +132,7 @@ def keep(
 
 @app.command()
 def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Ends the processes of idle scenes now; a scene wakes up on the next request or frame."""
+    """Stops the processes of idle scenes now; a scene wakes up on the next request or frame."""
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.put_to_sleep(scene))
@@ -140,15 +141,15 @@ def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 @app.command()
 def share(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene, or all.")],
-    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="Lifetime of the link.")] = 168,
-    only_token: Annotated[bool, typer.Option("--only-token", help="Print only the token, for a program.")] = False,
+    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="Lifetime of the link in hours.")] = 168,
+    only_token: Annotated[bool, typer.Option("--only-token", help="Print only the token, for use in scripts.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Prints a read-only link to a scene; the link cannot be revoked."""
+    """Prints a read-only link to a scene; a link cannot be revoked."""
     with Client(url, token=token) as client:
         made = client.share(None if scene == "all" else scene, round(3600 * hours))
-    _say(made.token) if only_token else _say(url.rstrip("/") + made.address, f"holds until {made.ends}")
+    _say(made.token) if only_token else _say(url.rstrip("/") + made.address, f"valid until {made.ends}")
 
 
 @app.command()
@@ -172,7 +173,7 @@ def _rule(option: str, given: str | None) -> Retention | None:
     if given is None or given == "all":
         return None if given is None else Retention()
     if not given.isdecimal():
-        raise ValueError(f"{option} {given} is neither a number of frames nor all; give as {option} 100")
+        raise ValueError(f"{option} {given} is neither a number of frames nor all; use the form {option} 100")
     return Retention(last=int(given))
 
 

@@ -1,4 +1,4 @@
-"""Scores of reconstructions: rows on disk, one file per row, and Markdown tables of them."""
+"""Scores of reconstructions: storage on disk with one file per row, and formatting as Markdown tables."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 Row = dict[str, Any]
-"""Measured values as JSON, by name; ``key`` identifies the row."""
+"""Measured JSON values, keyed by name; ``key`` identifies the row."""
 
 
 def read_row(path: Path) -> Row | None:
-    """Reads the file of a row; returns None if it does not exist."""
+    """Reads a row from its file; returns None if the file does not exist."""
     if not path.exists():
         return None
     row: Row = json.loads(path.read_text())
@@ -23,7 +23,7 @@ def read_row(path: Path) -> Row | None:
 
 
 def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) -> Row:
-    """Returns the row on disk. If it is missing, or with ``again``, measures the row and writes it first."""
+    """Returns the stored row; measures and stores it first if it is missing or ``again`` is true."""
     row = None if again else read_row(path)
     if row is None:
         row = measured()
@@ -32,7 +32,7 @@ def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) ->
 
 
 def write_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Writes the file of a row atomically, and creates its folder if needed."""
+    """Writes a row to its file atomically, creating the folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(f".{os.getpid()}.part")
     beside.write_text(json.dumps(row, indent=1))
@@ -40,9 +40,10 @@ def write_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 class Store:
-    """The rows of one study.
+    """Storage for the rows of one study.
 
-    Finished rows are in ``rows/<key>.json``; ``frames/<key>.jsonl`` receives one line per frame during measurement.
+    Finished rows are stored in ``rows/<key>.json``; during measurement, one line per frame is appended to
+    ``frames/<key>.jsonl``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -65,11 +66,11 @@ class Store:
         write_row(self.folder / "rows" / f"{row['key']}.json", row)
 
     def start_frames(self, key: str) -> None:
-        """Empties the file of a row's per-frame lines."""
+        """Clears the per-frame lines of a row."""
         (self.folder / "frames" / f"{key}.jsonl").write_text("")
 
     def put_frame(self, key: str, frame: Mapping[str, Any]) -> None:
-        """Appends one frame's line."""
+        """Appends the line of one frame."""
         with (self.folder / "frames" / f"{key}.jsonl").open("a") as file:
             file.write(json.dumps(frame) + "\n")
 
@@ -86,14 +87,14 @@ def digest(*parts: Any) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """One table column: its heading, the name of its value in a row, and its format."""
+    """Table column: its heading, the name of its value in a row, and its number format."""
 
     heading: str
     name: str
     form: str = ".2f"
 
     def cell(self, row: Row) -> str:
-        """Formats the value as text; a missing value becomes a dash."""
+        """Formats the value of a row as text; a missing value becomes a dash."""
         value: Any = row.get(self.name)
         if value is None or value == "":
             return "–"
@@ -127,7 +128,7 @@ QUALITY = (
 
 
 def markdown(rows: Iterable[Row], columns: Sequence[Column] = QUALITY) -> str:
-    """Formats rows as a Markdown table, one line per row. The line of a failed row ends with its error."""
+    """Formats rows as a Markdown table with one line per row; the line of a failed row ends with its error."""
     lines = ["| " + " | ".join(c.heading for c in columns) + " |", "|" + "---|" * len(columns)]
     for row in rows:
         if "error" in row:

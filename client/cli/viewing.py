@@ -1,4 +1,4 @@
-"""Commands that turn states into something to watch: `scas4d video` and `scas4d rerun`."""
+"""Commands that visualize states: `scas4d video` and `scas4d rerun`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from client.sdk import DEFAULT_URL
 
 Source = Annotated[
     str,
-    typer.Argument(metavar="SOURCE", help="A compact file (.s4d), a folder of `scas4d reconstruct`, or a scene id."),
+    typer.Argument(
+        metavar="SOURCE", help="A compact file (.s4d), an output folder of `scas4d reconstruct`, or a scene id."
+    ),
 ]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="First and last frame, inclusive.")]
 
@@ -23,19 +25,22 @@ Frames = Annotated[str | None, typer.Option(metavar="A:B", help="First and last 
 def video(
     source: Source,
     options: CaptureOptions,
-    out: Annotated[Path | None, typer.Option(help="File, .mp4 or .webp; default: an MP4 next to SOURCE.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output file (.mp4 or .webp); default: an MP4 next to SOURCE.")
+    ] = None,
     path: Annotated[
-        str, typer.Option(help="orbit, camera, or a JSON file of key poses; see docs/videos.md.", metavar="PATH")
+        str,
+        typer.Option(
+            help="Camera path: orbit, camera, or a JSON file of key poses; see docs/videos.md.", metavar="PATH"
+        ),
     ] = "orbit",
     camera: Annotated[
         str | None,
-        typer.Option(
-            help="Camera to look through, or at which the orbit starts; default: the first.", metavar="CAMERA"
-        ),
+        typer.Option(help="Camera to render from, or at which the orbit starts; default: the first.", metavar="CAMERA"),
     ] = None,
     frames: Frames = None,
     fps: Annotated[
-        float | None, typer.Option(min=0.1, max=240, help="Pictures per second; default: the rate of the frames.")
+        float | None, typer.Option(min=0.1, max=240, help="Frame rate of the video; default: that of the scene.")
     ] = None,
     speed: Annotated[
         float,
@@ -44,23 +49,26 @@ def video(
     seconds: Annotated[
         float | None,
         typer.Option(
-            min=0.01, max=86400, help="Length in seconds; the last frame stays. Default: until the frames end."
+            min=0.01, max=86400, help="Duration in seconds; the last frame is held. Default: the duration of the scene."
         ),
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the render, such as 1280x720; default: the camera's.")
+        str | None,
+        typer.Option(metavar="WxH", help="Size of the render, such as 1280x720; default: that of the camera."),
     ] = None,
     orbit_speed: Annotated[
-        float, typer.Option(min=-3600, max=3600, help="Degrees per second of the orbit; negative turns left.")
+        float, typer.Option(min=-3600, max=3600, help="Orbit speed in degrees per second; negative values turn left.")
     ] = 30.0,
     interpolate: Annotated[
         bool, typer.Option("--interpolate", help="Interpolate between frames; default: show the nearest frame.")
     ] = False,
     tracks: Annotated[int, typer.Option(min=0, max=1000, help="Draw the trails of this many moving points.")] = 0,
-    trail: Annotated[float, typer.Option(min=0.01, max=600, help="Seconds of video until a trail fades.")] = 1.0,
-    parts: Annotated[bool, typer.Option("--parts", help="Colour by part.")] = False,
+    trail: Annotated[
+        float, typer.Option(min=0.01, max=600, help="Seconds of video after which a trail fades out.")
+    ] = 1.0,
+    parts: Annotated[bool, typer.Option("--parts", help="Colour Gaussians by part.")] = False,
     compare: Annotated[
-        Path | None, typer.Option(metavar="CAPTURE", help="Show the true picture from this capture to the right.")
+        Path | None, typer.Option(metavar="CAPTURE", help="Show the ground-truth image from this capture to the right.")
     ] = None,
     background: Annotated[
         str | None, typer.Option(help="Background colour, such as white or #202020; default: the scene's.")
@@ -68,7 +76,7 @@ def video(
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Renders frames as a video from a camera that orbits, stays fixed or follows key poses.
+    """Renders frames to a video from a camera that orbits, stays fixed or follows key poses.
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d video out/robot --speed 0.25 --interpolate
     """
@@ -97,11 +105,13 @@ def video(
 
 def rerun(
     source: Source,
-    out: Annotated[Path | None, typer.Option(help="File, .rrd; default: next to SOURCE, with its name.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output file (.rrd); default: next to SOURCE, with its name.")
+    ] = None,
     frames: Frames = None,
-    tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Number of trails of moving points.")] = 30,
-    trail: Annotated[float, typer.Option(min=0, help="Length of the trails, seconds of the scene.")] = 0.5,
-    parts: Annotated[bool, typer.Option("--parts", help="Colour by part.")] = False,
+    tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Number of moving points to draw trails for.")] = 30,
+    trail: Annotated[float, typer.Option(min=0, help="Length of the trails in seconds of scene time.")] = 0.5,
+    parts: Annotated[bool, typer.Option("--parts", help="Colour points by part.")] = False,
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Implementation of `scas4d export`, which converts states of a file, an export or a scene to third-party formats."""
+"""Implementation of `scas4d export`, which converts states from a file, an export or a scene to third-party formats."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def export(
     url: str,
     token: str | None,
 ) -> None:
-    """Exports frames to a file or folder, with one state in memory at a time.
+    """Exports frames to a file or folder, holding one state in memory at a time.
 
     Args:
         source: source of the states, see `opened`.
         format: format name from docs/exports.md.
-        out: folder or `.zip` for numbered files, else a file. None derives the name from source and format and writes
-            next to the source file, or to the current folder for a scene.
-        frames: range `A:B`, inclusive; either end may be omitted. None for all.
-        ids: ids of the Gaussians for the format `tracks`.
-        rate: frames per second of a source with numbered files.
+        out: output folder or `.zip` for numbered files, otherwise output file. If None, the name is derived from source
+            and format, and the output is written next to the source, or to the current folder for a scene.
+        frames: inclusive range `A:B`; either end may be omitted. None for all frames.
+        ids: ids of the Gaussians to export in the format `tracks`.
+        rate: frame rate of a source that consists of numbered files; None for the default of 30.
         url: address of the service.
         token: token of the service.
 
@@ -42,12 +42,14 @@ def export(
     wanted = format_of(format)
     low, high = frame_range(frames)
     if ids and format != "tracks":
-        raise InputError(f"id is given for format {format!r}", "leave --id out; it chooses the Gaussians of tracks")
+        raise InputError(
+            f"id is given for format {format!r}", "leave --id out; it selects Gaussians for the format tracks"
+        )
     if out is not None and not wanted.numbered:
         check_suffix(out, wanted)
     elif out is not None and out.suffix.lower() in wanted.suffixes:
         raise InputError(
-            f"out {str(out)!r} is the name of one file, and {format} has one for each frame",
+            f"out {str(out)!r} is a file name, but {format} writes one file per frame",
             f"give a folder, or {out.stem}.zip",
         )
     with_parts = wanted.needs_parts or format in WITH_PARTS
@@ -57,18 +59,18 @@ def export(
         for remark in given.remarks:
             console.print(remark, soft_wrap=True)
         if given.damage is not None:
-            console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
+            console.print(f"only part of the source can be read: {given.damage}", soft_wrap=True)
         chosen = list(states.within(low, high))
         count = len(chosen)
         if others := other_frames(target, wanted, chosen):
             raise InputError(
-                f"out {str(target)!r} holds {len(others)} files of frames that are not in this export, as "
-                f"{others[0].name}; readers would treat them as one sequence",
-                "remove them, or give another folder: --out",
+                f"out {str(target)!r} contains {len(others)} files of frames that are not in this export, such as "
+                f"{others[0].name}; readers would treat all files as one sequence",
+                "remove them, or choose another folder with --out",
             )
         parts = given.parts() if with_parts else None
         if wanted.needs_parts and parts is None:
-            raise InputError(f"{source} has no parts, and {format} is made of them", "use a source with parts")
+            raise InputError(f"{source} has no parts, which the format {format} requires", "use a source with parts")
         paths = export_sequence(
             given.states(low, high),
             format,
@@ -82,4 +84,4 @@ def export(
             progress=lambda index, done: bars("exporting", done, count),
         )
     what = f"{len(paths)} files in {target}" if len(paths) > 1 else f"{count} frames in {target}"
-    console.print(f"{what} ({format}; docs/exports.md says what each format holds)", soft_wrap=True)
+    console.print(f"{what} ({format}; see docs/exports.md for the contents of each format)", soft_wrap=True)

@@ -1,7 +1,7 @@
-"""Bundling of JavaScript modules into one classic script, for pages opened from ``file://``.
+"""Bundles JavaScript modules into one classic script, for pages opened from ``file://``.
 
 Browsers do not load modules from ``file://``. Each module becomes a function that returns its exports. Only the forms
-of import and export matched below are supported; all others are refused.
+of import and export matched below are supported; all others are rejected.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ _OTHER = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
 def script(entry: Path, root: Path) -> str:
-    """Returns a script that contains a module and all its imports.
+    """Returns a script that contains a module and everything it imports.
 
     Args:
-        entry: main module.
-        root: folder relative to which modules are named.
+        entry: path of the entry module.
+        root: folder to which module names are relative.
 
     Returns:
-        Self-contained script without ``</script``.
+        Self-contained script that does not contain ``</script``.
 
     Raises:
         ValueError: a module uses an unsupported form of import or export, or there is an import cycle.
@@ -52,7 +52,7 @@ def script(entry: Path, root: Path) -> str:
     _link(entry.resolve(), root.resolve(), linked, ())
     text = "\n".join(['(() => {\n"use strict";\nconst modules = {};', *linked.values(), "})();"])
     if "</script" in text.lower() or "<!--" in text:
-        raise ValueError(f"{entry.name}: a module has text that ends a script of HTML; write it in two parts")
+        raise ValueError(f"{entry.name}: a module contains text that would end an HTML script element; split that text")
     return text
 
 
@@ -60,7 +60,7 @@ def _link(path: Path, root: Path, linked: dict[Path, str], within: tuple[Path, .
     if path in linked:
         return
     if path in within:
-        raise ValueError(f"modules import one another: {' → '.join(one.name for one in (*within, path))}")
+        raise ValueError(f"circular import: {' → '.join(one.name for one in (*within, path))}")
     text = path.read_text(encoding="utf-8")
     exported = [match.group(1) for match in _EXPORT.finditer(text)]
     exported += [name.strip() for match in _LIST.finditer(text) for name in match.group(1).split(",") if name.strip()]
@@ -73,7 +73,7 @@ def _link(path: Path, root: Path, linked: dict[Path, str], within: tuple[Path, .
 
     body = _LIST.sub("", _EXPORT.sub("", _IMPORT.sub(imported, text)))
     if other := _OTHER.search(body):
-        raise ValueError(f"{path.name}: {other.group()!r} is no import or export that can be linked")
+        raise ValueError(f"{path.name}: {other.group()!r} is not a supported form of import or export")
     returned = f"return {{ {', '.join(exported)} }};"
     linked[path] = f"modules[{_quoted(path, root)}] = (() => {{\n{body.rstrip()}\n{returned}\n}})();"
 

@@ -22,20 +22,20 @@ from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.errors import InputError
 
 VIEWER = Path(__file__).parents[2] / "server" / "viewer"
-"""Folder of the viewer's modules, which the player shares."""
+"""Folder of the viewer's modules, which the player reuses."""
 PIECE = 3 << 18
 """Chunk size in bytes; a multiple of 3, so that each base64 chunk can be decoded separately."""
 LARGE, LARGEST = 100 << 20, 1 << 30
-"""Total size of compact files in bytes above which a player opens slowly, and above which browsers refuse it."""
+"""Total sizes of the compact files in bytes above which a player opens slowly and above which browsers refuse it."""
 
 
 def export_player(source: str, out: Path, frames: str | None = None, *, url: str, token: str | None) -> None:
-    """Writes the player with the compact files of the source, or with a new one if only some frames are requested.
+    """Writes a player with the compact files of the source, or with a new file if only some frames are requested.
 
     Args:
-        source: compact file, output folder of `scas4d reconstruct`, or id of a scene of the service.
+        source: compact file, output folder of `scas4d reconstruct`, or id of a scene on the service.
         out: path of the HTML file.
-        frames: range `A:B`, inclusive; None for all.
+        frames: inclusive range `A:B`; None for all frames.
         url: address of the service.
         token: token of the service.
 
@@ -43,24 +43,24 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
         InputError: the range or output is invalid, or the data is larger than browsers can open.
     """
     if out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"player={str(out)!r} is not the name of a page", "give one that ends in .html")
+        raise InputError(f"player={str(out)!r} is not an HTML file name", "give a name that ends in .html")
     low, high = frame_range(frames)
     with opened(source, low, high, True, url, token) as given:
         if given.of.damage is not None:
-            console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
+            console.print(f"only part of the source can be read: {given.of.damage}", soft_wrap=True)
         count = len(given.within(low, high))
         with _files(given, low, high, count) as files:
             size = sum(file.stat().st_size for file in files)
             if size > LARGEST:
                 raise InputError(
-                    f"{size / 1e6:.0f} MB of frames are more than browsers open in one page",
+                    f"{size / 1e6:.0f} MB of frames are more than browsers can open in one page",
                     "export fewer with --frames A:B",
                 )
             folder = given.beside.resolve().name  # `scas4d reconstruct` always uses the same file name
             write_player(out, folder if f"{given.name}.s4d" == STATES and folder else given.name, files)
     console.print(f"{count} frames in {out}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser", soft_wrap=True)
     if size > LARGE:
-        console.print("it is large, and slow to open; --frames A:B makes a smaller one", soft_wrap=True)
+        console.print("the page is large and slow to open; use --frames A:B to make it smaller", soft_wrap=True)
 
 
 def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
@@ -103,7 +103,7 @@ def _pieces(file: Path) -> Iterator[str]:
 
 @contextmanager
 def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[Path]]:
-    """Yields the source's compact files, or a new one if they contain other frames or the source has none."""
+    """Yields the source's compact files, or a new one if there are none or they contain other frames."""
     if isinstance(given.of, CompactStates) and count == _held(given.of.files):
         yield given.of.files
         return
@@ -125,7 +125,7 @@ def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[
 
 
 def _facing(points: NDArray[np.float64]) -> Camera:
-    """Returns a camera that views points [N, 3] (user's world) along +z, for sources without cameras.
+    """Returns a camera that views points [N, 3] in the user's world along +z, for sources without cameras.
 
     >>> camera = _facing(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5]]))
     >>> pixels, depth = camera.project(np.array([[0.5, 0.5, 5]]))
@@ -140,7 +140,7 @@ def _facing(points: NDArray[np.float64]) -> Camera:
 
 
 def _held(files: Sequence[Path]) -> int:
-    """Returns the number of frames in compact files, including those on which others depend."""
+    """Returns the number of frames in compact files, including those that only serve as dependencies."""
     indices: set[int] = set()
     for file in files:
         with CompactReader(file) as reader:

@@ -40,15 +40,15 @@ def make_recording(
     url: str,
     token: str | None,
 ) -> Path:
-    """Writes a Rerun recording, with one state in memory at a time, and returns its path.
+    """Writes a Rerun recording, holding one state in memory at a time, and returns its path.
 
     Args:
         source: source of the states, see `opened`.
         out: path that ends in `.rrd`; None for a file next to the source, named after it.
-        frames: range `A:B`, inclusive; None for all.
+        frames: inclusive range `A:B`; None for all frames.
         tracks: number of moving Gaussians whose trajectories are drawn.
         trail: length of the trajectories in seconds of scene time.
-        parts: whether to colour points by part instead of by their own colour. Part labels are recorded in any case.
+        parts: whether to colour points by part instead of using their own colours. Part labels are always recorded.
         url: address of the service.
         token: token of the service.
 
@@ -61,13 +61,13 @@ def make_recording(
         raise InputError(f"out {str(out)!r} ends in {out.suffix!r}", f"give a name that ends in {SUFFIX}")
     with opened(source, low, high, parts, url, token) as given, Bars() as bars:
         if given.of.damage is not None:
-            console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
+            console.print(f"only part of the source can be read: {given.of.damage}", soft_wrap=True)
         times = given.within(low, high)
         target = out or given.beside / f"{given.name}{SUFFIX}"
         labels = given.parts()
         if parts and labels is None:
             raise InputError(
-                f"parts: {given.name} holds none", "leave --parts out; a scene without motion has no parts"
+                f"parts: {given.name} contains no parts", "leave --parts out; a scene without motion has no parts"
             )
         rows = moving_rows(given.some(list(times)), tracks)
         with _stream(target) as stream:
@@ -82,13 +82,13 @@ def make_recording(
     console.print(
         f"{target}: {len(times)} frames, {target.stat().st_size / 1e6:.1f} MB", highlight=False, soft_wrap=True
     )
-    console.print(f"to look at it: rerun {target}", highlight=False, soft_wrap=True)
+    console.print(f"to view it: rerun {target}", highlight=False, soft_wrap=True)
     return target
 
 
 @contextmanager
 def _stream(target: Path) -> Iterator[Any]:
-    """Yields a Rerun recording stream into a temporary file, which gets its final name once it is complete."""
+    """Yields a Rerun stream that records to a temporary file, which is renamed once it is complete."""
     import rerun
     from rerun import blueprint
 
@@ -173,10 +173,10 @@ def _longer(
     seconds: float,
     trail: float,
 ) -> NDArray[np.float64]:
-    """Appends the positions of a state to the trails and returns the last `trail` seconds.
+    """Appends the positions of a state to the trails and returns those of the last `trail` seconds.
 
     Returns:
-        Positions [S, K, 3]; NaN if a Gaussian is not present.
+        Positions [S, K, 3]; NaN where a Gaussian is not present.
     """
     places = given.head.world.to_user(state.means[rows])
     places[~state.present[rows]] = np.nan

@@ -1,4 +1,4 @@
-"""Sources of states for exports: a compact file, its folder, an export, or a scene of the service."""
+"""Sources of states for exports: a compact file, its folder, an export, or a scene on the service."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class States(Protocol):
         head: world frame, rig, frame rate and background.
         frames: frame indices in ascending order.
         times: times of the frames in seconds.
-        damage: reason why only a part of the source can be read, or None.
+        damage: reason why only part of the source can be read; None if all of it can be read.
         remarks: sentences that describe data missing from the source.
     """
 
@@ -50,7 +50,7 @@ class States(Protocol):
 
     @property
     def damage(self) -> str | None:
-        """Reason why only a part of the source can be read, or None."""
+        """Reason why only part of the source can be read, or None."""
 
     @property
     def remarks(self) -> Sequence[str]:
@@ -65,7 +65,7 @@ class States(Protocol):
 
 @dataclass(frozen=True)
 class Source:
-    """States with the default name and folder of exported files.
+    """States of a source, with the default name and folder for exported files.
 
     Attributes:
         name: base name of exported files.
@@ -91,7 +91,7 @@ class Source:
         return self.of.states(low, high)
 
     def within(self, low: int, high: int) -> dict[int, float]:
-        """Returns the times in seconds of the frames from ``low`` to ``high`` by frame index, in order.
+        """Returns the time in seconds of each frame from ``low`` to ``high``, keyed by frame index, in order.
 
         Raises:
             InputError: there are no such frames.
@@ -121,27 +121,27 @@ class Source:
 def opened(
     source: str, low: int, high: int, parts: bool, url: str, token: str | None, rate: float | None = None
 ) -> Iterator[Source]:
-    """Yields an opened source of states; the states of a scene are downloaded from the service.
+    """Opens and yields a source of states; the states of a scene are downloaded from the service.
 
     Args:
         source: compact file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
-            of a scene of the service.
+            of a scene on the service.
         low: first frame.
         high: last frame.
-        parts: whether to download the part labels of a scene.
+        parts: whether to also download the part labels of a scene.
         url: address of the service.
         token: token of the service.
-        rate: frames per second of numbered files.
+        rate: frame rate of numbered files; None for the default of 30.
 
     Raises:
-        InputError: the source does not exist, or it is an export without ids.
+        InputError: the source does not exist, or is an export without ids.
     """
     path = Path(source)
     if path.exists():
         yield of_path(path, rate)
     elif not is_scene_id(source):
         raise InputError(
-            f"source {source!r} is not there", "give a compact file, its folder, an export, or a scene's id"
+            f"source {source!r} does not exist", "give a compact file, its folder, an export, or a scene's id"
         )
     else:
         with of_scene(source, low, high, parts, url, token) as given:
@@ -149,7 +149,7 @@ def opened(
 
 
 def is_scene_id(source: str) -> bool:
-    """Returns True if a source is a scene id: no such file exists, and it has neither a suffix nor a folder.
+    """Returns True if a source is a scene id, i.e. it is not an existing path and has neither a suffix nor a folder.
 
     >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
     (True, False, False, False)
@@ -166,7 +166,7 @@ class CompactStates:
         files: compact files in frame order.
         head: header of the first file.
         frames, times: frame indices and times in seconds of all files.
-        damage: damage of the first damaged file, or None.
+        damage: description of the damage in the first damaged file, or None.
         remarks: always empty.
     """
 
@@ -179,7 +179,7 @@ class CompactStates:
 
     @classmethod
     def of(cls, files: Sequence[Path], first: int = 0) -> CompactStates:
-        """Returns the states of the files from frame ``first`` on; earlier frames only serve as dependencies."""
+        """Returns the states of the files from frame ``first`` on; earlier frames serve only as dependencies."""
         heads: list[FileHeader] = []
         times: dict[int, float] = {}
         damages: list[str] = []
@@ -212,16 +212,16 @@ def of_path(path: Path, rate: float | None = None) -> Source:
 
     Args:
         path: existing file or folder.
-        rate: frames per second of numbered files; None for the default of 30.
+        rate: frame rate of numbered files; None for the default of 30.
 
     Raises:
-        InputError: the path is none of these.
+        InputError: the path is not a supported source.
     """
     if path.is_dir() and (path / STATES).exists():
         path = path / STATES
     if path.suffix.lower() == ".s4d":
         return Source(path.stem, path.parent, CompactStates.of([path]))
-    from scas4d_core.exports.reading import open_export  # lazy: compact files need none of its readers
+    from scas4d_core.exports.reading import open_export  # imported lazily: compact files need none of its readers
     from scas4d_core.exports.reading.sources import DEFAULT_FPS
 
     return Source(path.stem, path.parent, open_export(path, DEFAULT_FPS if rate is None else rate))
@@ -250,7 +250,7 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
 
 
 def frame_range(text: str | None) -> tuple[int, int]:
-    """Returns the first and last frame of a range.
+    """Parses a frame range and returns its first and last frame.
 
     >>> frame_range("2:4"), frame_range(":1"), frame_range("7")
     ((2, 4), (0, 1), (7, 7))
@@ -263,7 +263,7 @@ def frame_range(text: str | None) -> tuple[int, int]:
         high = int(last or LAST) if colon else low
     except ValueError:
         raise InputError(
-            f"frames {text!r} is not a range", "give A:B, such as 0:99; A: and :B are open at one end"
+            f"frames {text!r} is not a range", "give A:B, such as 0:99; either end may be omitted"
         ) from None
     if not 0 <= low <= high:
         raise InputError(f"frames {text!r} contains no frame", "give A:B with 0 ≤ A ≤ B")

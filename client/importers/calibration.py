@@ -1,4 +1,4 @@
-"""`Calibration`: the cameras of a rig, independent of the calibration tool that wrote them. Needs only numpy."""
+"""`Calibration`: the cameras of a rig, independent of the calibration tool that wrote them. Requires only numpy."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
 STATIC_TOLERANCE = 1e-6
-"""Largest relative change of an entry of a static camera's pose, intrinsics or distortion between images."""
+"""Maximum relative change, between images, of any entry in a static camera's pose, intrinsics or distortion."""
 
 
-NAMES = "a camera's name has letters, digits, dots, dashes and underscores, at most 64, and is not `time`"
+NAMES = "a camera name consists of at most 64 letters, digits, dots, dashes and underscores, and is not `time`"
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedImage:
-    """One image that a calibration names, with its camera.
+    """Image listed in a calibration, with its camera.
 
     Attributes:
         path: path as written in the calibration file.
-        lens: the camera that took the image; `calibration` assigns its name.
-        time: seconds, if the file has it.
+        lens: camera that took the image; `calibration` assigns its name.
+        time: timestamp in seconds; None if the file contains none.
     """
 
     path: PurePosixPath
@@ -40,13 +40,13 @@ class Calibration:
     """A calibrated rig with lens distortion.
 
     Attributes:
-        source: the file or folder that the calibration was read from.
+        source: file or folder from which the calibration was read.
         cameras: cameras in natural order of their names.
-        views: the images that the calibration names, by camera name, in temporal order.
-        points: point cloud that came with the calibration, or None.
-        fps: frames per second, if the file has it.
-        remarks: messages about the reading, for the user.
-        left_out: cameras that are in the file but not in the rig; a remark names them.
+        views: images listed in the calibration, in temporal order, keyed by camera name.
+        points: point cloud included in the calibration, or None.
+        fps: frame rate; None if the file contains none.
+        remarks: messages for the user about how the calibration was read.
+        left_out: names of cameras that are in the file but not in the rig; a remark lists them.
     """
 
     source: Path
@@ -72,7 +72,7 @@ def natural(text: str) -> list[tuple[int, int, str]]:
 def calibration(
     source: Path, views: Sequence[CalibratedImage], *, points: InitialPoints | None = None, fps: float | None = None
 ) -> Calibration:
-    """Groups images by camera.
+    """Builds a calibration by grouping images by camera.
 
     A camera is named after the folder of its images or, if all images are in one folder, after its image.
 
@@ -80,7 +80,7 @@ def calibration(
         CaptureError: there are no views, a camera moves, or a camera name is invalid.
     """
     if not views:
-        raise CaptureError(f"{source}: lists no camera")
+        raise CaptureError(f"{source}: contains no cameras")
     one_folder = len({view.path.parent for view in views}) == 1
     by_name: dict[str, list[CalibratedImage]] = {}
     for view in views:
@@ -89,7 +89,7 @@ def calibration(
     for name in sorted(by_name, key=natural):
         if not can_be_named(name):
             raise CaptureError(
-                f"{source}: camera {name!r} (of {by_name[name][0].path}): {NAMES}; rename its pictures or their folder"
+                f"{source}: camera {name!r} (of {by_name[name][0].path}): {NAMES}; rename its images or their folder"
             )
         by_name[name].sort(key=lambda view: (view.time is not None, view.time or 0.0, natural(str(view.path))))
         cameras.append(_still(source, name, by_name[name]))
@@ -106,22 +106,22 @@ def calibration_of_cameras(
     Their images are expected in `images/<camera>/` or `videos/<camera>.mp4`.
 
     Args:
-        source: the file or folder that the calibration was read from.
-        cameras: the cameras of the rig.
-        left_out: cameras that are in the file but not in the rig.
-        why: start of the remark that names the cameras left out.
+        source: file or folder from which the calibration was read.
+        cameras: cameras of the rig.
+        left_out: names of cameras that are in the file but not in the rig.
+        why: beginning of the remark that lists these cameras.
 
     Raises:
         CaptureError: there are no cameras, a name occurs twice, or a name is invalid.
     """
     if not cameras:
-        raise CaptureError(f"{source}: lists no camera with a pose; calibrate the rig's poses (extrinsics) too")
+        raise CaptureError(f"{source}: contains no camera with a pose; calibrate the rig's poses (extrinsics) too")
     names = [camera.name for camera in cameras]
     for name in names:
         if not can_be_named(name):
-            raise CaptureError(f"{source}: camera {name!r}: {NAMES}; rename it there and its pictures")
+            raise CaptureError(f"{source}: camera {name!r}: {NAMES}; rename the camera and its images")
         if names.count(name) > 1:
-            raise CaptureError(f"{source}: two cameras are called {name!r}; rename one, and its pictures")
+            raise CaptureError(f"{source}: two cameras are named {name!r}; rename one of them and its images")
     ordered = tuple(sorted(cameras, key=lambda camera: natural(camera.name)))
     views: dict[str, tuple[CalibratedImage, ...]] = {camera.name: () for camera in ordered}
     remarks = (f"{why}: {', '.join(left_out)}",) if left_out else ()
@@ -129,7 +129,7 @@ def calibration_of_cameras(
 
 
 def can_be_named(name: str) -> bool:
-    """Returns whether the service accepts a camera name. No accepted name can escape its folder."""
+    """Returns whether the service accepts a camera name. Accepted names cannot contain path separators."""
     return bool(re.fullmatch(CAMERA_NAME, name)) and name != "time" and not name.startswith("mask.")
 
 
@@ -140,8 +140,8 @@ def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCam
             old, new = getattr(first, field), getattr(view.lens, field)
             if old.shape != new.shape or np.abs(new - old).max() > STATIC_TOLERANCE * max(1.0, np.abs(old).max()):
                 raise CaptureError(
-                    f"{source}: camera {name!r} has another {field} in {view.path} than in {views[0].path}; a rig's "
-                    "cameras must not move: calibrate with one picture per camera, or put each camera's pictures into "
+                    f"{source}: camera {name!r} has a different {field} in {view.path} and {views[0].path}; a rig's "
+                    "cameras must not move: calibrate with one image per camera, or put each camera's images into "
                     "a separate folder"
                 )
     return LensCamera(

@@ -1,4 +1,4 @@
-"""`DistortionCurve`: applies and inverts a lens's distortion where its polynomial is monotonic. Needs only numpy."""
+"""`DistortionCurve`: applies and inverts lens distortion where its polynomial is monotonic. Requires only numpy."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from client.importers.lens import LensCamera
 Float = NDArray[np.float64]
 
 FLAT = np.radians(89.0)
-"""Angle from the optical axis beyond which a ray counts as never meeting the plane at distance 1."""
+"""Angle from the optical axis in radians, beyond which a ray is treated as never meeting the plane at distance 1."""
 SAMPLES = 8192
 STEEP = 0.1
 """Smallest trusted slope of the radial profile, relative to the slope on the axis.
 
-A polynomial that turns back is not constrained by calibration points near its maximum. Where it is flatter than this,
-a tenth of a pixel in the lens's image would be stretched over more than a pixel.
+Near the maximum of a non-monotonic polynomial, no calibration points constrain it. Where it is flatter than this, a
+tenth of a pixel in the lens's image would be stretched over more than a pixel.
 """
 NEWTON = 8
 ROUNDS = 60
-"""Fixed-point iterations for the tangential part; since it is small, the iteration converges quickly."""
+"""Number of fixed-point iterations for the tangential part; since it is small, they converge quickly."""
 CLOSE = 1e-7
-"""Largest residual, on the plane at distance 1, of a ray that counts as a solution."""
+"""Maximum residual, on the plane at distance 1, for a ray to count as a solution."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,11 @@ class DistortionCurve:
     """Radial distortion profile of a lens: a function of the ray's radius at distance 1 or, for a fisheye, its angle.
 
     Attributes:
-        lens: the lens.
+        lens: camera with lens distortion.
         reach: largest radius (fisheye: angle from the axis) at which the profile is trusted.
-        turns: True if the image extends beyond `reach` because the polynomial turns back before the farthest corner.
-        samples: [S] radii (angles) from 0 to `reach`.
-        bends: [S] distorted radii at `samples`, increasing.
+        turns: True if the image extends beyond `reach` because the polynomial decreases before the farthest corner.
+        samples: [S] radii (fisheye: angles) from 0 to `reach`.
+        bends: [S] distorted radii at `samples`, in increasing order.
     """
 
     lens: LensCamera
@@ -82,7 +82,7 @@ class DistortionCurve:
     def undistort(self, bent: Float) -> Float:
         """Inverts `distort`, [P, 2] to [P, 2].
 
-        Returns ±infinity beyond 89° of a fisheye, and NaN for points that no trusted ray reaches.
+        Returns ±infinity beyond 89° for a fisheye, and NaN for points that no trusted ray reaches.
         """
         if self.lens.fisheye or not _tangential(self.lens).any():
             return self._undistort_radial(bent)

@@ -1,11 +1,11 @@
-"""Packages that only the importers need, imported on first use."""
+"""Optional packages that only the importers need, imported on first use."""
 
 from __future__ import annotations
 
 import importlib
 from typing import Any
 
-INSTALL = "in the project's folder: pip install -e '.[importers]'"
+INSTALL = "run in the project folder: pip install -e '.[importers]'"
 
 
 class MissingExtraError(RuntimeError):
@@ -13,7 +13,7 @@ class MissingExtraError(RuntimeError):
 
 
 def load(module: str, *, needed: str) -> Any:
-    """Imports a module; `needed` names its purpose in the error message.
+    """Imports a module; `needed` states its purpose in the error message.
 
     Raises:
         MissingExtraError: the module is not installed; the message names the extra.
@@ -29,7 +29,7 @@ def load(module: str, *, needed: str) -> Any:
 
 def opencv() -> Any:
     """Imports OpenCV, which undistorts images."""
-    return load("cv2", needed="undoing a lens's distortion")
+    return load("cv2", needed="undistorting images")
 
 
 def pyav() -> Any:

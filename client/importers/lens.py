@@ -1,4 +1,4 @@
-"""Lenses: the camera models of calibration tools, and cameras that use them. Needs only numpy.
+"""Camera models of calibration tools, and cameras with lens distortion. Requires only numpy.
 
 Pixel coordinates put the centre of the first pixel at (0.5, 0.5), as in COLMAP and nerfstudio.
 """
@@ -35,14 +35,14 @@ MODELS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class LensCamera:
-    """A calibrated camera with its distortion.
+    """A calibrated camera with lens distortion.
 
     Attributes:
-        name: identifies the camera within its rig.
-        model: one of `MODELS`.
+        name: name of the camera, unique within its rig.
+        model: name of the camera model, one of `MODELS`.
         intrinsics: [3, 3] in pixels, with the principal point relative to the upper left corner of the image.
         distortion: coefficients in OpenCV's order, [8] as in `PERSPECTIVE` or [4] as in `FISHEYE`.
-        world_to_camera: [4, 4], OpenCV axes.
+        world_to_camera: [4, 4] pose matrix with OpenCV axes.
         width, height: image size in pixels.
     """
 
@@ -87,27 +87,26 @@ def lens_camera(
 
     Args:
         name: name of the camera.
-        model: name of the lens model.
-        parameters: parameters by name. Models with a single focal length also accept `fx` and `fy`; missing
-            coefficients
-            are 0.
-        world_to_camera: [4, 4], OpenCV axes.
+        model: name of the camera model.
+        parameters: parameter values, keyed by name. Models with a single focal length also accept `fx` and `fy`.
+            Missing coefficients are 0.
+        world_to_camera: [4, 4] pose matrix with OpenCV axes.
         size: (width, height) in pixels.
-        source: name of the file in messages.
+        source: name of the file, for messages.
 
     Raises:
         CaptureError: the model is not supported, or the camera is not valid.
     """
     if model not in MODELS:
         raise CaptureError(
-            f"{source}: camera {name!r} has the model {model}, which is not read; "
+            f"{source}: camera {name!r} has the model {model}, which is not supported; "
             f"calibrate with one of {', '.join(MODELS)}"
         )
     known = {*MODELS[model], "fx", "fy"} | ({"k3"} if model == "OPENCV" else set())
     strange = {key: value for key, value in parameters.items() if key not in known and value != 0}
     if strange:
         listed = ", ".join(f"{key} = {value:g}" for key, value in strange.items())
-        raise CaptureError(f"{source}: camera {name!r} has {listed}, which the model {model} has not; give FULL_OPENCV")
+        raise CaptureError(f"{source}: camera {name!r} has {listed}, which the model {model} lacks; use FULL_OPENCV")
     focal = {key: parameters.get(key, parameters.get("f", 0.0)) for key in ("fx", "fy")}
     intrinsics = np.array(
         [[focal["fx"], 0, parameters["cx"]], [0, focal["fy"], parameters["cy"]], [0, 0, 1]], dtype=np.float64

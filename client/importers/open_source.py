@@ -40,12 +40,12 @@ class CaptureOptions:
     encoding: Encoding = "jpeg"
 
     def open(self, folder: Path | str, **more: Any) -> Capture:
-        """Opens a capture with these options; `more` is passed to `open_source` too and takes precedence."""
+        """Opens a capture with these options; `more` is also passed to `open_source` and takes precedence."""
         return open_source(folder, **(asdict(self) | more))
 
     @property
     def changed(self) -> dict[str, Any]:
-        """Options that differ from the default, as JSON values.
+        """Options that differ from the defaults, as JSON values.
 
         The encoding is excluded, because it does not affect decoded pixels.
         """
@@ -76,22 +76,22 @@ def open_source(
 
     Args:
         folder: folder of the capture.
-        calibration: a transforms.json, the folder of a COLMAP model, or a file of another tool
-            (`client/importers/formats/`); None searches the folder.
+        calibration: transforms.json, COLMAP model folder, or calibration file of another tool
+            (`client/importers/formats/`); None to search the folder.
         pictures: source of the images: `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
-            names. None uses the named files if there are several per camera, else whatever exists.
-        fps: frames per second, overriding the files; None uses theirs, or 30 if they have none.
-        encoding: format for images that must be encoded to be sent or written: undistorted images and video frames.
-        use_masks: False ignores `masks/` (`seg/`).
-        use_points: False ignores the point cloud.
+            names. None to use the named files if there are several per camera, otherwise whichever exist.
+        fps: frame rate, overriding that of the files; None to use that of the files, or 30 if they have none.
+        encoding: format in which undistorted images and video frames are encoded for sending or writing.
+        use_masks: whether to use the masks in `masks/` (`seg/`).
+        use_points: whether to use the point cloud.
         image_scale: factor by which images, masks and cameras are resized when they are read.
-        test: cameras held out for evaluation, in addition to those that the layout holds out.
-        size_mismatch: how images with another aspect ratio than calibrated were made (`adapt_intrinsics`); None rejects
-            such images.
+        test: names of cameras to hold out for evaluation, in addition to those that the layout holds out.
+        size_mismatch: how images whose aspect ratio differs from the calibration were produced (`adapt_intrinsics`);
+            None to reject such images.
 
     Raises:
         CaptureError: the layout is unknown, or a file is invalid; the message names the problem.
-        MissingExtraError: a lens or a video needs a package from the extra `importers`.
+        MissingExtraError: undistortion or video decoding needs a package from the extra `importers`.
 
     >>> capture = open_source(folder)
     >>> capture.rig.names, capture.frame_count
@@ -107,7 +107,7 @@ def open_source(
     if calibration is None and (folder / TRAIN_META).exists():
         if pictures is not None:
             raise CaptureError(
-                f"{folder / TRAIN_META}: names the pictures of this capture; leave --pictures {pictures} out, or name "
+                f"{folder / TRAIN_META}: lists the images of this capture; leave --pictures {pictures} out, or choose "
                 "another calibration with --calibration"
             )
         given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, size_mismatch=size_mismatch)
@@ -138,7 +138,7 @@ def _imported(
         raw.check_same_frames(files)
     elif files and len(files) != raw.frame_count:
         raise CaptureError(
-            f"{masks}: has masks of {len(files)} frames, and there are {raw.frame_count}; give one of every picture, "
+            f"{masks}: has masks for {len(files)} of {raw.frame_count} frames; give one for every image, "
             "or none (--no-masks)"
         )
     reader = ImportedPictures(found, raw, masks=files, encoding=encoding)
@@ -156,7 +156,7 @@ def _imported(
 
 
 def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
-    """Reads the given calibration or finds one in the folder.
+    """Reads the given calibration, or searches the folder for one.
 
     The search order is transforms.json, a COLMAP model in one of the usual places, then a single file of another tool.
 
@@ -183,21 +183,21 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
     raise CaptureError(
         f"{folder}: no known capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), no "
         f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}, nor, here or in calibration/, {READ}; "
-        "name the calibration with --calibration"
+        "choose the calibration with --calibration"
     )
 
 
 def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) -> Calibration:
-    """Returns the calibration with a remark that names other calibrations in the folder, which are not read."""
+    """Returns the calibration with a remark that lists other calibrations in the folder, which are not read."""
     if not others:
         return found
     listed = ", ".join(str(path.relative_to(folder)) for path in others)
-    remark = f"calibration: {found.source.relative_to(folder)}, not {listed}; --calibration FILE takes another"
+    remark = f"calibration: {found.source.relative_to(folder)}, not {listed}; choose another with --calibration FILE"
     return replace(found, remarks=(*found.remarks, remark))
 
 
 def uncalibrated_remark(folder: Path, calibration: Calibration) -> list[str]:
-    """Returns a remark that names cameras with images or a video but no calibration; empty if there are none."""
+    """Returns a remark that lists cameras with images or a video but no calibration; empty if there are none."""
     images, videos = folder / "images", folder / "videos"
     there = {path.name for path in images.iterdir() if path.is_dir()} if images.is_dir() else set[str]()
     if not there and videos.is_dir():
@@ -206,7 +206,7 @@ def uncalibrated_remark(folder: Path, calibration: Calibration) -> list[str]:
     left = sorted(name for name in unknown if not name.startswith("."))
     if not left or not there.intersection(calibration.names):  # otherwise these folders are not cameras
         return []
-    return [f"left out, {calibration.source.name} has no such camera: {', '.join(left)}"]
+    return [f"left out cameras that are not in {calibration.source.name}: {', '.join(left)}"]
 
 
 def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> RawReader:
@@ -215,12 +215,10 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
     if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):
         return _named(folder, calibration)
     if wanted is None and has_images and videos.is_dir():
-        raise CaptureError(
-            f"{folder}: has pictures in images/ and in videos/; say which: --pictures images or --pictures videos"
-        )
+        raise CaptureError(f"{folder}: has images/ and videos/; choose one: --pictures images or --pictures videos")
     if wanted == "images" or (wanted is None and has_images):
         if not images.is_dir():
-            raise CaptureError(f"{images}: no such folder; put each camera's pictures into images/<camera>/")
+            raise CaptureError(f"{images}: no such folder; put each camera's images into images/<camera>/")
         return PictureFiles(calibration, folders_of(images, calibration))
     if wanted == "videos" or (wanted is None and videos.is_dir()):
         if not videos.is_dir():
@@ -232,7 +230,7 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
 def _named(folder: Path, calibration: Calibration) -> PictureFiles:
     if not any(calibration.views.values()):
         raise CaptureError(
-            f"{folder}: there is neither images/ nor videos/, and {calibration.source.name} names no pictures; put "
-            f"each camera's into images/<camera>/ or videos/<camera>.mp4 (cameras: {', '.join(calibration.names)})"
+            f"{folder}: there is neither images/ nor videos/, and {calibration.source.name} lists no images; put "
+            f"them into images/<camera>/ or videos/<camera>.mp4 (cameras: {', '.join(calibration.names)})"
         )
     return PictureFiles(calibration, *named_files(folder, calibration))

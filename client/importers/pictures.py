@@ -1,6 +1,6 @@
-"""Frames from image files: one folder per camera, or files named by the calibration. Needs only numpy and Pillow.
+"""Frames from image files: one folder per camera, or files listed in the calibration. Requires only numpy and Pillow.
 
-In ``images/<camera>/<frame>.jpg``, frames are in natural order of their names. The images of one frame have the same
+In ``images/<camera>/<frame>.jpg``, frames are in natural order of their names. All images of a frame have the same
 name, with any extension.
 """
 
@@ -22,7 +22,7 @@ SHOWN = 3
 
 
 class PictureFiles:
-    """Image files of T frames, by camera; all images of a camera have the size of its first one.
+    """Image files of T frames for each camera; all images of a camera have the size of the first one.
 
     Raises:
         CaptureError: the first image of a camera cannot be read.
@@ -46,7 +46,7 @@ class PictureFiles:
         return self._times[index] if self._times else None
 
     def path(self, camera: str) -> Path:
-        """Returns the camera's first file."""
+        """Returns the first image file of a camera."""
         return self._files[0][camera]
 
     def file(self, index: int, camera: str) -> Path | None:
@@ -59,7 +59,7 @@ class PictureFiles:
         return decode_image(self._files[index][camera], size=self.sizes[camera])
 
     def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
-        """Checks that the masks have the same frame names as the images.
+        """Checks that masks and images have the same frame names.
 
         Raises:
             CaptureError: an image has no mask, or a mask has no image.
@@ -69,13 +69,13 @@ class PictureFiles:
             mask = next(iter(masks[index].values())) if index < len(masks) else None
             if picture is None or mask is None or picture.stem != mask.stem:
                 raise CaptureError(
-                    f"frame {index}: its picture is {picture} and its mask {mask}; call masks like the pictures and "
-                    "give one for every picture, or none (--no-masks)"
+                    f"frame {index}: its image is {picture} and its mask is {mask}; name masks like the images and "
+                    "give one for every image, or none (--no-masks)"
                 )
 
 
 def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") -> list[dict[str, Path]]:
-    """Returns the files in ``root/<camera>/`` by frame, [T], one file per camera.
+    """Returns the files in ``root/<camera>/`` for each frame [T], keyed by camera name.
 
     Raises:
         CaptureError: a camera has no folder, or a folder lacks a frame that another folder has.
@@ -87,7 +87,7 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") 
             there = sorted((path.name for path in root.iterdir() if path.is_dir()), key=natural)
             raise CaptureError(
                 f"{folder}: no such folder, but {calibration.source} has a camera {camera!r}; {root.name}/ has "
-                f"{_some(there) or 'no folders'}: name the folders like the cameras"
+                f"{_some(there) or 'no folders'}: name the folders after the cameras"
             )
         by_camera[camera] = _pictures_in(folder)
         if not by_camera[camera]:
@@ -98,8 +98,8 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") 
         if missing:
             others = next(name for name, paths in by_camera.items() if missing[0] in paths)
             raise CaptureError(
-                f"{root / camera}: has no {what} of {len(missing)} of {len(frames)} frames ({_some(missing)}), which "
-                f"{others!r} has; a frame's pictures have one name in the folders of all cameras"
+                f"{root / camera}: has no {what} for {len(missing)} of {len(frames)} frames ({_some(missing)}), which "
+                f"{others!r} has; the files of a frame must have the same name in all camera folders"
             )
     return [{camera: files[frame] for camera, files in by_camera.items()} for frame in frames]
 
@@ -111,15 +111,15 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
         if path.name.startswith(".") or end not in PICTURE_LIKE:
             continue
         if end not in READ:
-            raise CaptureError(f"{path}: {end} is not read; give JPEG, PNG, WebP or BMP")
+            raise CaptureError(f"{path}: {end} is not supported; use JPEG, PNG, WebP or BMP")
         if path.stem in pictures:
-            raise CaptureError(f"{path}: {pictures[path.stem].name} is the same frame; leave one of them")
+            raise CaptureError(f"{path}: {pictures[path.stem].name} is the same frame; keep only one of them")
         pictures[path.stem] = path
     return pictures
 
 
 def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
-    """Returns the files that the calibration names, by frame [T], and their times if given.
+    """Returns the files listed in the calibration for each frame [T], keyed by camera name, and the times if given.
 
     Frame t consists of the t-th image of each camera.
 
@@ -131,8 +131,8 @@ def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, 
     for camera, count in counts.items():
         if count != counts[most]:
             raise CaptureError(
-                f"{calibration.source}: camera {camera!r} has {count} pictures and {most!r} {counts[most]}; "
-                "give every camera one a frame"
+                f"{calibration.source}: camera {camera!r} has {count} images, but {most!r} has {counts[most]}; "
+                "give one image per camera and frame"
             )
     frames: list[dict[str, Path]] = []
     times: list[float] = []
@@ -143,7 +143,7 @@ def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, 
         given = {camera: view.time for camera, view in views.items()}
         if len(set(given.values())) > 1:
             listed = ", ".join(f"{camera}: {time}" for camera, time in list(given.items())[:SHOWN])
-            raise CaptureError(f"{calibration.source}: frame {index} has pictures of different times ({listed}, …)")
+            raise CaptureError(f"{calibration.source}: frame {index} has images with different times ({listed}, …)")
         now = next(iter(given.values()))
         if now is not None:
             times.append(now)

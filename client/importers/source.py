@@ -1,4 +1,4 @@
-"""The reader behind an imported capture: images of a calibrated rig, undistorted to those of its pinhole cameras."""
+"""Reader for imported captures, which undistorts the images of a calibrated rig to those of pinhole cameras."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ class RawReader(Protocol):
 
     @property
     def remarks(self) -> Sequence[str]:
-        """Messages about the reading, for the user."""
+        """Messages for the user about how the images were read."""
 
     @property
     def sizes(self) -> Mapping[str, Size]:
-        """(width, height) of each camera's images."""
+        """(width, height) of each camera's images, keyed by camera name."""
 
     def time(self, index: int) -> float | None:
         """Returns the frame's time in seconds, or None if unknown."""
 
     def path(self, camera: str) -> Path:
-        """Returns the camera's first file, for messages."""
+        """Returns the first file of a camera, for messages."""
 
     def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image's own file, or None if there is none in a format that the service accepts."""
+        """Returns the image file, or None if there is none in a format that the service accepts."""
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Decodes an image, [H, W, 3]."""
@@ -62,12 +62,12 @@ class RawReader(Protocol):
 class ImportedPictures:
     """Undistorted images of a calibrated rig; implements `PictureReader`.
 
-    Image files from cameras without distortion are passed through unchanged; all other images are re-encoded.
+    Image files of cameras without distortion are passed through unchanged; all other images are re-encoded.
 
     Args:
-        calibration: calibration for images of the size that `raw` has (see `fit_to_pictures`).
-        raw: images of all cameras.
-        masks: [T] mask files by camera, or empty.
+        calibration: calibration that matches the image sizes of `raw` (see `fit_to_pictures`).
+        raw: reader of the original images of all cameras.
+        masks: mask files for each frame [T], keyed by camera name; empty if there are no masks.
         encoding: format of re-encoded images; JPEG uses quality 95 without chroma subsampling.
 
     Raises:
@@ -91,12 +91,12 @@ class ImportedPictures:
 
     @cached_property
     def rig(self) -> Rig:
-        """Rig of pinhole cameras at the images' size."""
+        """Rig of pinhole cameras at the size of the images."""
         return Rig(tuple(undistorter.camera for undistorter in self._undistorters.values()))
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Remarks on the files and the lenses, for the user."""
+        """Messages for the user about the files and the lenses."""
         lenses = (undistorter.remark for undistorter in self._undistorters.values())
         return (*self._raw.remarks, *(remark for remark in lenses if remark is not None))
 
@@ -119,7 +119,7 @@ class ImportedPictures:
         return undistorter.mask(decode_mask(self._masks[index][camera], size=size))
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the unchanged file, or the undistorted image re-encoded; 16-bit images are rounded to 8 bits."""
+        """Returns the original file, or the undistorted image re-encoded; 16-bit images are rounded to 8 bits."""
         if self._undistorters[camera].lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
@@ -127,7 +127,7 @@ class ImportedPictures:
         return encode(self.image(index, camera), self._encoding)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns the undistorted mask as PNG, or None if there is no mask."""
+        """Returns the undistorted mask as a PNG file, or None if there is no mask."""
         return encode(255 * self.mask(index, camera), "png") if self.has_mask(index, camera) else None
 
 
@@ -136,10 +136,10 @@ def fit_to_pictures(
 ) -> tuple[Calibration, list[str]]:
     """Adapts the calibration to the actual size of the images.
 
-    Returns the calibration and a remark for each camera whose images have another size than calibrated.
+    Returns the adapted calibration, and a remark for each camera whose image size differs from the calibrated one.
 
     Raises:
-        CaptureError: images have another aspect ratio than calibrated, and `size_mismatch` does not say why.
+        CaptureError: the aspect ratio of images differs from the calibrated one, and `size_mismatch` is not given.
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:
@@ -161,11 +161,13 @@ def check_times(name: str, times: Sequence[float]) -> None:
     """Checks that the frame times [T] are strictly increasing.
 
     Raises:
-        CaptureError: a frame is not later than the one before; the message names it.
+        CaptureError: a frame is not later than the previous one; the message names it.
     """
     for index, (before, now) in enumerate(pairwise(times), 1):
         if now <= before:
-            raise CaptureError(f"{name}: frame {index} is at {now:g} s, not after the one before, {before:g} s")
+            raise CaptureError(
+                f"{name}: frame {index} is at {now:g} s, not later than the previous one at {before:g} s"
+            )
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:

@@ -1,8 +1,8 @@
-"""Undistorts images of perspective and fisheye lenses with OpenCV, to pinhole images of the same pose and size.
+"""Undistorts images of perspective and fisheye lenses with OpenCV, to pinhole images with the same pose and size.
 
 The pinhole camera covers the largest region with the image's aspect ratio in which every pixel was seen, so there are
-no black corners. It keeps the lens's pixel aspect ratio; the principal point follows from the region. If the lens's
-polynomial turns back before a corner, the field of view is narrowed to the rays on which the polynomial increases.
+no black corners. It keeps the lens's pixel aspect ratio; the principal point follows from the region. If the distortion
+polynomial decreases before a corner, the field of view is narrowed to the rays on which the polynomial increases.
 
 OpenCV puts the centre of the first pixel at (0, 0), whereas this project and COLMAP put it at (0.5, 0.5). Principal
 points passed to OpenCV are therefore reduced by half a pixel; otherwise images would be shifted by half a pixel.
@@ -26,16 +26,16 @@ Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDEST_DEGREES = 120.0
-"""Largest field of view of a pinhole camera; a wider one would stretch a fisheye image too much."""
+"""Maximum field of view of a pinhole camera in degrees; a wider one would stretch a fisheye image too much."""
 BORDER_POINTS = 64
 TOLERANCE_PIXELS = 0.01
-"""Largest distance that the pinhole's border may lie outside the image; interpolation hides smaller distances."""
+"""How far the pinhole's border may lie outside the image, in pixels; interpolation hides such distances."""
 NARROWING = 1.005
-"""Factor per step by which the focal length grows while a lens that turns back is cropped."""
+"""Factor by which the focal length grows per step while a lens with non-monotonic distortion is cropped."""
 MOST_NARROWED = 50.0
-"""Multiple of the lens's focal length at which the search for a pinhole camera stops."""
+"""Multiple of the lens's focal length at which the search for a pinhole camera is abandoned."""
 LEAST_KEPT = 0.25
-"""Share of the image below which a lens that turns back is rejected, because its calibration must be wrong."""
+"""Minimum fraction of the image that must remain after cropping; below it, the calibration must be wrong."""
 HALF = 0.5
 
 
@@ -44,11 +44,11 @@ class Undistorter:
     """Undistorts the images of one camera. A lens without distortion needs neither processing nor OpenCV.
 
     Args:
-        lens: the calibrated lens.
+        lens: calibrated camera with lens distortion.
 
     Raises:
         CaptureError: less than a quarter of the image can be undistorted.
-        MissingExtraError: OpenCV is needed and not installed.
+        MissingExtraError: OpenCV is needed but not installed.
     """
 
     lens: LensCamera
@@ -60,12 +60,12 @@ class Undistorter:
 
     @cached_property
     def remark(self) -> str | None:
-        """Message about a lens that is cropped because its polynomial turns back; None for other lenses."""
+        """Message about a lens that is cropped because its distortion is not monotonic; None for other lenses."""
         if self.lens.is_pinhole or self._view.kept is None:
             return None
         return (
-            f"camera {self.lens.name!r}: its distortion turns back towards the corners, where its calibration had no "
-            f"points; {1 - self._view.kept:.0%} of its picture is cut off"
+            f"camera {self.lens.name!r}: its distortion is not monotonic near the corners, where calibration had no "
+            f"points; {1 - self._view.kept:.0%} of its image is cropped"
         )
 
     @cached_property
@@ -96,19 +96,18 @@ class Undistorter:
         """Undistorts an image [H, W, 3] of the lens to an image [H, W, 3] of the pinhole camera.
 
         Uses Lanczos interpolation, which keeps painted dots within 0.02 pixels of their true position. Cubic
-        interpolation
-        shifts them by up to 0.08 pixels, and linear interpolation blurs.
+        interpolation shifts them by up to 0.08 pixels, and linear interpolation blurs the image.
         """
         return self._remapped(picture, "INTER_LANCZOS4")
 
     def mask(self, mask: Picture) -> Picture:
-        """Undistorts a mask of labels [H, W] with nearest-neighbour interpolation."""
+        """Undistorts a mask or label image [H, W] with nearest-neighbour interpolation."""
         return self._remapped(mask, "INTER_NEAREST")
 
     def _remapped(self, picture: Picture, how: str) -> Picture:
         if picture.shape[:2] != (self.lens.height, self.lens.width):
             raise CaptureError(
-                f"camera {self.lens.name!r}: a picture of {picture.shape[1]}x{picture.shape[0]}, but calibrated for "
+                f"camera {self.lens.name!r}: its image is {picture.shape[1]}x{picture.shape[0]}, but calibrated for "
                 f"{self.lens.width}x{self.lens.height}"
             )
         if self.lens.is_pinhole:
@@ -131,7 +130,7 @@ class _View:
 
     Attributes:
         intrinsics: [3, 3] in pixels.
-        kept: share of the lens's image that the pinhole camera covers; None unless the lens is cropped.
+        kept: fraction of the lens's image that the pinhole camera covers; None unless the lens is cropped.
     """
 
     intrinsics: Float
@@ -139,7 +138,7 @@ class _View:
 
 
 def _inscribed(lens: LensCamera) -> _View:
-    """Returns the pinhole camera whose whole image the lens saw; it keeps the lens's pixel aspect ratio."""
+    """Returns a pinhole camera whose entire image the lens saw; it keeps the lens's pixel aspect ratio."""
     curve = DistortionCurve.of(lens)
     left, top, right, bottom = _inner_rectangle(lens, curve)
     fx, fy = lens.intrinsics[0, 0], lens.intrinsics[1, 1]
@@ -152,10 +151,10 @@ def _inscribed(lens: LensCamera) -> _View:
 
 
 def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
-    """Narrows a pinhole camera about the lens's axis until its whole image lies where the lens's polynomial increases.
+    """Narrows a pinhole camera about the lens's axis until the distortion polynomial increases on its entire image.
 
     Raises:
-        CaptureError: too little of the image is left.
+        CaptureError: too little of the image remains.
     """
     border, size = np.concatenate(list(_edges(lens).values())), np.array([lens.width, lens.height])
     kept = 0.0
@@ -170,8 +169,8 @@ def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
         k[0, 0], k[1, 1] = NARROWING * k[0, 0], NARROWING * k[1, 1]
     if kept < LEAST_KEPT:
         raise CaptureError(
-            f"camera {lens.name!r}: its distortion ({_listed(lens)}) folds within the picture, and only {kept:.0%} "
-            "of the picture could be undistorted; calibrate with points up to the corners, or with another model"
+            f"camera {lens.name!r}: its distortion ({_listed(lens)}) folds over within the image, and only {kept:.0%} "
+            "of the image could be undistorted; calibrate with points up to the corners, or with another model"
         )
     return _View(k, kept)
 
@@ -190,8 +189,8 @@ def _edges(lens: LensCamera) -> dict[str, Float]:
 def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, float, float, float]:
     """Returns (left, top, right, bottom), at distance 1, of a rectangle inside the region that the lens saw.
 
-    Each side lies at the innermost point of the corresponding undistorted image edge. For a lens that turns back,
-    `_within` crops the corners afterwards.
+    Each side lies at the innermost point of the corresponding undistorted image edge. If the distortion is
+    not monotonic, `_within` crops the corners afterwards.
     """
     limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.max_radius)
     rays = {side: undistort_pixels(lens, pixels, curve) for side, pixels in _edges(lens).items()}
@@ -200,7 +199,7 @@ def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, f
     right, bottom = (seen[side][:, axis].min(initial=limit) for axis, side in enumerate(("right", "bottom")))
     if not (left < right and top < bottom):
         raise CaptureError(
-            f"camera {lens.name!r}: undistorted, nothing is left of its picture (from {left:.3g}, {top:.3g} to "
+            f"camera {lens.name!r}: nothing is left of its image after undistortion (from {left:.3g}, {top:.3g} to "
             f"{right:.3g}, {bottom:.3g} at distance 1); check its principal point and coefficients"
         )
     return float(left), float(top), float(right), float(bottom)
@@ -209,8 +208,8 @@ def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, f
 def undistort_pixels(lens: LensCamera, pixels: Float, curve: DistortionCurve | None = None) -> Float:
     """Maps pixels [P, 2] of the lens to rays (x/z, y/z) [P, 2].
 
-    Rays are ±infinity beyond 89° from the axis of a fisheye. They are NaN where the lens's polynomial turns back before
-    the pixel.
+    For a fisheye, rays beyond 89° from the axis are ±infinity. Rays are NaN if the distortion polynomial decreases
+    before it reaches the pixel.
     """
     curve = curve or DistortionCurve.of(lens)
     return curve.undistort((pixels - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2])

@@ -1,7 +1,7 @@
 """Frames from one video per camera, decoded on demand with PyAV.
 
-Frame times are read from the packets, without decoding. To decode a frame, the reader seeks to the key frame before it
-and decodes up to the frame's time stamp. Sequential access decodes each frame once.
+Frame times are read from the packets, without decoding. To decode a frame, the reader seeks to the preceding keyframe
+and decodes up to the frame's timestamp. Sequential access decodes each frame once.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from scas4d_core.captures.images import mixed_colours
 
 ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
 RATE_TOLERANCE = 1e-3
-"""Largest relative difference between the frame rates of two cameras, about that between 29.97 and 30."""
+"""Maximum relative difference between the frame rates of two cameras, about that between 29.97 and 30."""
 NEAR = 8
-"""Largest number of frames to decode forward; for larger steps, seeking to a key frame is usually faster."""
+"""Maximum number of frames to decode forwards; for larger steps, seeking to a keyframe is usually faster."""
 ALIKE = 0.05
-"""Relative difference below which two frame intervals count as equal, because time stamps are rounded."""
+"""Relative difference below which two frame intervals count as equal, because timestamps are rounded."""
 
 
 class Video:
@@ -34,12 +34,12 @@ class Video:
 
     Attributes:
         times: [T] time of each frame in seconds, relative to the first.
-        fps: mean frames per second.
+        fps: mean frame rate.
         size: (width, height) in pixels.
-        grey: True if the pixel format is greyscale.
+        grey: whether the pixel format is grayscale.
 
     Raises:
-        CaptureError: the file has no video stream, is damaged, or has no frame with a time stamp.
+        CaptureError: the file has no video stream, is damaged, or has no frame with a timestamp.
         MissingExtraError: PyAV is not installed.
     """
 
@@ -62,7 +62,7 @@ class Video:
         except self._av.FFmpegError as fault:
             raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
         if not self._stamps:
-            raise CaptureError(f"{path}: has no frames with a time")
+            raise CaptureError(f"{path}: has no frames with timestamps")
         base = float(self._stream.time_base)
         self.times: NDArray[np.float64] = (np.array(self._stamps) - self._stamps[0]) * base
         self.size = (int(self._stream.codec_context.width), int(self._stream.codec_context.height))
@@ -75,15 +75,14 @@ class Video:
 
     @property
     def interval(self) -> float:
-        """Median seconds between consecutive frames; dropped frames do not affect it."""
+        """Median interval between consecutive frames in seconds; dropped frames do not affect it."""
         return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
 
     def frame(self, index: int) -> Picture:
         """Decodes frame `index`: [H, W, 3] sRGB values, read-only.
 
-        Caches the last frame, and the last one that was requested by stepping back. Scoring compares every frame with
-        frame 0,
-        and decoding it again would decode everything since its key frame each time.
+        Caches the last frame, and the last frame that was requested by stepping back. Scoring compares every frame with
+        frame 0; without this cache, each comparison would decode everything since the preceding keyframe again.
 
         Raises:
             CaptureError: the frame cannot be decoded, or the video's metadata rotates it.
@@ -121,8 +120,8 @@ class Video:
     def _pixels(self, frame: Any) -> Picture:
         if frame.rotation:
             raise CaptureError(
-                f"{self.path}: its metadata turns the picture by {frame.rotation}°, and whether the calibration was of "
-                "turned pictures cannot be recognized; store the pixels as calibrated and drop the rotation"
+                f"{self.path}: its metadata rotates the image by {frame.rotation}°, and it is unknown whether the "
+                "calibration used rotated images; store the pixels as calibrated and remove the rotation"
             )
         picture: Picture = frame.to_ndarray(format="rgb24")
         return picture
@@ -133,10 +132,10 @@ class Video:
 
 
 class Videos:
-    """One video per camera, with a common frame rate and start time. The shortest determines the number of frames.
+    """One video per camera, with a common frame rate and start time. The shortest one determines the number of frames.
 
     Raises:
-        CaptureError: the frame rates differ, or frames of two videos are more than half a frame apart.
+        CaptureError: the frame rates differ, or the frame times of two videos are more than half a frame apart.
     """
 
     def __init__(self, calibration: Calibration, files: Mapping[str, Path]) -> None:
@@ -149,7 +148,7 @@ class Videos:
         for video in self._videos.values():
             self._check_together(video, first)
         self.remarks = [
-            f"{video.path.name} has {len(video) - self.frame_count} frames more than the shortest; they are left out"
+            f"{video.path.name} has {len(video) - self.frame_count} more frames than the shortest; they are left out"
             for video in self._videos.values()
             if len(video) > self.frame_count
         ] + mixed_colours({camera: video.grey for camera, video in self._videos.items()})
@@ -161,22 +160,22 @@ class Videos:
             late = int(np.argmax(apart > first.interval / 2))
             if apart[late] > first.interval / 2:
                 raise CaptureError(
-                    f"{video.path}: frame {late} is at {video.times[late]:.3f} s, that of {first.path.name} at "
+                    f"{video.path}: frame {late} is at {video.times[late]:.3f} s, but in {first.path.name} at "
                     f"{first.times[late]:.3f} s, over half a frame apart: frames were dropped, or the rates differ "
-                    f"({video.fps:.5g} and {first.fps:.5g} frames per second); cut the videos before, or repair them"
+                    f"({video.fps:.5g} and {first.fps:.5g} frames per second); trim the videos to match, or repair them"
                 )
         if abs(video.fps - first.fps) >= RATE_TOLERANCE * first.fps:
             raise CaptureError(
-                f"{video.path}: has {video.fps:.4g} frames per second, {first.path.name} {first.fps:.4g}; the "
-                "cameras of a rig take their pictures together: convert the videos to one rate"
+                f"{video.path}: has {video.fps:.4g} frames per second, but {first.path.name} has {first.fps:.4g}; "
+                "the cameras of a rig must be synchronized: convert the videos to one frame rate"
             )
 
     def time(self, index: int) -> float | None:
-        """Returns the seconds since the first frame."""
+        """Returns the time of a frame in seconds since the first frame."""
         return float(self._times[index])
 
     def path(self, camera: str) -> Path:
-        """Returns the camera's video."""
+        """Returns the video file of a camera."""
         return self._videos[camera].path
 
     def file(self, index: int, camera: str) -> Path | None:
@@ -201,10 +200,12 @@ def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
         if not own:
             listed = ", ".join(path.name for path in there[:3]) or "no videos"
             raise CaptureError(
-                f"{folder}: has no video of camera {camera!r} of {calibration.source}, only {listed}; "
+                f"{folder}: has no video for camera {camera!r} of {calibration.source}, only {listed}; "
                 f"name it {camera}.mp4"
             )
         if len(own) > 1:
-            raise CaptureError(f"{folder}: has {own[0].name} and {own[1].name} of one camera; leave one of them")
+            raise CaptureError(
+                f"{folder}: has {own[0].name} and {own[1].name} for the same camera; keep only one of them"
+            )
         videos[camera] = own[0]
     return videos

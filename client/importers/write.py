@@ -17,7 +17,7 @@ from scas4d_core.captures import Capture, CaptureError
 OnProgress = Callable[[str, int, int], None]
 
 UNEVEN = 0.1
-"""Largest deviation in frames from a constant frame rate; time stamps of videos are rounded."""
+"""Maximum deviation from a constant frame rate, in frames; timestamps of videos are rounded."""
 
 
 def write_dynamic3dgs(
@@ -32,10 +32,10 @@ def write_dynamic3dgs(
     The camera files are written last, so an incomplete folder is not recognized as a capture.
 
     Args:
-        source: the capture; its test cameras are written to `test_meta.json`.
+        source: capture to write; its test cameras are written to `test_meta.json`.
         out: output folder, new or empty.
         frames: number of frames; None for all.
-        on_progress: called with ("frames", done, total).
+        on_progress: callback that receives ("frames", done, total).
 
     Raises:
         CaptureError: the folder is not empty, or the frames are not evenly spaced in time.
@@ -75,7 +75,7 @@ def write_dynamic3dgs(
 
 
 def _rate(source: Capture, count: int) -> float:
-    """Returns the frames per second; the layout stores no individual times.
+    """Returns the frame rate, because the layout stores no individual times.
 
     Raises:
         CaptureError: the frames are not evenly spaced in time.
@@ -88,7 +88,7 @@ def _rate(source: Capture, count: int) -> float:
     if off.max() > UNEVEN:
         raise CaptureError(
             f"{source.name}: frame {int(off.argmax())} is {off.max():.2g} frames off a constant rate of {fps:.5g} "
-            "per second, and this layout has no times; skip the import: every command reads the original capture"
+            "per second, and this layout stores no times; skip the import: every command reads the original capture"
         )
     return fps
 
@@ -109,7 +109,7 @@ def _write_meta(
 
 
 def _one_or_all(sizes: list[int]) -> int | list[int]:
-    """Returns one size if all cameras share it, else a list per camera, which extends the layout."""
+    """Returns one size if all cameras share it, otherwise a list of sizes per camera, which extends the layout."""
     return sizes[0] if len(set(sizes)) == 1 else sizes
 
 

@@ -1,4 +1,4 @@
-"""Rig simulator, which sends a capture on disk to the service like a live camera rig."""
+"""Rig simulator, which sends a capture from disk to the service like a live camera rig."""
 
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace

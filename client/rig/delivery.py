@@ -10,16 +10,16 @@ from client.wire import SceneStatus
 
 @dataclass
 class Lateness:
-    """Delays of sending relative to the pace, and waiting times per reason, all in seconds.
+    """Sending delays relative to the pace, and waiting times by reason, all in seconds.
 
     Attributes:
-        late: delay of each frame's acknowledgement relative to the due time of the next frame; negative if earlier.
+        late: delay of each frame's acknowledgement relative to the due time of the next frame; negative if early.
         busy: time spent waiting for a full queue.
         busy_count: number of waits for a full queue.
-        outage: time spent waiting for a service that did not answer.
+        outage: time spent waiting for a service that did not respond.
         outage_count: number of retries during outages.
-        began: `time.monotonic()` at the start of the rig's clock: at the first frame, or when frame 0 was finished.
-        before: number of entries of `late` acknowledged before the clock started.
+        began: `time.monotonic()` when the rig's clock started: at the first frame, or when frame 0 was finished.
+        before: number of entries in `late` for frames acknowledged before the clock started.
         ended: `time.monotonic()` after the last frame; None while sending.
     """
 
@@ -41,11 +41,11 @@ class Lateness:
         if timed > 1 and seconds > 0:
             asked = f" of {fps:g}" if fps else ""
             which = ", those after frame 0" if self.before else ""
-            parts[0] += f"{which} at {(timed - 1) / seconds:.2f}{asked} a second"
+            parts[0] += f"{which} at {(timed - 1) / seconds:.2f}{asked} per second"
         if fps and timed:
             behind = [value for value in self.late[self.before :] if value > 0]
             worst = f", at most {max(behind):.2f} s" if behind else ""
-            parts.append(f"{len(behind)} acknowledged after the next was due{worst}")
+            parts.append(f"{len(behind)} acknowledged after the next frame was due{worst}")
         if self.busy_count:
             parts.append(f"waited {self.busy:.1f} s for a full queue ({self.busy_count} times)")
         if self.outage_count:
@@ -59,7 +59,7 @@ class Delivery:
 
     Attributes:
         scene: id of the scene.
-        lateness: delays of sending.
+        lateness: sending delays and waiting times.
         lost: indices of frames that the rig lost and declared missing.
         status: status of the scene after the last frame; None while the push is running.
     """

@@ -12,8 +12,8 @@ class Pace:
 
     Attributes:
         fps: frames per second; None sends as fast as the service accepts frames.
-        jitter: maximum delay of a frame in seconds, uniformly distributed; it models cables, encoders and switches.
-        drop: fraction of frames that the rig loses, 0…1. Frame 0 is never lost.
+        jitter: maximum delay of a frame in seconds, uniformly distributed; models cables, encoders and switches.
+        drop: fraction of frames that the rig loses, in 0…1. Frame 0 is never lost.
         seed: random seed of the jitter and the losses.
 
     >>> pace = Pace(fps=30, drop=0.5)
@@ -34,7 +34,7 @@ class Pace:
         if not self.jitter >= 0:
             raise ValueError(f"jitter {self.jitter!r} must be 0 seconds or more")
         if not 0 <= self.drop < 1:
-            raise ValueError(f"drop {self.drop!r} must be a share from 0 to below 1")
+            raise ValueError(f"drop {self.drop!r} must be a fraction from 0 to below 1")
 
     def drops(self, index: int, camera: str = "") -> bool:
         """Returns True if this frame, or this camera's image of it, is lost; deterministic."""

@@ -1,4 +1,4 @@
-"""Timed sending of the rig simulator's frames over HTTP or WebSockets, whole or per camera."""
+"""Sends the rig simulator's frames on schedule over HTTP or WebSockets, either whole or per camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OnMessage = Callable[[str], None]
 
 
 class Requests:
-    """Transport of frames by HTTP requests."""
+    """Transport that sends frames as HTTP requests."""
 
     def __init__(self, client: Client, scene: str) -> None:
         self._client = client
@@ -33,11 +33,11 @@ class Requests:
         self._client.put_camera(self._scene, index, name, files.images[name], mask, time=files.time)
 
     def close(self) -> None:
-        """Does nothing, since no connection is owned."""
+        """Does nothing, because this object owns no connection."""
 
 
 class Sockets:
-    """Transport of frames over WebSockets, one per sender."""
+    """Transport that sends frames over WebSockets, one per sender."""
 
     def __init__(self, client: Client, scene: str) -> None:
         self._client = client
@@ -65,7 +65,7 @@ class Sockets:
 
 
 class Sender:
-    """Sender of all frames at the configured pace."""
+    """Sends all frames at the configured pace."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class Sender:
             except FrameGap as gap:
                 if gap.expected == index:
                     raise
-                self._on_message(f"the service expects frame {gap.expected} next, not {index}: going on there")
+                self._on_message(f"the service expects frame {gap.expected} next, not {index}; continuing there")
                 index = gap.expected
                 continue
             if due is not None:
@@ -140,7 +140,7 @@ class Sender:
         if len(sending) < len(files.images):
             self._client.close_frame(id, index)
             lost = ", ".join(name for name in files.images if name not in sending)
-            self._on_message(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
+            self._on_message(f"frame {index}: the rig lost the images of {lost}; closed without them")
 
     def _send_camera(self, index: int, name: str, files: EncodedFrame) -> None:
         time.sleep(self._pace.delay(index, name))

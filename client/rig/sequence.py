@@ -13,7 +13,7 @@ FOREVER = 10**9
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """Encoded images and masks of a frame by camera name, with the frame's time in seconds."""
+    """Encoded images and masks of a frame, keyed by camera name, with the frame time in seconds."""
 
     time: float
     images: dict[str, bytes]
@@ -21,7 +21,7 @@ class EncodedFrame:
 
 
 def ping_pong(index: int, count: int) -> int:
-    """Returns the position in 0…count − 1 of an index that runs back and forth.
+    """Maps an increasing index to a position in 0…count − 1 that runs back and forth.
 
     >>> [ping_pong(index, 3) for index in range(6)]
     [0, 1, 2, 1, 0, 1]
@@ -33,9 +33,9 @@ def ping_pong(index: int, count: int) -> int:
 
 
 class Sequence:
-    """Frames of a capture as frames of a scene, beginning at `start`; with `loop`, they run back and forth endlessly.
+    """Frames of a capture as frames of a scene, starting at `start`; with `loop`, they run back and forth endlessly.
 
-    Playback reverses at the ends, because a jump from the last frame to the first would not be a plausible motion.
+    Playback reverses at the ends, because jumping from the last frame to the first is not plausible motion.
     """
 
     def __init__(self, source: Capture, *, start: int = 0, loop: bool = False) -> None:
@@ -53,7 +53,7 @@ class Sequence:
         return FOREVER if self.loop else self._last + 1
 
     def capture_index(self, index: int) -> int:
-        """Returns the index in the capture of the scene's frame `index`."""
+        """Returns the capture index that corresponds to frame `index` of the scene."""
         return self.start + ping_pong(index, self._last + 1)
 
     def time(self, index: int) -> float:

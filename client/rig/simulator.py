@@ -1,4 +1,4 @@
-"""Simulation of a live camera rig, which sends a capture on disk to the service."""
+"""Simulation of a live camera rig, which sends a capture from disk to the service."""
 
 from __future__ import annotations
 
@@ -49,27 +49,27 @@ def push(
         source: capture whose training cameras are sent, at the resolution of the files. The service scales the images
             if `settings` requests it.
         client: client of the service.
-        scene: id of an existing scene to continue from its next frame; None creates a new scene.
-        name: name of a new scene; None for the name of the source.
-        pace: pace of the rig; None sends as fast as the service accepts frames. Timestamps are those of the capture
-            in either case.
-        frames: total number of frames of the scene; None for all, or for no limit with `loop`.
-        start: index in the capture of the scene's frame 0.
-        loop: run back and forth through the capture until `frames` is reached or the push is interrupted.
-        per_camera: each camera sends its own images over its own connection.
-        websocket: send over a WebSocket (one per camera with `per_camera`) instead of HTTP requests.
+        scene: id of an existing scene to continue from its next frame; None to create a new scene.
+        name: name for a new scene; None for the name of the source.
+        pace: pace of the rig; None to send as fast as the service accepts frames. In either case, timestamps are those
+            of the capture.
+        frames: total number of frames in the scene; None for all frames, or for no limit with `loop`.
+        start: capture index of the scene's frame 0.
+        loop: whether to run back and forth through the capture until `frames` is reached or the push is interrupted.
+        per_camera: whether each camera sends its own images over its own connection.
+        websocket: whether to use a WebSocket (one per camera with `per_camera`) instead of HTTP requests.
         preset: name of a settings preset.
-        settings: nested settings that differ from the preset.
-        ingest: how the scene accepts frames.
-        nodes: labels that a cluster node must have to run a new scene.
-        on_progress: called with the stages of frame 0, then with "frames" and the number of finished frames.
-        on_message: called with messages about outages, lost frames and the frame at which sending continues.
+        settings: nested settings that override the preset.
+        ingest: rules by which a new scene accepts frames; None for the defaults.
+        nodes: labels that a cluster node must have in order to run a new scene.
+        on_progress: receives the stages of frame 0, then "frames" with the number of finished frames.
+        on_message: receives messages about outages, lost frames and the frame at which sending continues.
 
     Returns:
-        The scene, the delays and the lost frames.
+        The id and status of the scene, the delays and the lost frames.
 
     Raises:
-        ServiceError, ServiceUnreachable: raised by the client.
+        ServiceError, ServiceUnreachable: a request of the client failed.
         RuntimeError: the scene failed, or its cameras differ from those of the capture.
 
     >>> from client.importers.open_source import open_source
@@ -99,7 +99,7 @@ def push(
         else:
             status = client.scene(scene)
             _check_cameras(status, source)
-            on_message(f"scene {scene} goes on with frame {status.next_frame}")
+            on_message(f"scene {scene} continues with frame {status.next_frame}")
         delivery = Delivery(status.id)
         way = Sockets(client, status.id) if websocket else Requests(client, status.id)
         stack.callback(way.close)
@@ -117,7 +117,7 @@ def push(
             # Lost frames count as finished immediately, so wait for the last frame that was sent.
             last = next((index for index in reversed(range(count)) if index not in delivery.lost), 0)
             _follow(client, status.id, last, count, on_progress)
-        except KeyboardInterrupt:  # the way to stop an endless loop
+        except KeyboardInterrupt:  # how users stop an endless loop
             on_message("interrupted")
             delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
         delivery.status = client.scene(status.id)
@@ -151,7 +151,7 @@ class _record_retries:
                 self._lateness.outage += retry.seconds
                 self._lateness.outage_count += 1
                 if not self._out:
-                    self._on_message(f"the service cannot be used ({retry.detail}); trying on")
+                    self._on_message(f"the service is unavailable ({retry.detail}); retrying")
             self._out = retry.reason == "outage"
         if self._before is not None:
             self._before(retry)
@@ -160,7 +160,7 @@ class _record_retries:
 def _check_cameras(status: SceneStatus, source: Capture) -> None:
     if set(status.cameras) != set(source.full_rig.names):
         raise RuntimeError(
-            f"scene {status.id} has the cameras {', '.join(status.cameras)}, {source.name} has "
+            f"scene {status.id} has the cameras {', '.join(status.cameras)}, but {source.name} has "
             f"{', '.join(source.full_rig.names)}; continue with the capture that the scene started with"
         )
 

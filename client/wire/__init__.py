@@ -1,4 +1,4 @@
-"""Pydantic models of requests and responses, one module per resource; client and service share them."""
+"""Pydantic models of requests and responses, one module per resource, shared by client and service."""
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Pixel, Row3, Row4
 from client.wire.budgets import Budget, EffectiveBudget, SceneBudget

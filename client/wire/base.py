@@ -14,7 +14,7 @@ MAX_CAMERAS = 512
 MAX_PIXELS_A_SIDE = 16_384
 MAX_LABELS = 16
 LABEL_WORD = r"[A-Za-z0-9](?:[A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?"
-"""Pattern of a label's value and of both parts of its name around the slash, as accepted by Ray and Kubernetes."""
+"""Pattern for a label's value and for both parts of its name around the slash, as accepted by Ray and Kubernetes."""
 
 CameraName = Annotated[
     str,
@@ -26,26 +26,26 @@ CameraName = Annotated[
 
 
 def check_labels(labels: dict[str, str]) -> dict[str, str]:
-    """Raises an `InputError` for an invalid node label; otherwise returns the labels."""
+    """Returns the labels unchanged, or raises an `InputError` if a node label is invalid."""
     for name, value in labels.items():
         for what, text, pattern in (("name", name, f"(?:{LABEL_WORD}/)?{LABEL_WORD}"), ("value", value, LABEL_WORD)):
             if re.fullmatch(pattern, text) is None:
                 raise InputError(
-                    f"{text[:80]!r} cannot be the {what} of a node's label",
-                    "write names and values of 1 to 63 letters, digits, dots, dashes and underscores, starting and "
-                    "ending with a letter or digit; a name may have one slash, such as studio.example/rig",
+                    f"{text[:80]!r} is not a valid {what} for a node label",
+                    "use names and values of 1 to 63 letters, digits, dots, dashes and underscores that start and "
+                    "end with a letter or digit; a name may contain one slash, such as studio.example/rig",
                 )
     return labels
 
 
 Labels = Annotated[dict[str, str], Field(max_length=MAX_LABELS), AfterValidator(check_labels)]
-"""Node labels: values by name."""
+"""Node labels: values keyed by name."""
 Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 Pixel = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 
 
 class Model(BaseModel):
-    """Base of the wire models. Unknown fields are errors, so that misspelled names are detected."""
+    """Base class of the wire models. Unknown fields are errors, so that misspelled names are detected."""
 
     model_config = ConfigDict(extra="forbid")

@@ -15,7 +15,7 @@ Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 
 
 class Budget(Model):
-    """Limits of a scene's updates. Null fields default to the scene's settings."""
+    """Limits for a scene's updates. Null fields default to the scene's settings."""
 
     iterations: Iterations | None = Field(
         default=None, description="Iterations per frame; see the setting `update.iterations`."
@@ -27,8 +27,8 @@ class Budget(Model):
         le=LONGEST_MS,
         allow_inf_nan=False,
         description=(
-            "Milliseconds per frame, including decoding and commit. As many iterations run as fit, "
-            "regardless of `iterations`."
+            "Milliseconds per frame, including decoding and commit. The update runs as many iterations "
+            "as fit, regardless of `iterations`."
         ),
     )
     stop_gain: float | None = Field(
@@ -38,7 +38,7 @@ class Budget(Model):
         lt=1,
         description=(
             "End an update once ten iterations lower its error on four training views by less than "
-            "this share; 0: never."
+            "this fraction; 0 to never end it early."
         ),
     )
     skip_tolerance: float | None = Field(
@@ -49,7 +49,7 @@ class Budget(Model):
         allow_inf_nan=False,
         description=(
             "Skip the update if the previous state's error on the probe views is at most (1 + this) × "
-            "the usual error; -1: never skip."
+            "the usual error; -1 to never skip."
         ),
     )
 
@@ -64,18 +64,18 @@ class BudgetFields(TypedDict, total=False):
 
 
 class EffectiveBudget(Model):
-    """The effective limits, with every field filled in."""
+    """The limits in effect, with defaults filled in."""
 
     iterations: int
-    budget_ms: float | None = Field(description="Milliseconds per frame; null: no limit.")
+    budget_ms: float | None = Field(description="Milliseconds per frame; null for no limit.")
     stop_gain: float
     skip_tolerance: float
 
 
 class SceneBudget(Model):
-    """The requested and effective budget of a scene."""
+    """The requested and the effective budget of a scene."""
 
     scene: str
-    requested: Budget = Field(description="The budget as last set; a field is null if it was never set.")
-    effective: EffectiveBudget = Field(description="The budget that applies to frames that have not started.")
-    since: int = Field(description="The first frame to which it applies.")
+    requested: Budget = Field(description="The most recently requested budget; fields that were not set are null.")
+    effective: EffectiveBudget = Field(description="The budget for frames whose update has not started.")
+    since: int = Field(description="The first frame to which the effective budget applies.")

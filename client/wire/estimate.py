@@ -10,18 +10,20 @@ from client.wire.base import Model
 class SceneEstimate(Model):
     """Estimated memory and disk usage in MB (10⁶ bytes); `docs/operations.md` documents the formula."""
 
-    pixels: int = Field(description="Pixels of all cameras together, as sent.")
-    scaled_pixels: int = Field(description="Pixels of all cameras after `settings.scene.image_scale`.")
+    pixels: int = Field(description="Total number of pixels of all cameras, as sent.")
+    scaled_pixels: int = Field(
+        description="Total number of pixels of all cameras after scaling by `settings.scene.image_scale`."
+    )
     gaussians: int = Field(
-        description="Maximum number of Gaussians. If frame 0 chooses the number, this is its upper limit."
+        description="Maximum number of Gaussians. If the number is chosen in frame 0, this is its upper limit."
     )
     pictures_mb: float = Field(
-        description="Memory of one frame's pictures in the worker, proportional to cameras × pixels."
+        description="Worker memory for the images of one frame, proportional to cameras × pixels."
     )
-    gaussians_mb: float = Field(description="Memory that an update needs for its Gaussians.")
+    gaussians_mb: float = Field(description="Memory for the Gaussians during an update.")
     worker_mb: float = Field(description="Peak memory of the worker process.")
-    readers_mb: float = Field(description="Memory of the two reader processes, without queries over many frames.")
-    memory_mb: float = Field(description="Memory of all processes of the scene.")
+    readers_mb: float = Field(description="Memory of the two reader processes, excluding queries over many frames.")
+    memory_mb: float = Field(description="Total memory of all processes of the scene.")
     limit_mb: float = Field(description="Memory limit per scene on this service.")
-    state_mb: float = Field(description="Disk space per exact state; older states take a twentieth.")
-    history_mb: float = Field(description="Memory of a reader per frame of a query over all Gaussians.")
+    state_mb: float = Field(description="Disk space per exact state; older states take a twentieth of it.")
+    history_mb: float = Field(description="Reader memory per frame for a query over all Gaussians.")

@@ -16,7 +16,7 @@ LARGEST_ID = 2**63 - 1
 LAST_FRAME = 1_000_000_000
 
 ExportFormat = Literal["ply", "splat", "spz", "spz4", "glb", "glb-parts", "usd", "tracks", "poses", "s4d"]
-"""Names of the formats in `scas4d_core.exports.FORMATS`, repeated here to avoid that import."""
+"""Format names from `scas4d_core.exports.FORMATS`, repeated here to avoid importing it."""
 SUFFIXES: Mapping[str, str] = MappingProxyType(
     {
         **dict.fromkeys(("ply", "splat", "spz", "spz4", "glb"), ".zip"),
@@ -27,7 +27,7 @@ SUFFIXES: Mapping[str, str] = MappingProxyType(
         "s4d": ".s4d",
     }
 )
-"""File suffix of each format; numbered files are packed into one .zip."""
+"""File suffix of each format; numbered files are packed into a single .zip."""
 FrameNumber = Annotated[int, Field(strict=True, ge=0, le=LAST_FRAME)]
 
 
@@ -44,16 +44,20 @@ class ExportState(StrEnum):
 class ExportRequest(Model):
     """A request to export a range of committed frames (see docs/exports.md)."""
 
-    format: ExportFormat = Field(description="The format; docs/exports.md lists what each contains and loses.")
-    first: FrameNumber | None = Field(default=None, description="First frame; null: the first committed frame.")
-    last: FrameNumber | None = Field(default=None, description="Last frame, inclusive; null: the last committed frame.")
+    format: ExportFormat = Field(description="File format; docs/exports.md lists what each format preserves and loses.")
+    first: FrameNumber | None = Field(default=None, description="First frame; null for the first committed frame.")
+    last: FrameNumber | None = Field(
+        default=None, description="Last frame, inclusive; null for the last committed frame."
+    )
     ids: (
         Annotated[list[Annotated[int, Field(ge=0, le=LARGEST_ID)]], Field(min_length=1, max_length=MOST_IDS)] | None
-    ) = Field(default=None, description="Gaussians for the format `tracks`; null: all moving Gaussians.")
+    ) = Field(
+        default=None, description="Ids of the Gaussians to export in the format `tracks`; null for all moving ones."
+    )
 
 
 class ExportModel(Model):
-    """An export. The service keeps it until it is deleted, it expires, or the service stops."""
+    """An export. It is kept until it is deleted, it expires, or the service stops."""
 
     id: str
     scene: str
@@ -63,12 +67,14 @@ class ExportModel(Model):
     state: ExportState
     done: int = Field(description="Number of frames written so far.")
     frames: int = Field(description="Number of frames in total.")
-    bytes: int = Field(description="Bytes on disk so far; the size of the file once it is done.")
-    error: str | None = Field(description="Why the export failed or was cancelled.")
+    bytes: int = Field(description="Number of bytes on disk so far; the size of the file once the export is done.")
+    error: str | None = Field(description="Reason why the export failed or was cancelled.")
     created: str = Field(description="Creation time, ISO 8601.")
-    expires: str | None = Field(description="Time at which the file is removed; null until it is done.")
-    name: str = Field(description="Name of the file. Numbered files are packed into one .zip.")
-    file: str | None = Field(description="Path of the file relative to the service's address; null until it is done.")
+    expires: str | None = Field(description="Time at which the file will be removed; null until the export is done.")
+    name: str = Field(description="File name. Numbered files are packed into a single .zip.")
+    file: str | None = Field(
+        description="Path of the file, relative to the service address; null until the export is done."
+    )
 
 
 class ExportList(Model):

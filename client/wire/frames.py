@@ -13,23 +13,23 @@ from scas4d_core.frame_outcome import AlarmKind, FrameOutcome
 
 
 class FrameReceipt(Model):
-    """Confirms that a frame is on disk and queued. Repeating the same frame returns the same receipt."""
+    """Confirms that a frame is on disk and queued. Sending the same frame again returns the same receipt."""
 
     scene: str
     index: int
-    time: float = Field(description="Time of the frame in seconds.")
-    identity: str = Field(description="BLAKE3 over the sorted (camera, kind, BLAKE3 of the file) and the time.")
+    time: float = Field(description="Timestamp of the frame in seconds.")
+    identity: str = Field(description="BLAKE3 hash of the sorted (camera, kind, file BLAKE3) entries and the time.")
 
 
 class CameraReceipt(Model):
-    """Confirms that one camera's files are on disk. Repeating the request returns it with the current cameras."""
+    """Confirms that one camera's files are on disk. Repeating the request returns current camera lists."""
 
     scene: str
     index: int
     camera: str
-    received: list[str] = Field(description="Cameras whose picture has arrived, sorted.")
-    absent: list[str] = Field(description="Cameras whose picture has not arrived.")
-    frame: FrameReceipt | None = Field(description="Receipt of the whole frame, once it is closed.")
+    received: list[str] = Field(description="Cameras whose image has arrived, sorted.")
+    absent: list[str] = Field(description="Cameras whose image has not arrived yet.")
+    frame: FrameReceipt | None = Field(description="Receipt for the whole frame, once it is closed.")
 
 
 class FrameState(StrEnum):
@@ -45,44 +45,47 @@ class FrameState(StrEnum):
 
 
 FINISHED = frozenset({FrameState.COMMITTED, FrameState.FAILED, FrameState.MISSING, FrameState.SKIPPED})
-"""The final states, after which a frame no longer changes."""
+"""Final states, after which a frame no longer changes."""
 
 
 class MissingRequest(Model):
     """A request to declare a frame permanently missing."""
 
-    reason: str = Field(default="", max_length=500, description="Reason, for people.")
+    reason: str = Field(default="", max_length=500, description="Human-readable reason.")
 
 
 class CameraFitModel(Model):
-    """Fit of one camera's picture to the rendering; it exposes cameras that moved or changed."""
+    """How well one camera's image matches the render; reveals cameras that have moved or changed."""
 
     psnr: float | None = Field(description="PSNR in dB.")
     colour_shift: tuple[float, float, float] | None = Field(
-        default=None, description="Mean of the picture minus mean of the render, RGB in 0…1; null if not measured."
+        default=None,
+        description="Mean RGB of the image minus that of the render, for values in 0…1; null if not measured.",
     )
     health: float | None = Field(
         default=None,
         description=(
-            "0…1; 1: fits as well as usual compared with the other cameras, 0: would be discarded; null if not judged."
+            "From 1 (fits as usual relative to the other cameras) to 0 (would be discarded); null if not evaluated."
         ),
     )
 
 
 class AlarmModel(Model):
-    """An alarm about a condition that requires an operator's attention."""
+    """An alarm about a condition that needs an operator's attention."""
 
     kind: AlarmKind = Field(
         description=(
-            "camera_left_out: the update did not use it. camera_misfit: fits worse than usual "
-            "compared with the other cameras. camera_colours, camera_sharpness: differ from its past "
-            "and from the other cameras. camera_frozen: sends the same picture again. light: the "
-            "light has changed for all cameras. frame_repeated: all cameras send the same pictures "
-            "again. frame_in_part, frame_rejected: see `degraded`."
+            "camera_left_out: the update did not use the camera. camera_misfit: it fits worse than usual "
+            "compared with the other cameras. camera_colours, camera_sharpness: its colours or sharpness "
+            "differ from its own past and from the other cameras. camera_frozen: it sent the same image "
+            "again. light: the lighting changed for all cameras. frame_repeated: all cameras sent the "
+            "same images again. frame_in_part, frame_rejected: see `degraded`."
         )
     )
-    camera: str | None = Field(default=None, description="The camera; null if the alarm concerns none.")
-    evidence: str = Field(description="Evidence with figures, for people.")
+    camera: str | None = Field(
+        default=None, description="Camera that the alarm concerns; null if it concerns no single camera."
+    )
+    evidence: str = Field(description="Human-readable evidence, with figures.")
 
 
 class CameraTimingModel(Model):
@@ -90,32 +93,39 @@ class CameraTimingModel(Model):
 
     frames: float = Field(
         description=(
-            "Offset in frames; positive means this camera is later than the others. The median over the cameras is 0."
+            "Offset in frames; positive if this camera is later than the others. The median over all cameras is 0."
         )
     )
     error: float = Field(description="Standard error of the offset, in frames.")
-    out_of_step: bool = Field(description="The camera is clearly out of step; the scene's `warnings` name it.")
+    out_of_step: bool = Field(
+        description="Whether the camera is clearly out of step; if so, the scene's `warnings` name it."
+    )
 
 
 class CurvePointModel(Model):
-    """One point of an update's loss curve."""
+    """One point on an update's loss curve."""
 
     iterations: int
-    milliseconds: float = Field(description="Milliseconds since the update started, after decoding.")
-    loss: float | None = Field(description="Mean training loss of the iterations since the previous point.")
+    milliseconds: float = Field(description="Milliseconds since the update started, excluding decoding.")
+    loss: float | None = Field(description="Mean training loss over the iterations since the previous point.")
 
 
 class EffectModel(Model):
-    """On/off switch of one effect."""
+    """On/off state of one effect, with the evidence for it."""
 
-    on: bool = Field(description="The effect takes part in updates.")
-    since: int = Field(description="Frame after which it was last switched on or off.")
-    pinned: bool = Field(default=False, description="Pinned by the scene's settings; otherwise the evidence decides.")
-    share: float = Field(
-        default=0.0, description="0…1; what the effect explains, or would explain, according to the latest evidence."
+    on: bool = Field(description="Whether updates use the effect.")
+    since: int = Field(description="Frame after which the effect was last switched on or off.")
+    pinned: bool = Field(
+        default=False, description="Whether the scene's settings fix the state; otherwise, the evidence decides."
     )
-    text: str = Field(default="", description="The latest evidence, for people.")
-    idle: int = Field(default=0, description="Consecutive frames with too little evidence to keep it on.")
+    share: float = Field(
+        default=0.0,
+        description="Fraction (0…1) that the effect explains, or would explain, according to the latest evidence.",
+    )
+    text: str = Field(default="", description="Human-readable summary of the latest evidence.")
+    idle: int = Field(
+        default=0, description="Number of consecutive frames with too little evidence to keep the effect on."
+    )
 
 
 class FirstCloudModel(Model):
@@ -123,21 +133,21 @@ class FirstCloudModel(Model):
 
     method: str = Field(
         description=(
-            "given, or how the points were found in the pictures: agreement (of at least three "
-            "cameras), backdrop (silhouettes in front of a plain backdrop), pairs (two cameras "
-            "agree), plane (a floor or table on which pictures agree), surroundings (what single "
-            "cameras see, far away), volume (a guess that no camera confirms: send points, or add "
-            "cameras). Several methods are joined by +."
+            "given, or how the points were found in the images: agreement (at least three cameras "
+            "agree), backdrop (silhouettes in front of a plain backdrop), pairs (two cameras agree), "
+            "plane (a floor or table on which images agree), surroundings (distant content that only "
+            "single cameras see), volume (a guess that no camera confirms: send points, or add "
+            "cameras). Multiple methods are joined by +."
         )
     )
     points: int
     coverage: float | None = Field(
-        description="0…1; share of the pictures with points on which cameras agree; null for given points."
+        description="Fraction (0…1) of the images covered by points on which cameras agree; null for given points."
     )
 
 
 class CameraResidualModel(Model):
-    """Disagreement between the features of one camera's picture and the calibration."""
+    """Disagreement between the features in one camera's image and the calibration."""
 
     pixels: float | None = Field(
         description=(
@@ -151,37 +161,41 @@ class CameraResidualModel(Model):
 class RefinedCameraModel(Model):
     """A camera after refinement, compared with the given calibration."""
 
-    rotation_deg: float = Field(description="Change of rotation, degrees.")
-    translation: float = Field(description="Change of the camera's centre, in the calibration's unit.")
+    rotation_deg: float = Field(description="Change in rotation, in degrees.")
+    translation: float = Field(description="Displacement of the camera centre, in the calibration's units.")
     focal: float = Field(description="Factor by which the focal length changed.")
-    before: float | None = Field(description="Residual before refinement, pixels; null if there are too few matches.")
-    after: float | None = Field(description="Residual after refinement, pixels.")
-    fixed: bool = Field(description="Not refined, because there are too few matches.")
-    pose: list[list[float]] = Field(description="4×4 world-to-camera matrix in the calibration's world.")
+    before: float | None = Field(
+        description="Residual before refinement, in pixels; null if there are too few matches."
+    )
+    after: float | None = Field(description="Residual after refinement, in pixels.")
+    fixed: bool = Field(description="Whether the camera was not refined, because there are too few matches.")
+    pose: list[list[float]] = Field(description="4×4 world-to-camera matrix in the calibration's world frame.")
 
 
 class RefinementModel(Model):
     """Result of refining a calibration."""
 
-    accepted: bool = Field(description="The scene uses the refined rig.")
-    text: str = Field(description="Outcome with figures, for people.")
+    accepted: bool = Field(description="Whether the scene uses the refined rig.")
+    text: str = Field(description="Human-readable outcome, with figures.")
     before: float | None = Field(
-        description=("Typical distance of held-out matches from their epipolar lines before refinement, pixels.")
+        description=("Typical distance of held-out matches from their epipolar lines before refinement, in pixels.")
     )
-    after: float | None = Field(description="The same after refinement.")
+    after: float | None = Field(description="The same distance after refinement, in pixels.")
     matches: int = Field(description="Number of held-out matches.")
     cameras: dict[str, RefinedCameraModel] = Field(
-        description="Refined cameras by name; empty if the refinement was not accepted."
+        description="Refined cameras, keyed by name; empty if the refinement was not accepted."
     )
 
 
 class CalibrationModel(Model):
-    """Comparison of the calibration with the pictures of frame 0."""
+    """Comparison of the calibration with the images of frame 0."""
 
-    cameras: dict[str, CameraResidualModel] = Field(description="Residuals by camera, before refinement.")
+    cameras: dict[str, CameraResidualModel] = Field(description="Residuals before refinement, keyed by camera name.")
     miscalibrated: list[str] = Field(description="Cameras that clearly disagree with their calibration.")
-    warnings: list[str] = Field(description="Warnings for people, one sentence each; also in the scene's status.")
-    refined: RefinementModel | None = Field(description="Null unless the setting `static.refine_calibration` is on.")
+    warnings: list[str] = Field(description="Human-readable warnings, one sentence each; also in the scene's status.")
+    refined: RefinementModel | None = Field(
+        description="Result of refinement; null unless the setting `static.refine_calibration` is on."
+    )
 
 
 class FrameReportModel(Model):
@@ -189,124 +203,136 @@ class FrameReportModel(Model):
 
     scene: str
     index: int
-    time: float | None = Field(description="Time in seconds; null for a frame declared missing.")
+    time: float | None = Field(description="Timestamp in seconds; null for a frame declared missing.")
     state: FrameState = Field(
         description=(
-            "open: cameras are still sending. queued: on disk, waiting. updating: being "
+            "open: cameras are still sending. queued: stored on disk, waiting. updating: being "
             "reconstructed. committed: its state can be read. failed: could not be reconstructed, see "
-            "`error`. missing: declared missing. skipped: the queue was full, and the scene skips to "
-            "the newest frame."
+            "`error`. missing: declared missing. skipped: dropped in favour of the newest frame, "
+            "because the queue was full."
         )
     )
-    error: str | None = Field(default=None, description="Why the frame failed, was skipped, or is missing.")
-    identity: str | None = Field(default=None, description="The identity from its receipt; null if it never had one.")
+    error: str | None = Field(default=None, description="Reason why the frame failed, was skipped, or is missing.")
+    identity: str | None = Field(
+        default=None, description="Identity from the frame's receipt; null if it never had one."
+    )
     worker_deaths: int = Field(
         default=0, description="Number of times the worker died while reconstructing this frame."
     )
-    pictures_kept: bool = Field(default=False, description="The frame log still has its pictures.")
+    pictures_kept: bool = Field(default=False, description="Whether the frame's images are still in the frame log.")
     deleted: bool = Field(
-        default=False, description="The frame was committed, and retention has deleted its state since."
+        default=False, description="Whether the frame was committed, but its state has since been deleted by retention."
     )
-    received: list[str] | None = Field(default=None, description="While open: cameras whose picture has arrived.")
+    received: list[str] | None = Field(
+        default=None, description="While the frame is open: cameras whose image has arrived."
+    )
     used_cameras: list[str] = Field(default_factory=list, description="Cameras that the update used.")
     dropped_cameras: dict[str, str] = Field(
         default_factory=dict,
-        description=("Dropped cameras with the reason: no file that can be decoded, or a picture that did not fit."),
+        description=(
+            "Reason for each dropped camera, keyed by camera name: no decodable file, or an image that did not fit."
+        ),
     )
     outcome: FrameOutcome | None = Field(
         default=None, description="Outcome of the update; null until the frame is committed."
     )
     degraded: str | None = Field(
-        default=None, description="Why the committed state does not, or only partly, show the frame; null if it does."
+        default=None,
+        description="Reason why the committed state shows the frame only partly or not at all; null if it does.",
     )
     candidate: Literal["end", "previous", "warm"] | None = Field(
         default=None,
         description=(
-            "The committed candidate: the end of the update, the previous state, or its extrapolated motion (warm)."
+            "Committed candidate: the end of the update, the previous state, or its extrapolated motion (warm)."
         ),
     )
     attempts: list[str] = Field(
-        default_factory=list, description="The attempts of the update and their outcomes, in order."
+        default_factory=list, description="Attempts at the update and their outcomes, in order."
     )
     grey: list[str] = Field(
-        default_factory=list, description="Frame 0 only: cameras with grey pictures, if others have colour."
+        default_factory=list, description="Frame 0 only: cameras with grayscale images, if others have colour."
     )
     exposure: float | None = Field(
-        default=None, description="Brightness of the frame relative to the light in which the colours are stored."
+        default=None, description="Brightness of the frame relative to the lighting of the stored colours."
     )
     frozen_gaussians: int | None = Field(
-        default=None, description="Number of Gaussians that kept their state individually."
+        default=None, description="Number of individual Gaussians that kept their previous state."
     )
-    guards: dict[str, int] = Field(default_factory=dict, description="Number of times each guard acted.")
+    guards: dict[str, int] = Field(
+        default_factory=dict, description="Number of times each guard acted, keyed by guard name."
+    )
     effects: dict[str, EffectModel] = Field(
-        default_factory=dict, description="Switches of the effects after this frame, by name."
+        default_factory=dict, description="State of each effect after this frame, keyed by name."
     )
     budget: Budget | None = Field(
-        default=None, description="Budget of the update; null fields take the scene's settings."
+        default=None, description="Budget of the update; null fields default to the scene's settings."
     )
     iterations: int | None = None
     planned: list[tuple[int, int]] = Field(
         default_factory=list,
         description=(
-            "(iteration, total iterations) for every change of the plan. A shortened frame 0 has at least two entries."
+            "(iteration, total iterations) at each change of the plan. A shortened frame 0 has at least two entries."
         ),
     )
-    seconds: dict[str, float] = Field(default_factory=dict, description="Seconds by stage.")
+    seconds: dict[str, float] = Field(
+        default_factory=dict, description="Duration of each stage in seconds, keyed by stage name."
+    )
     write_seconds: float | None = Field(
         default=None,
-        description="Seconds to write the previous commit. The report is written before its own commit ends.",
+        description="Duration of writing the previous commit; this report is written before its own commit ends.",
     )
-    threads: int | None = Field(default=None, description="Number of threads of the update.")
+    device: Literal["cpu", "gpu"] | None = Field(default=None, description="Device that computed the update.")
+    threads: int | None = Field(default=None, description="Number of threads used for the update.")
     recomputed: bool = Field(
         default=False,
-        description=(
-            "The state was damaged on disk and recomputed from its pictures. It shows the same, with other bits."
-        ),
+        description=("Whether the state was damaged on disk and recomputed from its images; its bits may then differ."),
     )
     loss: list[float] = Field(default_factory=list)
-    curve: list[CurvePointModel] = Field(default_factory=list, description="Points of the last attempt.")
+    curve: list[CurvePointModel] = Field(default_factory=list, description="Loss curve of the last attempt.")
     errors: dict[str, float | None] = Field(
         default_factory=dict,
         description=(
-            "Mean image loss on the probe views (at most four training views) by candidate: the "
+            "Mean image loss on the probe views (at most four training views) for each candidate: the "
             "previous state (still), its extrapolated motion (warm), and the end of the update (end)."
         ),
     )
-    psnr: float | None = Field(default=None, description="PSNR in dB on the training views of the last iterations.")
+    psnr: float | None = Field(default=None, description="PSNR on the training views of the last iterations, in dB.")
     cameras: dict[str, CameraFitModel] = Field(
-        default_factory=dict, description="Fit by camera, for the cameras that the update used."
+        default_factory=dict, description="Fit of each camera that the update used, keyed by camera name."
     )
-    alarms: list[AlarmModel] = Field(default_factory=list, description="What needs a person's attention.")
+    alarms: list[AlarmModel] = Field(default_factory=list, description="Conditions that need an operator's attention.")
     timing: dict[str, CameraTimingModel] = Field(
-        default_factory=dict, description="Timing by camera, if the motion in the scene determines it well enough."
+        default_factory=dict, description="Timing of each camera for which the motion determines it well enough."
     )
     moving: int | None = None
-    gaussians: int | None = Field(default=None, description="Number of Gaussians present, without retired ones.")
-    born: int = Field(default=0, description="Gaussians added in this frame.")
+    gaussians: int | None = Field(default=None, description="Number of Gaussians present, excluding retired ones.")
+    born: int = Field(default=0, description="Number of Gaussians added in this frame.")
     retired: int = Field(
-        default=0, description="Gaussians that left the scene in this frame. Their ids are never reused."
+        default=0, description="Number of Gaussians that left the scene in this frame. Their ids are never reused."
     )
-    revived: int = Field(default=0, description="Retired Gaussians that came back in this frame, with their own ids.")
-    cloud: FirstCloudModel | None = Field(default=None, description="Frame 0 only: origin of its first points.")
+    revived: int = Field(
+        default=0, description="Number of retired Gaussians that returned in this frame, under their own ids."
+    )
+    cloud: FirstCloudModel | None = Field(default=None, description="Frame 0 only: origin of the initial points.")
     shortened: list[str] = Field(
         default_factory=list,
         description=(
-            "Frame 0 only: stages that the time limit `static.seconds` cut by at least 5 % of their "
-            "iterations. If it is empty and `planned` has one entry, frame 0 does not depend on the "
-            "speed of the machine."
+            "Frame 0 only: stages that the time limit `static.seconds` shortened by at least 5 % of their "
+            "iterations. If the list is empty and `planned` has one entry, the result of frame 0 does not "
+            "depend on the speed of the machine."
         ),
     )
     calibration: CalibrationModel | None = Field(
-        default=None, description="Frame 0 only: its pictures compared with the calibration."
+        default=None, description="Frame 0 only: comparison of its images with the calibration."
     )
     postponed: list[str] = Field(
         default_factory=list,
-        description="Births for which the budget left no time. The next frame reserves time for them.",
+        description="Births of Gaussians for which the budget left no time; the next frame reserves time for them.",
     )
 
 
 class FrameList(Model):
-    """Reports of frames in index order, without losses and curves."""
+    """Frame reports in index order, without losses and curves."""
 
     frames: list[FrameReportModel]
-    next: int | None = Field(description="`first` of the next request; null if there are no more frames.")
+    next: int | None = Field(description="Value of `first` for the next request; null if there are no more frames.")

@@ -1,8 +1,8 @@
-"""The binary frame format: `S4DF`, a little-endian uint32 length, a JSON header, then the files.
+"""Binary frame format: the magic `S4DF`, a little-endian uint32 length, a JSON header, then the files.
 
-As the body of `PUT /v1/scenes/{id}/frames/{n}`, its content type is `FRAME_MEDIA_TYPE`. Over `WS …/ingest`, it is one
-binary message. The header lists the files and their sizes, and the files follow in that order, so neither side has to
-search for boundaries:
+As the body of `PUT /v1/scenes/{id}/frames/{n}`, a frame has the content type `FRAME_MEDIA_TYPE`. Over `WS …/ingest`, it
+is one binary message. The header lists the files with their sizes, and the files follow in that order, so that neither
+side has to search for boundaries:
 
     offset  bytes  content
     0       4      magic, the ASCII letters S4DF
@@ -34,7 +34,7 @@ MAX_INDEX = 1_000_000_000
 
 
 class FramingError(InputError):
-    """Raised for invalid frame bytes. The message names the fault and the remedy."""
+    """Raised for invalid frame bytes. The message states the problem and the remedy."""
 
 
 class FileKind(StrEnum):
@@ -57,25 +57,27 @@ class FrameHead(Model):
 
     index: int = Field(ge=0, le=MAX_INDEX)
     time: FiniteFloat | None = Field(
-        default=None, description="Time in seconds; by default the index divided by the scene's frame rate."
+        default=None, description="Timestamp in seconds; default: the index divided by the scene's frame rate."
     )
     files: Annotated[list[FrameFile], Field(min_length=1, max_length=2 * MAX_CAMERAS)]
     single_camera: bool = Field(
         default=False,
-        description=("The files belong to one camera, as in PUT …/frames/{n}/cameras/{c}, not to a whole frame."),
+        description=(
+            "Whether the files belong to one camera, as in PUT …/frames/{n}/cameras/{c}, instead of a whole frame."
+        ),
     )
 
 
 class IngestAnswer(Model):
-    """The answer to one binary message of `WS …/ingest`, sent as JSON text in message order."""
+    """The response to one binary message of `WS …/ingest`, sent as JSON text in message order."""
 
     index: int | None = Field(description="Index of the frame; null if the message could not be read.")
-    status: int = Field(description="The same status as over HTTP: 202, 409, 422, 429, 507 …")
+    status: int = Field(description="The same status code as over HTTP: 202, 409, 422, 429, 507 …")
     retry_after: int | None = Field(default=None, description="Seconds to wait; the same as Retry-After over HTTP.")
     receipt: FrameReceipt | CameraReceipt | None = Field(
-        default=None, description="Receipt, with status 202: the files are on disk."
+        default=None, description="Receipt, which confirms that the files are on disk; only with status 202."
     )
-    problem: ProblemDetails | None = Field(default=None, description="Problem document, with any other status.")
+    problem: ProblemDetails | None = Field(default=None, description="Problem document; only with other statuses.")
 
 
 def frame_chunks(
@@ -86,13 +88,13 @@ def frame_chunks(
     *,
     part: bool = False,
 ) -> list[bytes]:
-    """Yields the bytes of a frame without copying files: prefix with header, then each file.
+    """Returns the bytes of a frame without copying the files: the prefix and header, then each file.
 
     Args:
         index: index of the frame.
-        images: encoded images by camera.
-        masks: encoded masks by camera; cameras may be omitted.
-        time: seconds; None: derived from the scene's frame rate.
+        images: encoded image of each camera, keyed by camera name.
+        masks: encoded masks, keyed by camera name; cameras may be omitted.
+        time: timestamp in seconds; derived from the scene's frame rate if None.
         part: whether the frame contains only one camera's files.
     """
     kinds = ((FileKind.IMAGE, images), (FileKind.MASK, masks or {}))
@@ -106,17 +108,17 @@ def head_length(prefix: bytes | bytearray | memoryview) -> int:
     """Returns the size of the header in bytes, read from the first `PREFIX.size` bytes.
 
     Raises:
-        FramingError: if the bytes are not the start of a frame.
+        FramingError: the bytes are not the start of a frame.
     """
     if len(prefix) < PREFIX.size:
-        raise FramingError(f"ends after {len(prefix)} bytes, within its prefix", "send the whole frame")
+        raise FramingError(f"is truncated within its prefix, after {len(prefix)} bytes", "send the whole frame")
     magic, length = PREFIX.unpack_from(prefix)
     if magic != MAGIC:
         raise FramingError(
-            f"begins with {bytes(magic).hex(' ')}, not with S4DF", "send a frame as docs/api.md has it, byte by byte"
+            f"begins with {bytes(magic).hex(' ')}, not with S4DF", "send a frame in the format described in docs/api.md"
         )
     if length > MAX_HEAD:
-        raise FramingError(f"declares a head of {length} bytes", f"a head has at most {MAX_HEAD}")
+        raise FramingError(f"declares a header of {length} bytes", f"a header has at most {MAX_HEAD} bytes")
     return int(length)
 
 
@@ -124,30 +126,32 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
     """Parses the JSON header.
 
     Raises:
-        FramingError: if the header is not valid JSON or has invalid fields.
+        FramingError: the header is not valid JSON or has invalid fields.
     """
     try:
         return FrameHead.model_validate_json(bytes(data))
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
-        raise FramingError(f"head{'.' + field if field else ''}: {first['msg']}", "correct the head") from None
+        raise FramingError(f"head{'.' + field if field else ''}: {first['msg']}", "correct the header") from None
 
 
 def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
     """Returns the header and zero-copy views of each file's bytes.
 
     Raises:
-        FramingError: if the data is not a frame, is truncated, or is longer than the header states.
+        FramingError: the data is not a frame, is truncated, or is longer than the header states.
     """
     view = memoryview(data)
     at = PREFIX.size + head_length(view[: PREFIX.size])
     if at > len(view):
-        raise FramingError(f"ends after {len(view)} bytes, within its head", "send the whole frame")
+        raise FramingError(f"is truncated within its header, after {len(view)} bytes", "send the whole frame")
     head = parse_head(view[PREFIX.size : at])
     expected = at + sum(file.size for file in head.files)
     if len(view) != expected:
-        raise FramingError(f"has {len(view)} bytes where its head says {expected}", "send what the head describes")
+        raise FramingError(
+            f"has {len(view)} bytes, but its header declares {expected}", "send the files that the header lists"
+        )
     pieces = []
     for file in head.files:
         pieces.append(view[at : at + file.size])

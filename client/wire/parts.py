@@ -11,25 +11,27 @@ from pydantic import Field
 from client.wire.base import Model
 
 GOLDEN = 0.618033988749895
-"""Hue step between parts (golden ratio), which keeps any number of hues well separated."""
+"""Hue step between parts (golden ratio), which keeps the hues of any number of parts well separated."""
 
 
 class PartsModel(Model):
-    """Part labels for all Gaussians. Parts keep their labels and colours across frames."""
+    """Part labels of all Gaussians. Parts keep their labels and colours across frames."""
 
     count: int = Field(description="Number of parts.")
-    frame: int = Field(description="The newest frame used to find the parts.")
-    ids: list[int] = Field(description="[N] ids of Gaussians.")
+    frame: int = Field(description="Newest frame that was used to find the parts.")
+    ids: list[int] = Field(description="[N] ids of the Gaussians.")
     labels: list[int] = Field(
-        description=("[N] labels from 0; −1 for static Gaussians. With a chosen count, some labels may be unused.")
+        description=(
+            "[N] labels, starting at 0; −1 for static Gaussians. If `count` was requested, some labels may be unused."
+        )
     )
     colours: list[tuple[int, int, int]] = Field(
-        description="RGB 0…255 for each label from 0 to the largest. A label always has the same colour."
+        description="RGB colour (0…255) of each label from 0 to the largest. A label always has the same colour."
     )
 
 
 def part_colour(label: int) -> tuple[int, int, int]:
-    """Returns the RGB colour of a part, 0…255."""
+    """Returns the RGB colour of a part, with values in 0…255."""
     red, green, blue = colorsys.hsv_to_rgb(
         (0.58 + label * GOLDEN) % 1, (0.65, 0.45, 0.85)[label % 3], (0.95, 0.8)[label % 2]
     )

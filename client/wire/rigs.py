@@ -17,19 +17,19 @@ class CameraModel(Model):
 
     name: CameraName
     intrinsics: Annotated[list[Row3], Field(min_length=3, max_length=3)] = Field(
-        description="[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; (0, 0) is the upper left corner of the picture."
+        description="[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; (0, 0) is the upper left corner of the image."
     )
     world_to_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)] = Field(
-        description="X_cam = R X_world + t as [[R, t], [0, 1]], in the user's units."
+        description="Pose matrix [[R, t], [0, 1]] with X_cam = R X_world + t, in the user's units."
     )
-    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the pictures in pixels.")
-    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Height of the pictures in pixels.")
+    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the images in pixels.")
+    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Height of the images in pixels.")
 
     @model_validator(mode="after")
     def _check_camera(self) -> CameraModel:
-        """Rejects names that are reserved for frame fields, and impossible cameras."""
+        """Rejects names that are reserved for frame fields, and invalid cameras."""
         if self.name == "time" or self.name.startswith("mask."):
-            raise InputError(f"camera name {self.name!r} is the name of another field of a frame", "rename the camera")
+            raise InputError(f"camera name {self.name!r} is reserved for another field of a frame", "rename the camera")
         self.camera()  # raises CameraError, a ValueError, for an invalid camera
         return self
 
@@ -56,7 +56,7 @@ class RigModel(Model):
 
     axes: Literal["opencv"] = Field(
         description=(
-            "Camera axes: x right, y down, z forward. The only choice; it is named so that nobody has to guess."
+            "Camera axes: x right, y down, z forward. The only supported convention, which must be stated explicitly."
         )
     )
     cameras: Annotated[list[CameraModel], Field(min_length=1, max_length=MAX_CAMERAS)]

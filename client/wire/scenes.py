@@ -15,19 +15,19 @@ from scas4d_core.errors import InputError
 
 
 class Retention(Model):
-    """A retention rule for per-frame data: keep all frames, the last N frames, or the newest bytes."""
+    """A retention rule for per-frame data: keep all frames, the last N frames, or the newest N bytes."""
 
     last: int | None = Field(
-        default=None, ge=0, description="Number of newest frames to keep. Not together with `bytes`."
+        default=None, ge=0, description="Number of newest frames to keep. Cannot be combined with `bytes`."
     )
     bytes: int | None = Field(
-        default=None, ge=0, description="Maximum number of bytes to keep. Not together with `last`."
+        default=None, ge=0, description="Maximum number of bytes to keep. Cannot be combined with `last`."
     )
 
     @model_validator(mode="after")
     def _one_rule(self) -> Retention:
         if self.last is not None and self.bytes is not None:
-            raise InputError("last and bytes are two rules", "give one of them, or neither to keep all")
+            raise InputError("last and bytes cannot be combined", "give one of them, or neither to keep all")
         return self
 
 
@@ -35,51 +35,62 @@ class StateBounds(Model):
     """Error bounds of states in compact files (see docs/format.md)."""
 
     position: float = Field(
-        default=0.04, ge=1e-6, le=1, description="Error of the centre, relative to the Gaussian's size."
+        default=0.04, ge=1e-6, le=1, description="Maximum error of the centre, relative to the Gaussian's size."
     )
-    axes: float = Field(default=0.055, ge=1e-6, le=1, description="Error of its axes, relative to the Gaussian's size.")
-    rotation: float = Field(default=0.05, ge=0.002, le=1, description="Error of the material rotation, radians.")
-    colour: float = Field(default=0.012, ge=1e-6, le=1, description="Error per colour channel; colours are 0…1.")
-    gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Error per gloss component.")
+    axes: float = Field(
+        default=0.055, ge=1e-6, le=1, description="Maximum error of the axes, relative to the Gaussian's size."
+    )
+    rotation: float = Field(
+        default=0.05, ge=0.002, le=1, description="Maximum error of the material rotation, in radians."
+    )
+    colour: float = Field(
+        default=0.012, ge=1e-6, le=1, description="Maximum error per colour channel, for colours in 0…1."
+    )
+    gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Maximum error per gloss component.")
     opacity: float = Field(
-        default=0.0005, ge=1e-6, le=1, description="Error of the opacity in downloaded files; stored states are exact."
+        default=0.0005,
+        ge=1e-6,
+        le=1,
+        description="Maximum error of the opacity in downloaded files; stored opacities are exact.",
     )
 
 
 class IngestSettings(Model):
-    """Ingest rules of a scene: queue limits, incomplete frames, and retention."""
+    """Ingest rules of a scene: queue limits, incomplete frames and retention."""
 
     queue_frames: int | None = Field(
         default=None,
         ge=1,
         le=10_000,
-        description="Maximum number of acknowledged, unfinished frames; null: the service's default.",
+        description="Maximum number of acknowledged but unfinished frames; null for the service's default.",
     )
     when_full: Literal["refuse", "skip"] = Field(
         default="refuse",
-        description="refuse: 429 with Retry-After. skip: accept the new frame and skip the waiting ones.",
+        description="refuse: respond with 429 and Retry-After. skip: accept the new frame and skip the queued ones.",
     )
     minimum_cameras: int | None = Field(
         default=None,
         ge=1,
         le=MAX_CAMERAS,
-        description="A frame with fewer pictures fails; null: half of the rig's cameras, rounded up.",
+        description="Minimum number of images per frame; null for half of the rig's cameras, rounded up.",
     )
     open_frame_seconds: float | None = Field(
         default=None,
         gt=0,
         le=86_400,
-        description=("Seconds after its first picture until a frame sent camera by camera is closed; null: never."),
+        description=(
+            "Seconds after its first image at which a frame sent camera by camera is closed; null to leave it open."
+        ),
     )
     keep_frames: Retention = Field(
         default=Retention(last=32),
-        description=("Retention of the pictures. Pictures of frames that are not committed yet are always kept."),
+        description=("Retention of images. Images of frames that are not yet committed are always kept."),
     )
     keep_states: Retention = Field(
         default=Retention(),
         description=(
-            "Retention of committed states. The first and the two newest are always kept. States in "
-            "one compact file, at most 120, are deleted together."
+            "Retention of committed states. The first and the two newest states are always kept. The "
+            "states in one compact file (at most 120) are deleted together."
         ),
     )
     exact_states: int | None = Field(
@@ -87,8 +98,8 @@ class IngestSettings(Model):
         ge=24,
         le=1_000_000,
         description=(
-            "Number of newest states that stay exact. Older ones move to compact files within "
-            "`state_bounds`, a twentieth of the size. null: all stay exact."
+            "Number of newest states to store exactly. Older states are moved to compact files, which "
+            "take a twentieth of the space, with errors within `state_bounds`. null to store all exactly."
         ),
     )
     state_bounds: StateBounds = StateBounds()
@@ -98,16 +109,18 @@ class SceneCreate(Model):
     """A request to create a scene from a rig and settings."""
 
     rig: RigModel
-    name: str = Field(default="", max_length=200, description="Name for people; the service generates the id.")
-    preset: str = Field(default="scas4d", max_length=64, description="Named settings to start from.")
+    name: str = Field(default="", max_length=200, description="Display name; the service generates the id.")
+    preset: str = Field(
+        default="scas4d", max_length=64, description="Name of the preset that provides the default settings."
+    )
     settings: dict[str, Any] = Field(
-        default_factory=dict, description='Differences from the preset, nested: {"update": {"iterations": 200}}.'
+        default_factory=dict, description='Nested settings that override the preset: {"update": {"iterations": 200}}.'
     )
     frames_per_second: float = Field(
         default=30.0,
         gt=0,
         le=10_000,
-        description="Frame n has the time n / frames_per_second unless it is sent with one.",
+        description="Frame rate. Frame n has the time n / frames_per_second unless it is sent with a timestamp.",
     )
     ingest: IngestSettings = IngestSettings()
     nodes: Labels = Field(
@@ -125,23 +138,25 @@ class SceneEdit(Model):
     archived: bool | None = Field(
         default=None,
         strict=True,
-        description="true: accept no more frames, and sleep except when viewed. Refused while frames wait.",
+        description="true to accept no more frames and sleep except when viewed. Refused while frames are queued.",
     )
-    keep_frames: Retention | None = Field(default=None, description="As in `ingest`; takes effect at once.")
+    keep_frames: Retention | None = Field(default=None, description="As in `ingest`; takes effect immediately.")
     keep_states: Retention | None = Field(
-        default=None, description="As in `ingest`; takes effect at once and deletes the other states for good."
+        default=None, description="As in `ingest`; takes effect immediately and permanently deletes the other states."
     )
     exact_states: int | None = Field(
         default=None,
         ge=24,
         le=1_000_000,
-        description="As in `ingest`. The idle worker moves older states to compact files, where they stay.",
+        description="As in `ingest`. When idle, the worker moves older states to compact files, where they remain.",
     )
 
     @model_validator(mode="after")
     def _changes_something(self) -> SceneEdit:
         if all(value is None for _, value in self):
-            raise InputError("nothing is to be changed", "give name, archived, keep_frames, keep_states, exact_states")
+            raise InputError(
+                "the request changes nothing", "give name, archived, keep_frames, keep_states, exact_states"
+            )
         return self
 
 
@@ -149,7 +164,7 @@ class ReconstructionRequest(Model):
     """A request to restart a scene's reconstruction from its first frame."""
 
     settings: dict[str, Any] = Field(
-        default_factory=dict, description="Changes of the scene's settings, nested as on creation."
+        default_factory=dict, description="Changes to the scene's settings, nested as on creation."
     )
     frame: int | None = Field(
         default=None,
@@ -157,18 +172,18 @@ class ReconstructionRequest(Model):
         ge=0,
         le=1_000_000_000,
         description=(
-            "First frame of the new reconstruction, received or still to come; null: as before. Earlier frames fail."
+            "First frame of the new reconstruction, received or still to come; null for no change. Earlier frames fail."
         ),
     )
     points: bool = Field(
         default=True,
         strict=True,
-        description="Start from the scene's newest points; false: from the pictures alone.",
+        description="Whether to start from the scene's newest points; false to start from the images alone.",
     )
     discard: bool = Field(
         default=False,
         strict=True,
-        description="Discard committed states; must be true if a frame after the first is committed.",
+        description="Whether to discard committed states; must be true if any frame after the first is committed.",
     )
 
 
@@ -189,21 +204,21 @@ class ProgressModel(Model):
 
     stage: str
     done: int
-    total: int = Field(description="Steps of the stage. A short time limit of frame 0 may reduce it.")
+    total: int = Field(description="Number of steps in the stage. A short time limit for frame 0 may reduce it.")
     detail: dict[str, float] = Field(
         default_factory=dict,
         description=(
-            "Figures by name: `loss`; `seconds_left`, predicted; `seconds_at_most`, the rest of the "
-            "setting `static.seconds`."
+            "Figures, keyed by name: `loss`; `seconds_left`, the predicted remaining time; "
+            "`seconds_at_most`, what remains of the time limit `static.seconds`."
         ),
     )
 
 
 class EffectStatus(EffectModel):
-    """Switch and description of one effect in a scene's status."""
+    """State and description of one effect in a scene's status."""
 
-    group: str = Field(description="motion, coherence, appearance, cameras or presence.")
-    description: str = Field(description="A sentence that describes the effect.")
+    group: str = Field(description="Group of the effect: motion, coherence, appearance, cameras or presence.")
+    description: str = Field(description="One-sentence description of the effect.")
 
 
 class SceneStatus(Model):
@@ -214,70 +229,78 @@ class SceneStatus(Model):
     state: SceneState = Field(
         description=(
             "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. "
-            "ready: idle, and the last frame was committed whole. updating: a later frame is being "
-            "reconstructed. paused: accepts frames, and reconstructs none. degraded: continues, but "
-            "its last frame lost a camera, was rejected or failed, or its worker is restarting; see "
-            "`error`. failed: accepts no more frames until its reconstruction is restarted (PUT "
-            "…/reconstructions/{n}). `paused` and `degraded` also have fields of their own."
+            "ready: idle, and the last frame was fully committed. updating: a later frame is being "
+            "reconstructed. paused: accepts frames but does not reconstruct them. degraded: continues, "
+            "but the last frame lost a camera, was rejected or failed, or the worker is restarting; see "
+            "`error`. failed: accepts no more frames until the reconstruction is restarted (PUT "
+            "…/reconstructions/{n}). `paused` and `degraded` also have separate fields."
         )
     )
-    error: str | None = Field(default=None, description="Why the scene is failed or degraded.")
+    error: str | None = Field(default=None, description="Reason why the scene failed or is degraded.")
     progress: ProgressModel | None = Field(default=None, description="Progress of frame 0, while initialising.")
     cameras: list[str]
     has_points: bool
-    next_frame: int = Field(description="The only new index that PUT …/frames/{n} accepts.")
-    queued: int = Field(description="Acknowledged, unfinished frames, including the one being reconstructed.")
+    next_frame: int = Field(description="The only new frame index that PUT …/frames/{n} accepts.")
+    queued: int = Field(
+        description="Number of acknowledged but unfinished frames, including the one being reconstructed."
+    )
     queue_limit: int
-    committed: int = Field(description="Number of frames that can be rendered and tracked.")
+    committed: int = Field(description="Number of committed frames, which can be rendered and tracked.")
     first_committed: int | None
     last_committed: int | None
     gaussians: int | None
     reconstruction: int = Field(description="Number of the reconstruction, increased at each restart.")
     first_frame: int = Field(description="First frame of the reconstruction; earlier frames failed.")
-    paused: bool = Field(description="No further frame is started, whatever `state` says; one may still be running.")
+    paused: bool = Field(
+        description="Whether no further frame is started, regardless of `state`; one may still be running."
+    )
     asleep: bool = Field(
         description=(
-            "The scene is idle, without processes, and does not count towards the limit. Requests "
-            "wake it. `state` remains valid."
+            "Whether the scene is idle, has no processes and does not count towards the scene limit. "
+            "Requests wake it up. `state` remains valid."
         ),
     )
     archived: bool = Field(
-        description="The scene accepts no frames until it is unarchived. Everything can still be viewed."
+        description="Whether the scene refuses frames until it is unarchived. Everything can still be viewed."
     )
     degraded: bool = Field(
         description=(
-            "The last frame lost a camera, was rejected, was fitted only in part or failed; the "
-            "worker is restarting, the disk is full, or damaged files are being repaired. `error` has "
+            "Whether the last frame lost a camera, was rejected, was only partly fitted or failed, the "
+            "worker is restarting, the disk is full, or damaged files are being repaired. `error` gives "
             "the reason. Independent of `state`."
         ),
     )
     open_frames: list[int] = Field(description="Frames whose cameras are still sending.")
-    failed: int = Field(description="Frames that could not be reconstructed.")
-    missing: int = Field(description="Frames declared missing.")
-    skipped: int = Field(description="Frames skipped because the queue was full.")
-    worker_deaths: int = Field(description="Deaths of the worker since the scene woke or its reconstruction started.")
-    frames_kept: int = Field(description="Frames whose pictures are in the frame log.")
-    frame_bytes: int = Field(description="Size of the frame log on disk.")
+    failed: int = Field(description="Number of frames that could not be reconstructed.")
+    missing: int = Field(description="Number of frames declared missing.")
+    skipped: int = Field(description="Number of frames skipped because the queue was full.")
+    worker_deaths: int = Field(
+        description="Number of worker deaths since the scene woke up or its reconstruction started."
+    )
+    frames_kept: int = Field(description="Number of frames whose images are in the frame log.")
+    frame_bytes: int = Field(description="Size of the frame log on disk, in bytes.")
     states_deleted: int = Field(description="Number of committed states that retention has deleted.")
     effects: dict[str, EffectStatus] = Field(
-        description="Effects (docs/effects.md) of the next update, with their evidence."
+        description="Effects (docs/effects.md) in the next update, with their evidence, keyed by name."
     )
     damage: list[str] = Field(
-        description="Damage found on disk and its outcome, one sentence each; the newest 100.",
+        description="Damage found on disk and its outcome, one sentence each; only the newest 100.",
     )
     warnings: list[str] = Field(
         description=(
             "Likely mistakes, one sentence each: poses that seem inverted, cameras that disagree with "
             "their calibration, the outcome of refinement, initial points that no camera confirms or "
-            "that cover little of the pictures, stages of frame 0 that were cut short, grey cameras "
-            "among colour ones, and cameras that are out of step."
+            "that cover little of the images, stages of frame 0 that were cut short, grayscale cameras "
+            "among colour cameras, and cameras that are out of step."
         ),
     )
-    created: str = Field(description="Creation time, UTC, ISO 8601.")
+    created: str = Field(description="Creation time in UTC, ISO 8601.")
     ingest: IngestSettings
-    nodes: dict[str, str] = Field(description="On a cluster: labels of the nodes on which its processes may run.")
+    nodes: dict[str, str] = Field(
+        description="On a cluster: labels of the nodes on which the scene's processes may run."
+    )
     settings: dict[str, Any]
-    budget: Budget = Field(description="The budget as last set; null fields take `settings`.")
+    budget: Budget = Field(description="The most recently requested budget; null fields default to `settings`.")
 
 
 class SceneList(Model):

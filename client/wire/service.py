@@ -1,4 +1,4 @@
-"""Wire models of the service: health, errors, tickets, shares, cluster."""
+"""Wire models of the service: health, errors, tickets, shares and cluster."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Health(Model):
         default=None, description="Seconds from the start of the service until its kernels were compiled."
     )
     ingest_ready: bool | None = Field(
-        default=None, description="The disk has room for frames; null if it was not checked."
+        default=None, description="Whether the disk has room for frames; null if not checked."
     )
 
 
@@ -27,8 +27,10 @@ class Ticket(Model):
     """A single-use ticket that opens one WebSocket from a browser, which cannot send a bearer token."""
 
     ticket: str
-    subprotocol: str = Field(description="Offer it in Sec-WebSocket-Protocol, in addition to the stream's protocol.")
-    seconds: float = Field(description="Lifetime of the ticket.")
+    subprotocol: str = Field(
+        description="Value to offer in Sec-WebSocket-Protocol, in addition to the stream's protocol."
+    )
+    seconds: float = Field(description="Lifetime of the ticket in seconds.")
 
 
 class ProblemDetails(BaseModel):
@@ -49,60 +51,60 @@ class ShareRequest(Model):
     """A request for a read-only token."""
 
     scene: str | None = Field(
-        default=None, max_length=64, description="The only scene that the token can read; null: all scenes."
+        default=None, max_length=64, description="The only scene that the token can read; null for all scenes."
     )
     seconds: int = Field(
-        default=7 * 86_400, ge=1, le=316_224_000, description="Lifetime of the token; by default a week."
+        default=7 * 86_400, ge=1, le=316_224_000, description="Lifetime of the token in seconds; by default a week."
     )
 
 
 class Share(Model):
-    """A read-only token and the URL of the viewer that contains it."""
+    """A read-only token, and a viewer URL that contains it."""
 
-    token: str = Field(description="For `Authorization: Bearer`.")
+    token: str = Field(description="Token for `Authorization: Bearer`.")
     scene: str | None
-    ends: str = Field(description="End of its validity, UTC, ISO 8601.")
+    ends: str = Field(description="Expiry time in UTC, ISO 8601.")
     address: str = Field(
-        description=("Address of the page, relative to the service. The part after # is never sent to a server.")
+        description=("Viewer URL, relative to the service address. The part after # is never sent to a server.")
     )
 
 
 class Node(Model):
-    """A machine that runs processes of scenes."""
+    """A machine that runs scene processes."""
 
     id: str
     host: str
     labels: dict[str, str] = Field(
-        default_factory=dict, description="Labels given when the node started, without Ray's own."
+        default_factory=dict, description="Labels given when the node was started, excluding Ray's own labels."
     )
     alive: bool
     cpus: float
-    cpus_reserved: float = Field(
-        description="CPUs reserved by the processes of all services that respond, by estimate."
-    )
+    cpus_reserved: float = Field(description="Estimated CPUs reserved by the processes of all services that respond.")
     gpus: float
     memory_mb: float
     memory_reserved_mb: float
-    scenes: list[str] = Field(description="Scenes whose worker runs here.")
+    scenes: list[str] = Field(description="Scenes whose worker runs on this node.")
 
 
 class WaitingProcess(Model):
-    """A process that waits for a node with enough resources."""
+    """A process that is waiting for a node with enough resources."""
 
     scene: str
     role: str
     needs: str
     seconds: float = Field(
-        default=0.0, description="Seconds that it has waited. A start without waiting takes a few seconds."
+        default=0.0,
+        description="How long the process has waited, in seconds. Starting without waiting takes a few seconds.",
     )
 
 
 class Cluster(Model):
-    """The machines of the service and the processes that wait for resources."""
+    """The machines of the service, and the processes that are waiting for resources."""
 
     placement: Literal["local", "ray"]
     nodes: list[Node]
     waiting: list[WaitingProcess]
     head_responds: bool = Field(
-        default=True, description="The head of the cluster responds; otherwise the nodes are from its last answer."
+        default=True,
+        description="Whether the head of the cluster responds; if not, the nodes are those of its last response.",
     )

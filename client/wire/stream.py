@@ -1,7 +1,7 @@
-"""Wire models of subscriptions, protocol `scas4d.stream.v1` (docs/stream.md).
+"""Wire models of the stream protocol `scas4d.stream.v1` (docs/stream.md).
 
-A client sends text messages, `ClientMessage`. The service sends text messages, and binary messages for bulk data. A
-binary message has the magic `S4DS`, the header length as little-endian uint32, a JSON header, and the data.
+Clients send text messages (`ClientMessage`). The service sends text messages, and binary messages for bulk data. A
+binary message consists of the magic `S4DS`, the header length as little-endian uint32, a JSON header, and the data.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PREFIX = struct.Struct("<4sI")
 SCENE_GONE = 4404
 """Close code: the scene was deleted."""
 SCENE_RESTARTS = 1012
-"""Close code: the scene's reconstruction or the service restarts, and the client should reconnect."""
+"""Close code: the scene's reconstruction or the service is restarting, and the client should reconnect."""
 TOO_BIG = 1009
 """Close code: a message was larger than `StreamLimits.message_bytes`."""
 
@@ -37,7 +37,7 @@ SubscriptionId = Annotated[
 ]
 Tag = Annotated[
     int | None,
-    Field(default=None, ge=0, le=2**53 - 1, description="Returned with every message for this request."),
+    Field(default=None, ge=0, le=2**53 - 1, description="Number that is echoed in every message for this request."),
 ]
 
 
@@ -58,14 +58,12 @@ class NoRequest(Model):
 class PartsSubscription(Model):
     """A subscription to part labels."""
 
-    count: int | None = Field(
-        default=None, ge=1, le=254, description="Number of parts; by default chosen automatically."
-    )
+    count: int | None = Field(default=None, ge=1, le=254, description="Number of parts; default: chosen automatically.")
     every: int = Field(
         default=1,
         ge=1,
         le=1_000_000,
-        description="Frames between two messages. Finding the parts keeps the reader busy for a while.",
+        description="Number of frames between messages. Finding the parts keeps the reader busy for a while.",
     )
 
 
@@ -76,14 +74,14 @@ REQUESTS: dict[Topic, type[Model]] = {
     Topic.TRACKS: TracksRequest,
     Topic.PARTS: PartsSubscription,
 }
-"""Request model of each topic. In a render request, a null `frame` follows the newest frame."""
+"""Request model of each topic. A render request with a null `frame` follows the newest frame."""
 
 
 # Messages from the client.
 
 
 class Subscribe(Model):
-    """Starts a subscription, replacing one with the same id."""
+    """Starts a subscription, replacing any subscription with the same id."""
 
     type: Literal["subscribe"] = "subscribe"
     id: SubscriptionId
@@ -93,7 +91,7 @@ class Subscribe(Model):
 
 
 class Update(Model):
-    """Changes some members of a subscription's request, for example when the camera moves."""
+    """Changes some fields of a subscription's request, for example when the camera moves."""
 
     type: Literal["update"] = "update"
     id: SubscriptionId
@@ -119,9 +117,9 @@ class StreamLimits(Model):
     """The service's limits for one client."""
 
     subscriptions: int = Field(description="Maximum number of subscriptions.")
-    message_bytes: int = Field(description="Maximum size of a client's message.")
-    render_pixels: int = Field(description="Maximum pixels per view.")
-    track_points: int = Field(description="Maximum points × frames per tracks message.")
+    message_bytes: int = Field(description="Maximum size of a client message in bytes.")
+    render_pixels: int = Field(description="Maximum number of pixels per view.")
+    track_points: int = Field(description="Maximum number of points × frames per tracks message.")
 
 
 class Hello(Model):
@@ -141,14 +139,14 @@ class Subscribed(Model):
 
 
 class Unsubscribed(Model):
-    """Confirms an `unsubscribe`: no more messages with this id follow."""
+    """Confirms an `unsubscribe`; no more messages with this id follow."""
 
     type: Literal["unsubscribed"] = "unsubscribed"
     id: SubscriptionId
 
 
 class StreamProblem(Model):
-    """A rejected request or update. If it has an id, that subscription remains active."""
+    """Reports a rejected request or update. If it has an id, that subscription remains active."""
 
     type: Literal["error"] = "error"
     id: SubscriptionId | None = None
@@ -194,19 +192,21 @@ SERVER_MESSAGE: TypeAdapter[
 
 
 class BinaryHead(Model):
-    """The header of a binary message, which describes the data after it."""
+    """The header of a binary message, which describes the data that follows."""
 
     type: Literal["render", "tracks", "parts"]
     id: SubscriptionId
     tag: Tag = None
-    missed: int = Field(description="Number of unsent messages that this one replaces: frames and camera positions.")
+    missed: int = Field(
+        description="Number of unsent messages, for earlier frames or camera positions, that this one replaces."
+    )
     frame: int = Field(description="Frame of the render, last frame of the tracks, or newest frame of the parts.")
     first: int | None = Field(
-        default=None, description="Tracks only: first frame in the message; earlier ones were sent before."
+        default=None, description="Tracks only: first frame in the message; earlier frames were already sent."
     )
     media_type: str = Field(description="Media type of the body, as for the same request over HTTP.")
     headers: dict[str, str] = Field(
-        default_factory=dict, description="HTTP response headers with lowercase names, e.g. x-depth-near …"
+        default_factory=dict, description="HTTP response headers with lowercase names, e.g. x-depth-near."
     )
 
 
@@ -220,12 +220,14 @@ def unpack(message: bytes) -> tuple[BinaryHead, bytes]:
     """Splits a binary message into its header and body.
 
     Raises:
-        ValueError: if the message is not in this format.
+        ValueError: the message is not in this format.
     """
     if len(message) < _PREFIX.size:
-        raise ValueError(f"a binary message of {len(message)} bytes has no room for its head")
+        raise ValueError(f"a binary message of {len(message)} bytes is too short for its header")
     magic, length = _PREFIX.unpack_from(message)
     if magic != MAGIC or _PREFIX.size + length > len(message):
-        raise ValueError(f"a binary message begins with {magic!r} and a head of {length} of its {len(message)} bytes")
+        raise ValueError(
+            f"a binary message of {len(message)} bytes has the magic {magic!r} and a header of {length} bytes"
+        )
     head = BinaryHead.model_validate_json(message[_PREFIX.size : _PREFIX.size + length])
     return head, message[_PREFIX.size + length :]

@@ -14,27 +14,30 @@ from client.wire.rigs import CameraModel
 
 
 class TracksRequest(Model):
-    """A request for trajectories of ids, pixels or points; exactly one of them is given."""
+    """A request for trajectories of exactly one of `ids`, `pixels` and `points`."""
 
     ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Ids of Gaussians.")
     pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
-        default=None, description="u v in the picture of `camera`; (0.5, 0.5) is the centre of the first pixel."
+        default=None,
+        description="Pixel coordinates (u, v) in the image of `camera`; (0.5, 0.5) is the centre of the first pixel.",
     )
     camera: CameraModel | str | None = Field(
-        default=None, description="Camera of the pixels: any camera, or the name of one in the rig."
+        default=None, description="Camera to whose image the pixels belong: any camera, or the name of one in the rig."
     )
     points: Annotated[list[Row3], Field(min_length=1)] | None = Field(
-        default=None, description="x y z in the rig's world and units."
+        default=None, description="Points (x, y, z) in the rig's world frame and units."
     )
     at: int | None = Field(
-        default=None, ge=0, description="Frame of the pixels or points; default: the first committed frame."
+        default=None, ge=0, description="Frame to which the pixels or points refer; default: the first committed frame."
     )
     first: int | None = Field(default=None, ge=0, description="First frame; default: the first committed frame.")
     last: int | None = Field(
         default=None, ge=0, description="Last frame, inclusive; default: the last committed frame."
     )
     project: list[CameraModel | str] = Field(
-        default_factory=list, max_length=64, description="Cameras to project into, with visibility."
+        default_factory=list,
+        max_length=64,
+        description="Cameras into which to project the trajectories, including visibility.",
     )
     format: Literal["json", "npz"] = "json"
 
@@ -42,33 +45,35 @@ class TracksRequest(Model):
 class TracksModel(Model):
     """Trajectories of Q points over T frames, in the rig's world frame and units."""
 
-    frames: list[int] = Field(description="[T] indices of frames.")
-    times: list[float] = Field(description="[T] seconds.")
-    ids: list[int] = Field(description="[Q] the Gaussian that carries the point; −1 if the query met nothing.")
+    frames: list[int] = Field(description="[T] frame indices.")
+    times: list[float] = Field(description="[T] frame times in seconds.")
+    ids: list[int] = Field(description="[Q] id of the Gaussian that carries the point; −1 if the query hit nothing.")
     confidence: list[list[float]] = Field(
         description=(
-            "[Q][T] 0…1: how well the Gaussians that carry the point agree in that frame; "
-            "docs/tracks.md. 0 without a position."
+            "[Q][T] how well the Gaussians that carry the point agree in that frame, in 0…1 "
+            "(docs/tracks.md); 0 if there is no position."
         )
     )
     positions: list[list[list[float] | None]] = Field(
-        description="[Q][T] x y z; null if the query met nothing, or its Gaussian is not born yet or retired."
+        description="[Q][T] positions (x, y, z); null if the query hit nothing, or the Gaussian is unborn or retired."
     )
     visible: dict[str, list[list[bool]]] = Field(
-        default_factory=dict, description="[Q][T] per requested camera: inside the picture with nothing in front."
+        default_factory=dict,
+        description="For each requested camera, [Q][T] whether the point is inside the image and not occluded.",
     )
     pixels: dict[str, list[list[list[float] | None]]] = Field(
-        default_factory=dict, description="[Q][T] u v per requested camera; null behind the camera."
+        default_factory=dict,
+        description="For each requested camera, [Q][T] pixels (u, v); null if the point is behind the camera.",
     )
 
 
 class GaussianModel(Model):
-    """The lifetime of one Gaussian: present from birth and from each revival until retired."""
+    """The lifetime of one Gaussian, which is present from its birth, and from each revival, until it is retired."""
 
     id: int
-    born: int = Field(description="Frame of birth; the first frame for the initial Gaussians.")
-    retired: list[int] = Field(description="Frames in which it was retired.")
-    revived: list[int] = Field(description="Frames in which it was revived.")
+    born: int = Field(description="Frame in which the Gaussian was born; the first frame for initial Gaussians.")
+    retired: list[int] = Field(description="Frames in which the Gaussian was retired.")
+    revived: list[int] = Field(description="Frames in which the Gaussian was revived.")
 
 
 class GaussiansModel(Model):

@@ -23,16 +23,16 @@ class PointKind(StrEnum):
 
 
 class TradeoffPoint(Model):
-    """Milliseconds, error and PSNR per frame for a number of iterations."""
+    """Time, error and PSNR per frame for a number of iterations."""
 
     kind: PointKind = Field(
         description=(
-            "measured: on frames that the scene committed. replayed: on frames updated again in the "
-            "background with another number of iterations. extrapolated: computed by `model` from the "
+            "measured: from frames that the scene committed. replayed: from frames updated again in the "
+            "background with a different number of iterations. extrapolated: computed by `model` from the "
             "measured points."
         )
     )
-    iterations: int = Field(description="Iterations per frame. Measured points round to two significant digits.")
+    iterations: int = Field(description="Iterations per frame; rounded to two significant digits for measured points.")
     milliseconds: float = Field(description="Median milliseconds per frame, from decoding to the end of the commit.")
     error: float | None = Field(
         description=(
@@ -44,21 +44,23 @@ class TradeoffPoint(Model):
         description="PSNR in dB on the training views as last rendered; null if not measured or extrapolated."
     )
     frames: int = Field(description="Number of frames measured; 0 for extrapolated points.")
-    threads: int | None = Field(description="Threads of the update. Compare times only for equal numbers.")
+    threads: int | None = Field(
+        description="Number of threads used for the update. Compare times only for equal numbers."
+    )
 
 
 class CurveMean(Model):
-    """Mean convergence of updates after a given number of iterations."""
+    """Mean convergence of updates after a given number of their iterations."""
 
-    planned: int = Field(description="Total iterations of the update.")
+    planned: int = Field(description="Total number of iterations of the update.")
     iterations: int
-    milliseconds: float = Field(description="Median milliseconds since the update started, after decoding.")
-    loss: float = Field(description="Mean training loss of the iterations since the previous point.")
+    milliseconds: float = Field(description="Median milliseconds since the update started, excluding decoding.")
+    loss: float = Field(description="Mean training loss over the iterations since the previous point.")
     frames: int
 
 
 class TimeModel(Model):
-    """Linear time model: milliseconds = fixed + per_iteration × iterations, medians over the newest frames."""
+    """Linear time model: milliseconds = fixed + per_iteration × iterations, from medians over the newest frames."""
 
     fixed: float
     per_iteration: float
@@ -79,33 +81,35 @@ class ReplayStatus(Model):
 
     state: ReplayState = ReplayState.NONE
     iterations: list[int] = Field(
-        default_factory=list, description="Numbers of iterations to measure; the scene's own comes first."
+        default_factory=list, description="Iteration counts to measure; the scene's own count comes first."
     )
-    frames: list[int] = Field(default_factory=list, description="Number of frames that count.")
-    warm_up: int | None = Field(default=None, description="The frame before them, which warms up and does not count.")
+    frames: list[int] = Field(default_factory=list, description="Indices of the frames that are measured.")
+    warm_up: int | None = Field(
+        default=None, description="Index of the preceding frame, which serves as warm-up and is not measured."
+    )
     threads: int | None = None
     done: int = Field(default=0, description="Number of finished updates.")
     total: int = 0
-    error: str | None = Field(default=None, description="Why the replay failed.")
+    error: str | None = Field(default=None, description="Reason why the replay failed.")
 
 
 class TradeoffModel(Model):
     """Accuracy versus time for this scene on this machine."""
 
     scene: str
-    points: list[TradeoffPoint] = Field(description="Points by kind, then by iterations.")
-    curve: list[CurveMean] = Field(description="Mean progress within updates, for each measured budget.")
-    model: TimeModel | None = Field(description="Null until an update was measured.")
-    budget: EffectiveBudget = Field(description="The budget that applies to frames that have not started.")
+    points: list[TradeoffPoint] = Field(description="Points, ordered by kind, then by iterations.")
+    curve: list[CurveMean] = Field(description="Mean progress during updates, for each measured budget.")
+    model: TimeModel | None = Field(description="Fitted time model; null until an update has been measured.")
+    budget: EffectiveBudget = Field(description="The budget for frames whose update has not started.")
     replay: ReplayStatus
 
 
 class ReplayRequest(Model):
-    """A request to replay frames with other numbers of iterations."""
+    """A request to replay frames with other iteration counts."""
 
     iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(
         default=[25, 50, 200],
-        description="Iterations per frame, one replay each. The scene's own number is always measured too.",
+        description="Iterations per frame, one replay each. The scene's own iteration count is always measured too.",
     )
     frames: int = Field(
         default=4,
@@ -113,6 +117,6 @@ class ReplayRequest(Model):
         ge=1,
         le=MOST_REPLAYED,
         description=(
-            "Number of newest frames; one more before them warms up. The frame log must still have their pictures."
+            "Number of newest frames to replay, after one warm-up frame. The frame log must still contain their images."
         ),
     )

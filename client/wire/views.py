@@ -36,34 +36,34 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 class RenderRequest(Model):
     """A request for a novel view."""
 
-    camera: CameraModel | str = Field(description="Any camera in the rig's world, or the name of a camera of the rig.")
-    frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; by default the last one.")
+    camera: CameraModel | str = Field(
+        description="Any camera in the rig's world frame, or the name of a camera in the rig."
+    )
+    frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; default: the last one.")
     kinds: Annotated[list[RenderKind], Field(min_length=1, max_length=4)] = Field(
         default_factory=lambda: [RenderKind.COLOUR],
         description=(
-            "A picture has one kind; npz and float32 may have several. Depth is along z in the rig's "
-            "units, NaN where nothing is visible; as PNG it has 16 bits: 0 for nothing, 1…65535 from "
-            "X-Depth-Near to X-Depth-Far. Parts are 0 for static Gaussians, else 1 + label; as PNG "
-            "they have a palette."
+            "Image files have one kind; npz and float32 may have several. Depth is measured along z in "
+            "the rig's units, and is NaN where nothing is visible. As PNG, it has 16 bits: 0 for nothing, "
+            "and 1…65535 from X-Depth-Near to X-Depth-Far. Parts are 0 for static Gaussians, otherwise "
+            "1 + label; as PNG, they have a palette."
         ),
     )
     format: RenderFormat = Field(
         default=RenderFormat.PNG,
         description=(
-            "JPEG and WebP support colour and alpha. float32: rows from the top, little-endian; "
-            "X-Shape is 'height,width,channels' and X-Channels names the channels."
+            "JPEG and WebP support colour and alpha. float32 is little-endian, with rows from the top; "
+            "X-Shape is 'height,width,channels', and X-Channels names the channels."
         ),
     )
     width: int | None = Field(
         default=None,
         ge=1,
         le=MAX_PIXELS_A_SIDE,
-        description="Width of the picture; the camera is scaled to it, and the height in proportion.",
+        description="Width of the image in pixels, to which the camera is scaled; the height follows in proportion.",
     )
-    quality: int | None = Field(default=None, ge=1, le=100, description="Quality of JPEG and WebP; by default 92.")
+    quality: int | None = Field(default=None, ge=1, le=100, description="Quality of JPEG and WebP; default: 92.")
     background: tuple[Unit, Unit, Unit] | None = Field(
-        default=None, description="RGB; by default the scene's background."
+        default=None, description="RGB colour; default: the scene's background."
     )
-    parts: int | None = Field(
-        default=None, ge=1, le=254, description="Number of parts; by default chosen by the scene."
-    )
+    parts: int | None = Field(default=None, ge=1, le=254, description="Number of parts; default: chosen by the scene.")

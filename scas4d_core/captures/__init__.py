@@ -33,11 +33,11 @@ __all__ = [
 
 
 def open_capture(folder: Path | str, **options: Any) -> Capture:
-    """Opens a capture in a known layout, which is recognized by the files in the folder.
+    """Opens a capture, detecting its layout from the files in the folder.
 
     Args:
         folder: folder of the capture.
-        options: options of `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
+        options: keyword arguments for `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
 
     Raises:
         CaptureError: the folder does not exist, its layout is unknown, or one of its files is invalid.
@@ -53,4 +53,4 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
         raise CaptureError(f"{folder}: no such folder")
     if (folder / TRAIN_META).exists():
         return read_dynamic3dgs(folder, **options)
-    raise CaptureError(f"{folder}: no known capture layout; Dynamic3DGaussians has {TRAIN_META} here")
+    raise CaptureError(f"{folder}: no known capture layout; Dynamic3DGaussians captures contain {TRAIN_META}")

@@ -17,7 +17,7 @@ from scas4d_core.captures.reader import PictureReader
 
 
 class LazyPictures(Mapping[str, NDArray[np.uint8]]):
-    """Images by camera name, decoded on every access and not cached, to limit memory use."""
+    """Maps camera names to images, which are decoded on every access and not cached, to limit memory use."""
 
     def __init__(self, cameras: Collection[str], decode: Callable[[str], NDArray[np.uint8]]) -> None:
         self._cameras = cameras
@@ -37,19 +37,19 @@ class LazyPictures(Mapping[str, NDArray[np.uint8]]):
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A sequence of frames from one rig, optionally with points and ground truth.
+    """A sequence of frames from one rig, optionally with a point cloud and ground truth.
 
     Attributes:
         name: name of the capture's folder.
         full_rig: training cameras at the full image size.
         full_test_rig: test cameras at the full image size, or None.
         pictures: reader for the images and masks of all cameras.
-        image_scale: factor by which images, masks, labels and the cameras of ``rig`` are resized.
-        fps: frames per second; the time of frame i is i / fps if the images have no times of their own.
+        image_scale: factor by which images, masks, labels and the cameras of ``rig`` are scaled.
+        fps: frames per second; the time of frame i is i / fps if the images have no timestamps.
         points: point cloud of frame 0, or None.
         ground_truth: ground-truth tracks and parts, or None.
         extent: longest side of the foreground's bounding box over the sequence, in the user's units, or None.
-        remarks: messages about how the files were read, for the user.
+        remarks: user-facing notes on how the files were read.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -91,7 +91,7 @@ class Capture:
         return self.pictures.frame_count
 
     def time(self, index: int) -> float:
-        """Returns the time of a frame in seconds: from the images if they have times, else from the frame rate."""
+        """Returns the time of a frame in seconds, from image timestamps if available, else from the frame rate."""
         given = self.pictures.time(index)
         return index / self.fps if given is None else given
 
@@ -99,7 +99,7 @@ class Capture:
         """Returns the training images and masks of one frame.
 
         Raises:
-            IndexError: no such frame. Accessing an image may also raise ImageError.
+            IndexError: the frame does not exist. Accessing an image may also raise ImageError.
         """
         return self._frame(index, self.full_rig)
 
@@ -107,7 +107,7 @@ class Capture:
         """Returns the test images of one frame, and their masks if any, for evaluation only.
 
         Raises:
-            IndexError: no such frame.
+            IndexError: the frame does not exist.
             CaptureError: the capture has no test cameras. Accessing an image may also raise ImageError.
         """
         if self.full_test_rig is None:
@@ -115,28 +115,28 @@ class Capture:
         return self._frame(index, self.full_test_rig)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the bytes of an image file of a training or test camera, at full size independent of ``image_scale``.
+        """Returns the image file of a training or test camera as bytes, at full size regardless of ``image_scale``.
 
         Raises:
-            IndexError: no such frame.
-            KeyError: no such camera.
+            IndexError: the frame does not exist.
+            KeyError: the camera does not exist.
             CaptureError: the file cannot be read.
         """
         self._check(index)
         return self.pictures.encoded_image(index, camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns the bytes of a mask file at full size independent of ``image_scale``, or None if there is no mask.
+        """Returns a mask file as bytes, at full size regardless of ``image_scale``, or None if there is no mask.
 
         Raises:
-            IndexError: no such frame.
+            IndexError: the frame does not exist.
             CaptureError: the file cannot be read.
         """
         self._check(index)
         return self.pictures.encoded_mask(index, camera)
 
     def scaled(self, image_scale: float) -> Capture:
-        """Returns the capture at another ``image_scale``; it shares the image reader."""
+        """Returns a copy of the capture with another ``image_scale``, sharing the image reader."""
         truth = self.ground_truth
         if truth is not None:
             sizes = {name: (full, scaled_size(full, image_scale)) for name, (full, _) in truth.image_size.items()}
@@ -158,7 +158,7 @@ class Capture:
             raise CaptureError(f"test camera {unknown[0]!r} is not one of {', '.join(known)}")
         train = tuple(camera for camera in self.full_rig.cameras if camera.name not in names)
         if not train:
-            raise CaptureError("every camera is a test camera; leave some to reconstruct from")
+            raise CaptureError("every camera is a test camera; leave some cameras for training")
         held = tuple(camera for camera in self.full_rig.cameras if camera.name in names)
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
@@ -166,7 +166,7 @@ class Capture:
         """Returns the capture with its training cameras as test cameras, to measure the fit to the training images.
 
         Args:
-            rig: training cameras as refined by a scene; None uses them unchanged.
+            rig: training cameras as refined by a scene; if None, the capture's own cameras.
         """
         return replace(self, full_test_rig=self.full_rig if rig is None else rig)
 

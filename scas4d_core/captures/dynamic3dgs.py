@@ -1,11 +1,12 @@
 """Reads the Dynamic3DGaussians data layout. Needs only numpy and Pillow.
 
 ``train_meta.json`` and ``test_meta.json`` contain ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
-axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are under ``seg/`` with the same path, ending in
-``.png``. ``init_pt_cld.npz`` contains ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). This reader also accepts
-``fps`` in ``train_meta.json``, lists with one number per camera for ``w`` and ``h``, and point clouds with six columns,
-without foreground.
-(JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
+axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are in ``seg/`` under the same paths, with the
+suffix ``.png``. ``init_pt_cld.npz`` contains ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). This reader also
+accepts ``fps`` in ``train_meta.json``, one value per camera for ``w`` and ``h``, and point clouds with six columns
+(no foreground).
+
+Reference: ``train.py`` in JonathonLuiten/Dynamic3DGaussians.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from scas4d_core.captures.size_mismatch import SizeMismatch, adapt_intrinsics
 
 TRAIN_META = "train_meta.json"
 STATIC_TOLERANCE = 1e-6
-"""Largest relative change over time of an entry of k or w2c for a camera that counts as static."""
+"""Maximum relative change of any entry of k or w2c over time for a camera to count as static."""
 
 
 def read_dynamic3dgs(
@@ -41,19 +42,20 @@ def read_dynamic3dgs(
     use_points: bool = True,
     size_mismatch: SizeMismatch | None = None,
 ) -> Capture:
-    """Opens a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
+    """Opens a capture in the Dynamic3DGaussians layout.
 
-    Masks, point cloud, test cameras and ground truth are optional, but masks must exist for all training cameras or
-    none.
+    Cameras are named ``str(cam_id)``, and ``test_meta.json`` lists the test cameras. Masks, point cloud, test cameras
+    and ground truth are optional, but masks must exist for all training cameras or for none.
 
     Args:
         folder: folder that contains ``train_meta.json``.
-        image_scale: factor by which images, masks, labels and cameras are resized.
-        fps: frames per second; None uses ``fps`` of ``train_meta.json`` (written by ``scas4d import``), or else 30.
-        use_masks: False ignores ``seg/``.
-        use_points: False ignores ``init_pt_cld.npz``.
-        size_mismatch: how images whose aspect ratio differs from ``w``:``h`` were produced (`adapt_intrinsics`); None
-            rejects them.
+        image_scale: factor by which images, masks, labels and cameras are scaled.
+        fps: frames per second. If None, ``fps`` from ``train_meta.json`` (written by ``scas4d import``), or 30 if
+            it is missing there.
+        use_masks: whether to read the masks in ``seg/``.
+        use_points: whether to read ``init_pt_cld.npz``.
+        size_mismatch: how images whose aspect ratio differs from ``w``:``h`` were produced (see `adapt_intrinsics`).
+            If None, such images are rejected.
 
     Raises:
         CaptureError: a file is missing, damaged or inconsistent with the others, or a camera moves.
@@ -70,7 +72,7 @@ def read_dynamic3dgs(
             raise CaptureError(f"{folder / 'test_meta.json'}: cam_id {', '.join(both)} is also in {TRAIN_META}")
         if len(test.images) != len(train.images):
             raise CaptureError(
-                f"{folder / 'test_meta.json'}: has {len(test.images)} frames, {TRAIN_META} {len(train.images)}"
+                f"{folder / 'test_meta.json'}: has {len(test.images)} frames, but {TRAIN_META} has {len(train.images)}"
             )
     given = [train] if test is None else [train, test]
     sizes = {camera.name: (camera.width, camera.height) for one in given for camera in one.rig.cameras}
@@ -133,7 +135,7 @@ def _read_cameras(folder: Path, file: str, size_mismatch: SizeMismatch | None) -
     for frame in images:
         absent = next((file for file in frame.values() if not file.is_file()), None)
         if absent:
-            raise CaptureError(f"{absent}: no such file, but {file} names it")
+            raise CaptureError(f"{absent}: no such file, but {file} refers to it")
     fitted = [_adapt_camera(camera, images[0][camera.name], size_mismatch) for camera in rig.cameras]
     remarks = [remark for _, remark in fitted if remark is not None]
     return _Cameras(Rig(tuple(camera for camera, _ in fitted)), images, relative, meta.get("fps", 30.0), remarks)
@@ -152,11 +154,11 @@ def _adapt_camera(camera: Camera, picture: Path, size_mismatch: SizeMismatch | N
 
 
 def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
-    """Returns widths or heights by camera; a single number applies to all cameras."""
+    """Returns the width or height of each camera; a single number applies to all cameras."""
     if not isinstance(value, list):
         return [_parse_pixels(path, key, value)] * cameras
     if len(value) != cameras:
-        raise CaptureError(f"{path}: {key} lists {len(value)} sizes and cam_id {cameras} cameras; give one per camera")
+        raise CaptureError(f"{path}: {key} has {len(value)} values for {cameras} cameras (cam_id); give one per camera")
     return [_parse_pixels(path, f"{key}[{number}]", one) for number, one in enumerate(value)]
 
 
@@ -168,7 +170,7 @@ def _parse_pixels(path: Path, key: str, value: Any) -> int:
 
 def _camera_names(path: Path, cam_id: Any) -> list[str]:
     if not isinstance(cam_id, list) or not cam_id or not all(isinstance(row, list) and row for row in cam_id):
-        raise CaptureError(f"{path}: cam_id must be a list of frames, each a list of cameras, none empty")
+        raise CaptureError(f"{path}: cam_id must be a list of frames, each a list of cameras; no list may be empty")
     changed = next((t for t, row in enumerate(cam_id) if row != cam_id[0]), None)
     if changed is not None:
         raise CaptureError(
@@ -178,8 +180,8 @@ def _camera_names(path: Path, cam_id: Any) -> list[str]:
     for name in names:
         if not re.fullmatch(CAMERA_NAME, name):
             raise CaptureError(
-                f"{path}: cam_id {name!r} is not a valid name: files are named after it; give a number, or letters, "
-                "digits, dots, dashes and underscores, at most 64"
+                f"{path}: cam_id {name!r} cannot be used in file names; give a number, or at most 64 letters, digits, "
+                "dots, dashes and underscores"
             )
     return names
 
@@ -188,15 +190,15 @@ def _require_static(path: Path, key: str, value: Any, shape: tuple[int, ...]) ->
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as fault:
-        raise CaptureError(f"{path}: {key} must be numbers of shape {list(shape)}, as cam_id has; {fault}") from fault
+        raise CaptureError(f"{path}: {key} must be numbers of shape {list(shape)} to match cam_id; {fault}") from fault
     if array.shape != shape:
-        raise CaptureError(f"{path}: {key} must have shape {list(shape)}, as cam_id has; found {list(array.shape)}")
+        raise CaptureError(f"{path}: {key} must have shape {list(shape)} to match cam_id; found {list(array.shape)}")
     moved = np.abs(array - array[:1]).max(axis=(2, 3)) > STATIC_TOLERANCE * np.maximum(1, np.abs(array[:1])).max()
     if moved.any():
         frame, camera = np.argwhere(moved)[0]
         raise CaptureError(
-            f"{path}: {key} of camera number {camera} changes at frame {frame}; a rig's cameras must not move: "
-            "cut the capture where they move"
+            f"{path}: {key} of camera number {camera} changes at frame {frame}; the cameras of a rig must not move: "
+            "split the capture where they do"
         )
     still: NDArray[np.float64] = array[0]
     return still
@@ -204,11 +206,11 @@ def _require_static(path: Path, key: str, value: Any, shape: tuple[int, ...]) ->
 
 def _relative_paths(path: Path, fn: Any, frames: int, names: list[str]) -> tuple[dict[str, PurePosixPath], ...]:
     if not isinstance(fn, list) or len(fn) != frames:
-        raise CaptureError(f"{path}: fn must list {frames} frames, as cam_id does")
+        raise CaptureError(f"{path}: fn must list {frames} frames to match cam_id")
     result = []
     for number, row in enumerate(fn):
         if not isinstance(row, list) or len(row) != len(names) or not all(isinstance(entry, str) for entry in row):
-            raise CaptureError(f"{path}: fn[{number}] must list {len(names)} file names, as cam_id does")
+            raise CaptureError(f"{path}: fn[{number}] must list {len(names)} file names to match cam_id")
         files = {}
         for name, entry in zip(names, row, strict=True):
             file = PurePosixPath(entry)
@@ -227,7 +229,7 @@ def _masks(folder: Path, cameras: _Cameras, *, required: bool) -> tuple[Files, .
         if absent and required:
             raise CaptureError(
                 f"{files[absent[0]]}: no mask for camera {absent[0]}; give masks for every training camera and frame, "
-                "or leave them all out (use_masks=False)"
+                "or ignore all masks (use_masks=False)"
             )
         frames.append({name: file for name, file in files.items() if name not in absent})
     return tuple(frames)
@@ -243,7 +245,7 @@ def _read_points(path: Path) -> InitialPoints | None:
             f"found {data.dtype} {list(data.shape)}"
         )
     if not np.isfinite(data).all():
-        raise CaptureError(f"{path}: data holds NaN or infinity in row {int(np.argmin(np.isfinite(data).all(axis=1)))}")
+        raise CaptureError(f"{path}: data has NaN or infinity in row {int(np.argmin(np.isfinite(data).all(axis=1)))}")
     shown = data[:, 3:]
     if shown.min() < -1e-3 or shown.max() > 1 + 1e-3:
         raise CaptureError(

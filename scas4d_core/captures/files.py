@@ -1,4 +1,4 @@
-"""Reads the JSON and npz files of a capture, with specific error messages. Needs only numpy."""
+"""Reads the JSON and npz files of a capture and explains what is wrong with invalid ones. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def read_json(path: Path) -> dict[str, Any]:
     except FileNotFoundError as fault:
         raise CaptureError(f"{path}: no such file") from fault
     except (OSError, ValueError, RecursionError) as fault:
-        raise CaptureError(f"{path}: is not JSON ({fault})") from fault
+        raise CaptureError(f"{path}: is not valid JSON ({fault})") from fault
     if not isinstance(content, dict):
-        raise CaptureError(f"{path}: must hold a JSON object; found {type(content).__name__}")
+        raise CaptureError(f"{path}: must contain a JSON object; found {type(content).__name__}")
     return content
 
 
 def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Reads the named arrays of an npz file, without pickle.
+    """Reads the named arrays from an npz file; pickled objects are not allowed.
 
     Raises:
         CaptureError: the file is missing or damaged, or lacks one of the keys.

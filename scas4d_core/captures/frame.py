@@ -1,4 +1,4 @@
-"""`Frame`, the images and masks of one time step by camera, and `InitialPoints` of a scene. Needs only numpy."""
+"""`Frame`, the images and masks of one time step, and `InitialPoints`, a point cloud. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Frame:
     """The images of all cameras at one time step.
 
     Attributes:
-        index: 0, 1, 2, … in temporal order.
-        time: seconds since the first frame.
-        images: images by camera name, [H, W, 3] uint8, sRGB values as in the file. Entries may be decoded lazily on
-            access.
-        masks: masks by camera name, [H, W] uint8, 1 on the foreground; empty if the capture has no masks.
+        index: position in temporal order, starting at 0.
+        time: time since the first frame, in seconds.
+        images: maps each camera name to its image, [H, W, 3] uint8, sRGB values as in the file. Images may be decoded
+            lazily on access.
+        masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground; empty if the capture has no masks.
 
     >>> picture = np.zeros((48, 64, 3), np.uint8)
     >>> frame = Frame(index=3, time=0.1, images={"front": picture, "left": picture}, masks={})
@@ -34,12 +34,12 @@ class Frame:
 
 @dataclass(eq=False)
 class InitialPoints:
-    """A point cloud on the surfaces of frame 0, from which the fit of frame 0 starts.
+    """A point cloud on the surfaces of frame 0, used to initialize the fit of that frame.
 
     Attributes:
-        positions: [P, 3] float64, in the user's units and axes.
-        colours: [P, 3] float32 in 0…1, sRGB values as in the images.
-        foreground: [P] float32 in 0…1, or None if unknown.
+        positions: [P, 3] float64 point positions, in the user's units and axes.
+        colours: [P, 3] float32 point colours in 0…1, sRGB values as in the images.
+        foreground: [P] float32 foreground label of each point in 0…1, or None if unknown.
 
     >>> cloud = InitialPoints(np.zeros((5, 3)), np.full((5, 3), 0.5, np.float32))
     >>> len(cloud), cloud.foreground is None

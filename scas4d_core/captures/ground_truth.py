@@ -15,16 +15,16 @@ from scas4d_core.captures.images import Size, decode_labels
 
 @dataclass(frozen=True, eq=False)
 class TruePart:
-    """One part of the scene.
+    """Ground truth of one part of the scene.
 
     Attributes:
-        id: value of the part in label images.
+        id: pixel value of the part in label images.
         name: human-readable name.
         rigid: whether the part moves as a rigid body.
         static: whether the part never moves.
-        foreground: whether masks cover the part.
-        pose: [T, 4, 4] part to world for rigid parts, else None; ``pose[t] @ inv(pose[s])`` moves a point from frame s
-            to t.
+        foreground: whether the masks include the part.
+        pose: [T, 4, 4] part-to-world transforms of a rigid part, else None; ``pose[t] @ inv(pose[s])`` moves a point
+            from frame s to frame t.
     """
 
     id: int
@@ -41,12 +41,13 @@ class GroundTruth:
 
     Attributes:
         points: [T, P, 3] float64 world positions, in the user's units.
-        part_id: [P] int64, the part of each point.
-        visible: [T, C, P] bool, whether the point is inside the image and not occluded.
-        cameras: names along the axis C, for both training and test cameras.
-        parts: the parts; empty if the capture has none.
-        label_files: label images of all frames, by camera name; empty if the capture has none.
-        image_size: full and scaled (width, height), by camera name; labels are resized from the former to the latter.
+        part_id: [P] int64 part id of each point.
+        visible: [T, C, P] bool, whether each point is inside the image and not occluded.
+        cameras: camera names along axis C, both training and test cameras.
+        parts: parts of the scene; empty if the capture lists none.
+        label_files: maps each camera name to its label images of all frames; empty if the capture has none.
+        image_size: maps each camera name to its full and scaled (width, height); labels are resized from full to
+            scaled.
 
     >>> from scas4d_core.captures import open_capture
     >>> truth = open_capture("samples/robot").ground_truth
@@ -66,7 +67,10 @@ class GroundTruth:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[P] bool: points that leave their position in frame 0 by more than 10⁻⁶ of the bounding box of all points."""
+        """[P] bool, whether each point moves from its position in frame 0.
+
+        Displacements of up to 10⁻⁶ of the longest side of the bounding box of all points are ignored.
+        """
         moved: NDArray[np.float64] = np.linalg.norm(self.points - self.points[:1], axis=-1).max(axis=0)
         box = float(np.ptp(self.points.reshape(-1, 3), axis=0).max())
         moving: NDArray[np.bool_] = moved > 1e-6 * box
@@ -88,11 +92,13 @@ class GroundTruth:
         return tuple(self.label_files)
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint8]:
-        """Returns part ids per pixel of a frame, [H, W] uint8, 0 for no part. Labels are sampled, not averaged.
+        """Returns the part id of each pixel of a frame, [H, W] uint8, 0 for no part.
+
+        Labels are resized by sampling, not averaging.
 
         Raises:
             KeyError: the camera has no labels.
-            ImageError: the label image cannot be used.
+            ImageError: the label image is invalid.
         """
         full, scaled = self.image_size[camera]
         return decode_labels(self.label_files[camera][index], size=full, target=scaled)
@@ -104,13 +110,13 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
     Args:
         folder: folder of the capture.
         frame_count: number of frames T of the capture.
-        sizes: full and scaled (width, height), by camera name.
+        sizes: maps each camera name to its full and scaled (width, height).
 
     Returns:
         The ground truth, or None if ``gt_tracks.npz`` does not exist.
 
     Raises:
-        CaptureError: a file is damaged, or does not match the capture.
+        CaptureError: a file is damaged or does not match the capture.
     """
     path = folder / "gt_tracks.npz"
     if not path.exists():
@@ -147,7 +153,7 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
 def read_extent(folder: Path) -> float | None:
     """Returns the longest side of the foreground's bounding box over the sequence, in the user's units.
 
-    The value is read from ``scene.json``; returns None if it has none.
+    The value is read from ``scene.json``. Returns None if the file or the value is missing.
     """
     path = folder / "scene.json"
     value = read_json(path).get("extent") if path.exists() else None

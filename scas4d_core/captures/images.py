@@ -1,16 +1,16 @@
 """Decodes and resizes images and masks. Needs only numpy and Pillow.
 
-Content of an image file, and how it is handled:
+How the content of an image file is handled:
 
 ======================  ====================================================================================
-EXIF orientation ≠ 1    rejected: the intrinsics of a calibrated camera hold for one orientation of the pixels,
-                        and the file does not say which one the calibration used
-alpha (also palette)    composited over black, the empty background of a capture, using the file's values
+EXIF orientation ≠ 1    rejected: intrinsics are valid for one orientation of the pixels only, and the file
+                        does not record which one was calibrated
+alpha (also palette)    composited over black, the empty background of a capture, without linearization
 grey                    replicated to three channels
-16 bit                  value / 257, rounded to 8 bit for grey; colour takes the high byte (at most one level off)
-ICC profile             converted to sRGB (relative colorimetric); values are kept if the profile names itself sRGB
-ICC profile of grey     not applied: the values are kept
-no ICC profile          assumed to be sRGB; gAMA and cHRM chunks are not read
+16 bit                  grey: value / 257, rounded to 8 bit; colour: the high byte (at most one level off)
+ICC profile             converted to sRGB (relative colorimetric), unless its description names sRGB
+grey ICC profile        ignored
+no ICC profile          assumed to be sRGB; gAMA and cHRM chunks are ignored
 CMYK, float, Lab        rejected
 more than one image     rejected (animations, multi-page and multi-image files)
 ======================  ====================================================================================
@@ -52,19 +52,19 @@ def scaled_size(size: Size, image_scale: float) -> Size:
 def decode_image(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """Decodes an image to sRGB values.
+    """Decodes an image file to 8-bit sRGB values.
 
     Args:
-        source: bytes of an image file, or its path.
-        size: (width, height) in pixels that the file must have, before ``image_scale``.
-        image_scale: factor for resizing by area averaging to the size of `Camera.scaled`, with edges aligned.
-        name: name of the image in messages; None uses the path.
+        source: image file, as bytes or as a path.
+        size: required (width, height) of the file in pixels, before scaling; not checked if None.
+        image_scale: scale factor; the image is resized by area averaging to the size of `Camera.scaled`.
+        name: name of the image in error messages; defaults to the path.
 
     Returns:
-        [H, W, 3] uint8.
+        Image [H, W, 3] uint8.
 
     Raises:
-        ImageError: the file is missing, is not an image, or has content that the module docstring lists as rejected.
+        ImageError: the file is missing, is not an image, has the wrong size, or is rejected (see the module docstring).
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
@@ -83,12 +83,13 @@ def decode_image(
 def decode_mask(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """Decodes a foreground mask: 1 where any stored value is nonzero. Arguments and errors are those of `decode_image`.
+    """Decodes a foreground mask. Takes the same arguments as `decode_image` and raises the same errors.
 
-    After resizing by ``image_scale``, a pixel is foreground if at least half of its area is.
+    A pixel is foreground if any stored value is nonzero. After scaling, it is foreground if at least half of its area
+    is.
 
     Returns:
-        [H, W] uint8, values 0 and 1.
+        Mask [H, W] uint8, 1 on the foreground and 0 elsewhere.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.array([[0, 1, 255]], np.uint8)).save(file, "PNG")
@@ -98,8 +99,8 @@ def decode_mask(
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
     if picture.mode in ("LA", "PA", "RGBA", "La", "RGBa"):
-        raise ImageError(f"{name}: a mask with an alpha channel is ambiguous; give one channel, 0 and not 0")
-    values = np.asarray(picture)  # for palette images, the index instead of the colour
+        raise ImageError(f"{name}: a mask with an alpha channel is ambiguous; give one channel, 0 for background")
+    values = np.asarray(picture)  # palette images give the index, not the colour
     foreground = values != 0
     if foreground.ndim == 3:
         foreground = foreground.any(axis=-1)
@@ -107,19 +108,19 @@ def decode_mask(
 
 
 def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
-    """Decodes an 8-bit single-channel image of labels. Resizing samples labels and never averages them.
+    """Decodes an 8-bit single-channel label image. Resizing samples labels and never averages them.
 
     Args:
-        source: bytes of the file, or its path.
-        size: (width, height) that the file must have.
-        target: (width, height) of the result; a pixel takes the label under its centre.
-        name: name of the image in messages; None uses the path.
+        source: image file, as bytes or as a path.
+        size: required (width, height) of the file in pixels.
+        target: (width, height) of the result; each pixel takes the label at its centre.
+        name: name of the image in error messages; defaults to the path.
 
     Returns:
-        [H, W] uint8.
+        Labels [H, W] uint8.
 
     Raises:
-        ImageError: as for `decode_mask`, or the image has more than one channel.
+        ImageError: the file is missing or invalid, has the wrong size, or has more than one channel.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.array([[3, 3, 7, 7]], np.uint8)).save(file, "PNG")
@@ -129,7 +130,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
     if picture.mode not in ("L", "P"):
-        raise ImageError(f"{name}: labels have colour mode {picture.mode}; give one channel of 8 bit")
+        raise ImageError(f"{name}: labels have colour mode {picture.mode}; give one channel of 8 bits")
     columns, rows = (
         np.floor((np.arange(count) + 0.5) * (length / count)).astype(np.intp)
         for count, length in zip(target, size, strict=True)
@@ -157,8 +158,8 @@ def picture_size(source: bytes | Path, name: str | None = None) -> Size:
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     """Resizes an image [H, W, C] to (width, height) by area averaging.
 
-    Edges map to edges, so pixel positions (centres at +0.5) are multiplied by the ratio of the sizes, as in
-    `Camera.scaled`. Pillow's BOX filter uses whole source pixels only, which is half a pixel off at fractional ratios.
+    Image edges stay aligned, so pixel coordinates (centres at +0.5) scale by the ratio of the sizes, as in
+    `Camera.scaled`. Pillow's BOX filter only uses whole source pixels and is half a pixel off at fractional ratios.
 
     >>> resize_area(np.array([[[0], [10], [20]]], np.uint8), size=(2, 1))[..., 0]
     array([[ 3, 17]], dtype=uint8)
@@ -200,15 +201,15 @@ def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
 
 
 def is_sixteen_bit(head: bytes) -> bool:
-    """Returns whether the first 25 bytes of a file are those of a PNG with 16 bits per channel."""
+    """Returns whether a file is a PNG with 16 bits per channel, given its first 25 bytes."""
     return head.startswith(b"\x89PNG") and head[24:25] == b"\x10"
 
 
 def describe_pictures(files: Mapping[str, Path]) -> list[str]:
-    """Returns remarks on the cameras' first images, from their headers: 16 bits, and grey cameras among colour ones.
+    """Returns user-facing remarks on 16-bit images and on grey cameras among colour cameras, from the image headers.
 
     Args:
-        files: one image file by camera name.
+        files: maps each camera name to one of its image files.
 
     Raises:
         ImageError: an image cannot be read.
@@ -223,7 +224,7 @@ def describe_pictures(files: Mapping[str, Path]) -> list[str]:
         except Exception as fault:
             raise _unreadable(str(path), fault) from fault
         if deep:
-            remarks.append(f"camera {camera!r}: its pictures have 16 bits; they are rounded to 8, value / 257")
+            remarks.append(f"camera {camera!r}: its 16-bit images are rounded to 8 bits (value / 257)")
     return remarks + mixed_colours(grey)
 
 
@@ -238,7 +239,8 @@ def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
     """Returns the names of grey images among colour images; images without contrast are ignored.
 
     Args:
-        images: [H, W, 3] by camera. Colour sensors are noisy, so their images are never grey in every pixel.
+        images: maps each camera name to its image [H, W, 3]. Because of sensor noise, an image from a colour camera is
+            never grey in every pixel.
 
     >>> grey = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)[..., :1].repeat(3, axis=2)
     >>> red = grey + np.uint8([1, 0, 0])
@@ -256,7 +258,7 @@ def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64
     for axis, target in ((0, size[1]), (1, size[0])):
         picture = np.moveaxis(picture, axis, 0)
         length = picture.shape[0]
-        # The image's cumulative integral is linear within a pixel, so it is interpolated at the new pixels' edges.
+        # The cumulative integral of the image is linear within a pixel, so interpolating it at new edges is exact.
         integral = np.concatenate([np.zeros_like(picture[:1]), np.cumsum(picture, axis=0)])
         edges = np.arange(target + 1) * (length / target)
         left = np.minimum(edges.astype(np.intp), length - 1)
@@ -283,23 +285,23 @@ def _unreadable(name: str, fault: Exception) -> ImageError:
 
 
 def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size | None) -> Image.Image:
-    # On damaged files, Pillow's decoders raise many kinds of exceptions (OSError, SyntaxError, struct.error, …).
+    # For damaged files, Pillow's decoders raise many kinds of exceptions (OSError, SyntaxError, struct.error, …).
     try:
         picture = Image.open(_stream(source), formats=formats)
         # Check before decoding, because a small file can decompress to gigabytes.
         if size is not None and picture.size != size:
             raise ImageError(
-                f"{name}: is {picture.width}x{picture.height} pixels, the camera {size[0]}x{size[1]}; "
-                "give pictures at the size the camera was calibrated for (image_scale resizes both)"
+                f"{name}: is {picture.width}x{picture.height} pixels, but the camera is {size[0]}x{size[1]}; "
+                "give images at the size that the camera was calibrated for (image_scale resizes both)"
             )
         count = getattr(picture, "n_frames", 1)
         if count > 1:
-            raise ImageError(f"{name}: holds {count} pictures; give a file with one")
+            raise ImageError(f"{name}: contains {count} images; give a file with a single image")
         orientation = picture.getexif().get(EXIF_ORIENTATION, 1)
         if orientation != 1:
             raise ImageError(
-                f"{name}: EXIF orientation is {orientation}; the intrinsics refer to stored pixels and a turned "
-                "picture would not fit them; store the pixels as calibrated and remove the tag"
+                f"{name}: EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not "
+                "match a rotated image; store the pixels as calibrated and remove the tag"
             )
         picture.load()
     except Exception as fault:
@@ -312,7 +314,7 @@ def _rgb(picture: Image.Image, name: str) -> NDArray[np.uint8]:
     if picture.mode in ("I;16", "I;16B", "I;16L", "I"):
         grey = np.asarray(picture).astype(np.int64)
         if grey.min() < 0 or grey.max() > 65535:
-            raise ImageError(f"{name}: grey values {grey.min()}…{grey.max()} exceed 16 bit; give 8 or 16 bit")
+            raise ImageError(f"{name}: grey values {grey.min()}…{grey.max()} exceed 16 bits; give 8 or 16 bits")
         picture = Image.fromarray(((grey + 128) // 257).astype(np.uint8))
     if picture.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         raise ImageError(f"{name}: colour mode {picture.mode} is not supported; give RGB or grey")
@@ -333,12 +335,12 @@ def _to_srgb(picture: Image.Image, profile: bytes, name: str) -> Image.Image:
         source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         described = source.profile.profile_description or ""
         if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in described:
-            # A grey profile is only a tone curve, and converting from sRGB would merely add rounding errors.
+            # A grey profile is only a tone curve, and converting sRGB to sRGB would merely add rounding errors.
             return picture
         converted = ImageCms.profileToProfile(
             picture, source, ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
         )
     except (ImageCms.PyCMSError, OSError) as fault:
-        raise ImageError(f"{name}: its ICC profile cannot be read ({fault}); convert the picture to sRGB") from fault
+        raise ImageError(f"{name}: the ICC profile cannot be read ({fault}); convert the image to sRGB") from fault
     assert converted is not None  # only in-place conversion returns None
     return converted

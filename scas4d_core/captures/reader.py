@@ -16,11 +16,10 @@ Files = Mapping[str, Path]
 
 
 class PictureReader(Protocol):
-    """Reads the images and masks of pinhole cameras by frame and camera, for training and test cameras.
+    """Interface for reading the images and masks of pinhole cameras, both training and test cameras.
 
-    Images have the size of their camera in the full rig, independent of the capture's `image_scale`. A reader keeps at
-    most
-    a few images per camera in memory, and decodes each image once if frames are read in order.
+    Images have the size of their camera in the full rig, regardless of the capture's `image_scale`. A reader keeps at
+    most a few images per camera in memory, and decodes each image once if frames are read in order.
     """
 
     @property
@@ -28,40 +27,43 @@ class PictureReader(Protocol):
         """Number of frames T."""
 
     def time(self, index: int) -> float | None:
-        """Returns the frame's time in seconds, strictly increasing, or None if only the frame rate is known."""
+        """Returns the timestamp of a frame in seconds, or None if only the frame rate is known.
+
+        Timestamps are strictly increasing.
+        """
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes an image, [H, W, 3] sRGB values.
+        """Returns a decoded image, [H, W, 3] sRGB values.
 
         Raises:
-            ImageError: the image cannot be decoded, or has another size than its camera.
+            ImageError: the image cannot be decoded, or its size differs from that of its camera.
         """
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """Returns whether the image has a mask."""
+        """Returns whether an image has a mask."""
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes a mask, [H, W], 1 on the foreground."""
+        """Returns a decoded mask, [H, W], 1 on the foreground."""
 
     def encoded_image(self, index: int, camera: str) -> bytes:
         """Returns an image as an 8-bit file that the service accepts: JPEG, PNG or WebP.
 
         Raises:
-            KeyError: no such camera.
+            KeyError: the camera does not exist.
             CaptureError: the file cannot be read.
         """
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns a mask as PNG or BMP, or None if there is none."""
+        """Returns a mask as a PNG or BMP file, or None if there is none."""
 
 
 class FileReader:
     """Reads one file per image, as in the Dynamic3DGaussians layout.
 
     Args:
-        images: [T] image files by camera name.
-        masks: [T] mask files by camera name; a camera may have no mask in a frame.
-        sizes: (width, height) that the files of each camera must have.
+        images: for each of T frames, maps camera names to image files.
+        masks: for each of T frames, maps camera names to mask files; a camera may have no mask in a frame.
+        sizes: maps each camera name to the required (width, height) of its files.
     """
 
     def __init__(self, images: Sequence[Files], masks: Sequence[Files], sizes: Mapping[str, Size]) -> None:
@@ -73,19 +75,19 @@ class FileReader:
         return None
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes an image, [H, W, 3]."""
+        """Returns a decoded image, [H, W, 3]."""
         return decode_image(self.images[index][camera], size=self._sizes[camera])
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """Returns whether the image has a mask file."""
+        """Returns whether an image has a mask file."""
         return camera in self.masks[index]
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes a mask, [H, W]."""
+        """Returns a decoded mask, [H, W]."""
         return decode_mask(self.masks[index][camera], size=self._sizes[camera])
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the unchanged file; 16-bit images are rounded to 8 bits."""
+        """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG."""
         return eight_bit_file(read_bytes(self.images[index][camera]), str(self.images[index][camera]))
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:

@@ -1,4 +1,4 @@
-"""Adapts cameras whose images have another size than calibrated. Needs only numpy."""
+"""Adapts the intrinsics of cameras whose images do not have the calibrated size. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.images import Size
 
 SizeMismatch = Literal["corner", "centre", "stretch"]
-"""How images with another aspect ratio than calibrated were produced.
+"""How images were produced whose aspect ratio differs from the calibrated one.
 
 ``corner``: cropped (or padded) at the right and bottom. ``centre``: cropped evenly on opposite sides. ``stretch``:
 resized by different factors along x and y.
@@ -20,9 +20,9 @@ resized by different factors along x and y.
 ROUNDING_PIXELS = 0.5
 """Tolerance per side when comparing aspect ratios, because resized sides are rounded to whole pixels."""
 MIN_RESIZE = 0.05
-"""Smallest relative size change that counts as resizing; a smaller change is cropping, which shifts the camera."""
+"""Minimum relative change of size that counts as resizing; a smaller change is treated as cropping."""
 CODEC_BLOCK = 16
-"""Video codecs pad both sides to a multiple of this. Some calibrations include the padding, such as 1088 for 1080."""
+"""Video codecs pad both sides to a multiple of this. Some calibrations include the padding, e.g. 1088 for 1080."""
 
 
 def adapt_intrinsics(
@@ -34,21 +34,21 @@ def adapt_intrinsics(
     where: str,
     size_mismatch: SizeMismatch | None = None,
 ) -> tuple[NDArray[np.float64], str | None]:
-    """Adapts intrinsics [3, 3] to images of another size than calibrated, and returns a remark about it.
+    """Adapts intrinsics to images whose size differs from the calibrated size, and describes the change.
 
     Images with the calibrated aspect ratio were resized, so the intrinsics are scaled. Images with another aspect ratio
     may have been cropped in several ways, so they are rejected unless `size_mismatch` is given.
 
     Args:
-        intrinsics: [3, 3] in pixels, with the principal point relative to the upper left corner.
-        calibrated: (width, height) that the intrinsics were calibrated for.
-        found: (width, height) of the images.
+        intrinsics: [3, 3] camera matrix in pixels, with the principal point relative to the upper left corner.
+        calibrated: (width, height) for which the camera was calibrated.
+        found: actual (width, height) of the images.
         camera: name of the camera, for messages.
         where: path of the image, for messages.
-        size_mismatch: how images with another aspect ratio were produced; None rejects them.
+        size_mismatch: how images with a different aspect ratio were produced; if None, they are rejected.
 
     Returns:
-        The intrinsics and the remark, which is None if the sizes are equal.
+        The adapted intrinsics, and a remark for the user, which is None if the sizes are equal.
 
     Raises:
         CaptureError: the aspect ratios differ and `size_mismatch` is None.
@@ -56,37 +56,37 @@ def adapt_intrinsics(
     >>> k = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
     >>> half, remark = adapt_intrinsics(k, (64, 48), (32, 24), camera="c", where="c.png")
     >>> half[0].tolist(), remark
-    ([50.0, 0.0, 16.0], "camera 'c': calibrated for 64x48, its pictures are 32x24: its intrinsics are scaled by 0.5")
+    ([50.0, 0.0, 16.0], "camera 'c': calibrated for 64x48, but images are 32x24: intrinsics scaled by 0.5")
     >>> adapt_intrinsics(k, (64, 48), (60, 48), camera="c", where="c.png", size_mismatch="centre")[0][0].tolist()
     [100.0, 0.0, 30.0]
     """
     if calibrated == found:
         return intrinsics, None
-    said = f"camera {camera!r}: calibrated for {calibrated[0]}x{calibrated[1]}, its pictures are {found[0]}x{found[1]}"
+    said = f"camera {camera!r}: calibrated for {calibrated[0]}x{calibrated[1]}, but images are {found[0]}x{found[1]}"
     ratio = np.array([found[0] / calibrated[0], found[1] / calibrated[1]])
     k = intrinsics.copy()
     if _same_aspect_ratio(calibrated, found) and abs(ratio.mean() - 1) > MIN_RESIZE:
         k[:2] *= ratio[:, None]
-        return k, f"{said}: its intrinsics are scaled by {ratio.mean():.4g}"
+        return k, f"{said}: intrinsics scaled by {ratio.mean():.4g}"
     if size_mismatch == "stretch":
         k[:2] *= ratio[:, None]
-        return k, f"{said}: its intrinsics are stretched by {ratio[0]:.5g} along x and {ratio[1]:.5g} along y"
+        return k, f"{said}: intrinsics stretched by {ratio[0]:.5g} along x and {ratio[1]:.5g} along y"
     if size_mismatch == "centre":
         k[:2, 2] += (np.array(found) - calibrated) / 2
-        return k, f"{said}: taken as cut evenly on opposite sides"
+        return k, f"{said}: treated as cropped evenly on opposite sides"
     if size_mismatch == "corner":
-        return k, f"{said}: taken as cut at the right and the bottom"
+        return k, f"{said}: treated as cropped at the right and bottom"
     padded = all(big == -(-small // CODEC_BLOCK) * CODEC_BLOCK for big, small in zip(calibrated, found, strict=True))
-    hint = " (a codec's padding to a multiple of 16, usually at the right and the bottom: --size-mismatch corner)"
+    hint = " (codec padding to a multiple of 16, usually at the right and bottom: --size-mismatch corner)"
     raise CaptureError(
         f"{where}: is {found[0]}x{found[1]} pixels, but camera {camera!r} was calibrated for "
-        f"{calibrated[0]}x{calibrated[1]}{hint if padded else ''}; give the pictures at that size, or say how they "
-        "came about: --size-mismatch corner (cut at the right and the bottom), centre (cut evenly) or stretch (resized)"
+        f"{calibrated[0]}x{calibrated[1]}{hint if padded else ''}; give images of that size, or specify how they "
+        "were produced: --size-mismatch corner (cropped at the right and bottom), centre (cropped evenly) or stretch"
     )
 
 
 def _same_aspect_ratio(calibrated: Size, found: Size) -> bool:
-    """Returns whether one scale factor maps both sides, up to rounding."""
+    """Returns whether a single scale factor maps one size to the other, up to rounding."""
     lowest = max((side - ROUNDING_PIXELS) / of for side, of in zip(found, calibrated, strict=True))
     highest = min((side + ROUNDING_PIXELS) / of for side, of in zip(found, calibrated, strict=True))
     return lowest <= highest

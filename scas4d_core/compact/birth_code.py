@@ -1,6 +1,7 @@
-"""Encodes Gaussians without a reference: those of the first frame, and those that are born later.
+"""Encodes Gaussians that have no reference state: those of the first frame, and those added later.
 
-Other frames refer to them, so thin axes must keep their direction: each axis is quantized relative to its own length.
+Later frames are coded relative to these Gaussians, so thin axes must keep their direction. Each axis is therefore
+quantized relative to its own length.
 """
 
 from __future__ import annotations
@@ -38,22 +39,22 @@ from scas4d_core.compact.sections import (
 Float = NDArray[np.float64]
 
 OCTAVE = 8
-"""Quantization steps of an axis length per factor of two."""
+"""Number of quantization steps per octave (factor of two) of axis length."""
 FINER = 4
-"""Divisor of the bounds of centres, axes and colours. They are coded once, and static Gaussians keep these errors."""
+"""Divisor of the bounds on centres, axes and colours, because static Gaussians keep their initial errors."""
 COARSEST = 0.02
-"""Maximum error of an axis, relative to its own length."""
+"""Maximum error of an axis relative to its own length."""
 SHORTEST = 1e-30
-"""Minimum length of an axis, in metres."""
+"""Minimum axis length, in metres."""
 TINIEST, LARGEST_SIZE = 1e-18, 1e18
-"""Range of sizes in metres; Gaussians outside it are coded exactly."""
+"""Range of quantizable sizes, in metres; Gaussians outside it are coded exactly."""
 OPAQUE = 1e-4
-"""Minimum distance of opacities from 0 and 1."""
+"""Minimum distance of a decoded opacity from 0 and 1."""
 COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3, "labels": 1, "opacities": 1}
 
 
 def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[bytes, Columns]:
-    """Encodes Gaussians with their ids and clusters; returns the bytes and the Gaussians as decoded by a reader.
+    """Encodes Gaussians, their ids and their clusters; returns the bytes, and the Gaussians as decoded by a reader.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Columns.of(Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1))
@@ -94,7 +95,7 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     steps, offset = unpack(body, count)
     labels, offset = unpack(body, count, offset)
     if labels.min(initial=0) < 0 or labels.max(initial=0) > MAX_CLUSTERS:
-        raise PlaneError(f"clusters {labels.min(initial=0)} to {labels.max(initial=0)} cannot be")
+        raise PlaneError(f"cluster labels {labels.min(initial=0)} to {labels.max(initial=0)} are out of range")
     coded = {}
     for name, components in COMPONENTS.items():
         coded[name], offset = read_residuals(body, offset, components, count)
@@ -104,13 +105,13 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     state = _columns(coded, np.cumsum(steps.astype(np.int64)), bounds)
     if with_gloss:
         if not 1 <= with_gloss <= count + 1:
-            raise PlaneError(f"{with_gloss - 1} of {count} Gaussians cannot have gloss")
+            raise PlaneError(f"invalid number of Gaussians with gloss: {with_gloss - 1} of {count}")
         planes, offset = read_residuals(body, offset, 3, int(with_gloss) - 1)
         state = state.replace(gloss=planes * np.float32(2 * bounds.gloss))
     environment, offset = read_array(body, offset)
     if offset != len(body):
-        raise PlaneError(f"{len(body) - offset} bytes follow the Gaussians")
-    values += np.float32(0)  # as in `Columns.replace_rows`
+        raise PlaneError(f"{len(body) - offset} unexpected bytes after the Gaussians")
+    values += np.float32(0)  # −0 becomes 0, as in `Columns.replace_rows`
     return apply_exact(state, rows, values, retired, environment), Clusters(labels.astype(np.int64))
 
 
@@ -119,7 +120,7 @@ def _axis_step(bounds: Bounds) -> float:
 
 
 def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
-    """Returns each attribute [P, N] in quantization steps; values may still be non-finite or too large."""
+    """Returns each attribute as [P, N] quantization steps, which may still be non-finite or too large."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         factors = state.factors.astype(np.float64).reshape(3, 3, -1)
         lengths = np.rint(OCTAVE * np.log2(np.maximum(np.sqrt(np.square(factors).sum(axis=0)), SHORTEST)))

@@ -1,4 +1,4 @@
-"""Error bounds of a compact file, per attribute."""
+"""Per-attribute error bounds of a compact file."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from scas4d_core.errors import InputError
 
 @dataclass(frozen=True)
 class Bounds:
-    """Maximum error per component of each attribute of a decoded state.
+    """Maximum error of a decoded state, per component of each attribute.
 
     A Gaussian's size is the root mean square of the lengths of its three axes. The defaults are the coarsest bounds at
-    which the five test objects lose less than 0.05 dB (figures in docs/format.md).
+    which the five test objects lose less than 0.05 dB (see docs/format.md).
 
     Attributes:
-        position: error of a centre, as a fraction of the Gaussian's size.
-        axes: error of an axis, as a fraction of the Gaussian's size.
-        rotation: angle error of the material rotation in radians.
-        colour: error of a colour channel in 0…1.
-        gloss: error of a gloss component.
-        opacity: error of an opacity in 0…1.
+        position: error of the centre, as a fraction of the Gaussian's size.
+        axes: error of each axis, as a fraction of the Gaussian's size.
+        rotation: angular error of the material rotation, in radians.
+        colour: error of each colour channel, whose range is 0…1.
+        gloss: error of each gloss component.
+        opacity: error of the opacity, whose range is 0…1.
 
     Raises:
         InputError: a bound is not between 1e-6 (rotation: 0.002) and 1.
@@ -30,7 +30,7 @@ class Bounds:
     0.1
     >>> Bounds(colour=0)
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: bound colour=0 is out of its range; give a number from 1e-06 to 1
+    scas4d_core.errors.InputError: bound colour=0 is out of range; give a number from 1e-06 to 1
     """
 
     position: float = 0.04
@@ -44,7 +44,7 @@ class Bounds:
         for item in fields(self):
             value, least = getattr(self, item.name), MIN_ROTATION if item.name == "rotation" else LEAST
             if not least <= value <= 1:
-                raise InputError(f"bound {item.name}={value} is out of its range", f"give a number from {least} to 1")
+                raise InputError(f"bound {item.name}={value} is out of range", f"give a number from {least} to 1")
 
     @property
     def rotation_step(self) -> float:
@@ -52,16 +52,16 @@ class Bounds:
         return 2 * self.rotation / 3**0.5
 
     def record(self) -> dict[str, float]:
-        """Returns the bounds by name, for the header of a file."""
+        """Returns the bounds as a dict for the file header."""
         return asdict(self)
 
     @classmethod
     def of_record(cls, given: Mapping[str, float]) -> Bounds:
-        """Returns the bounds stored in a header; names from later versions are ignored."""
+        """Creates bounds from the dict in a file header, ignoring names added by later versions."""
         return cls(**{item.name: float(given[item.name]) for item in fields(cls) if item.name in given})
 
 
 LEAST = 1e-6
-"""Smallest bound; float32 has no precision left below it."""
+"""Smallest allowed bound; finer steps would exceed the precision of float32."""
 MIN_ROTATION = 0.002
-"""Smallest rotation bound; with smaller steps, the values of a half turn would exceed the range of a plane."""
+"""Smallest allowed rotation bound; with smaller steps, a half turn would exceed the integer range of a plane."""

@@ -1,7 +1,7 @@
-"""One affine map per cluster of Gaussians predicts a state from the previous one.
+"""Predicts a state from the previous one with one affine map per cluster of Gaussians.
 
-As in the cascade, a map transforms centres (x → x + A (x − c) + t) and axes (F → (I + A) F). The polar rotation of I +
-A is applied to the material rotation. The remaining residual of each Gaussian is small. Needs only numpy.
+As in the cascade, a map transforms centres (x → x + A (x − c) + t) and axes (F → (I + A) F). Material rotations are
+multiplied by the rotation nearest to I + A. The remaining residual of each Gaussian is small. Requires only numpy.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ PER_CLUSTER, MAX_CLUSTERS = 100, 400
 More clusters would cost more bytes than they save (docs/format.md).
 """
 ROUNDS, SAMPLE = 5, 20_000
-"""Iterations of k-means, and number of Gaussians sampled to compute the centres."""
+"""Number of k-means iterations, and number of Gaussians sampled to compute the centres."""
 NO_CLUSTER = 0
 """Label of Gaussians without a cluster; clusters are numbered from 1."""
 SMALLEST = 1e-9
-"""Minimum size in metres when weighting Gaussians, which limits the weight of tiny ones."""
+"""Lower limit on sizes in metres when computing weights, so that tiny Gaussians do not dominate."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 """The identity quaternion."""
 RIDGE = 1e-3
-"""Ridge regularization of A, in units of the Gaussians' size, since a flat or thin cluster leaves A underdetermined."""
+"""Ridge regularization of A, in units of the Gaussians' size; a flat or thin cluster leaves A underdetermined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Clusters:
     """Clusters of Gaussians that share an affine motion.
 
     Attributes:
-        labels: [N] int64, 0 for static Gaussians, else 1 + the cluster index.
+        labels: [N] int64 label of each Gaussian: 0 if static, otherwise 1 + the cluster index.
 
     >>> clusters = Clusters(np.array([2, 0, 1, 2]))
     >>> clusters.count, clusters.means(np.array([[1.0, 5.0, 7.0, 3.0]]))
@@ -58,31 +58,31 @@ class Clusters:
         return int(self.labels.max(initial=0))
 
     def sums(self, columns: Iterable[NDArray[Any]]) -> Float:
-        """Returns the sum of each column [N] over each cluster, [P, count]."""
+        """Sums each column [N] over each cluster; returns [P, count]."""
         totals = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
         return np.array(totals, np.float64)
 
     @cached_property
     def sizes(self) -> Float:
-        """[count] number of Gaussians per cluster, at least 1."""
+        """[count] number of Gaussians in each cluster, at least 1."""
         return np.maximum(np.bincount(self.labels, minlength=self.count + 1)[1:], 1).astype(np.float64)
 
     def means(self, columns: NDArray[Any]) -> Float:
-        """Returns the means of columns [P, N] over each cluster, [P, count]."""
+        """Averages the columns [P, N] over each cluster; returns [P, count]."""
         return self.sums(columns) / self.sizes
 
     def spread(self, values: NDArray[Any], stands: float) -> Array:
-        """Returns the value [count] of each Gaussian's cluster as float32 [N]; static Gaussians get ``stands``."""
+        """Expands cluster values [count] to the Gaussians, [N] float32; static Gaussians get ``stands``."""
         table = np.empty(self.count + 1, np.float32)
         table[NO_CLUSTER], table[1:] = stands, values
         return table[self.labels]
 
     def rows(self, rows: NDArray[np.intp]) -> Clusters:
-        """Returns the labels of some rows. These must include all moving Gaussians, so that clusters do not change."""
+        """Returns the labels of a subset of rows, which must include all moving Gaussians to preserve the clusters."""
         return Clusters(self.labels[rows])
 
     def concatenate(self, labels: Ints) -> Clusters:
-        """Appends the labels of further Gaussians."""
+        """Appends the labels of additional Gaussians."""
         return Clusters(np.concatenate([self.labels, labels]))
 
     @classmethod
@@ -99,8 +99,8 @@ class Clusters:
         """Returns labels [B] of newborn Gaussians: the nearest cluster for moving ones, else 0.
 
         Args:
-            state: the Gaussians that ``labels`` belong to.
-            born: the newborn Gaussians.
+            state: existing Gaussians, to which ``labels`` apply.
+            born: newborn Gaussians.
         """
         labels = np.zeros(len(born), np.int64)
         moving = np.flatnonzero(born.moving)
@@ -115,8 +115,8 @@ class ClusterMotion:
     """One affine map per cluster.
 
     Attributes:
-        matrices: [K, 3, 3] A.
-        shifts: [K, 3] t in metres.
+        matrices: [K, 3, 3] matrix A of each cluster.
+        shifts: [K, 3] translation t of each cluster, in metres.
     """
 
     matrices: Float
@@ -137,12 +137,12 @@ class ClusterMotion:
         for (i, j), second_moments in zip(pairs, clusters.sums(weighted[i] * arms[j] for i, j in pairs), strict=True):
             moments[:, i, j] = moments[:, j, i] = second_moments
         right = clusters.sums(one * step for one in weighted for step in steps).reshape(4, 3, -1)
-        # A Gaussian's weight times its squared size is 1, so its own extent adds one unit of regularization.
+        # A Gaussian's weight times its squared size is 1, so each Gaussian contributes the ridge once.
         moments[:, range(3), range(3)] += RIDGE * clusters.sizes[:, None]
         moments[:, 3, 3] += 1e-12 + (moments[:, 3, 3] == 0)
         try:
             maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
-        except np.linalg.LinAlgError:  # near float64 overflow; fall back to residuals alone
+        except np.linalg.LinAlgError:  # near float64 overflow; code everything as residuals
             maps = np.zeros((clusters.count, 4, 3))
         maps[~np.isfinite(maps).all(axis=(1, 2))] = 0
         return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])
@@ -204,7 +204,7 @@ def quaternions_of(turns: Float) -> Float:
 
 
 def _k_means(points: Float, count: int) -> Ints:
-    """Returns the cluster of each point [N], from 0; the result is deterministic."""
+    """Returns the cluster index of each point, [N]; the result is deterministic."""
     draw = np.random.default_rng(0)
     sample = points if len(points) <= SAMPLE else points[draw.choice(len(points), SAMPLE, replace=False)]
     centres = sample[draw.choice(len(sample), count, replace=False)]
@@ -218,7 +218,7 @@ def _k_means(points: Float, count: int) -> Ints:
 
 
 def _nearest(points: Float, centres: Float, piece: int = 512) -> Ints:
-    """Returns the index of the nearest centre for each point, [N]; blocks that fit the cache are ten times faster."""
+    """Returns the index of the nearest centre of each point, [N]; processing in cache-sized blocks is 10× faster."""
     squares = np.square(centres).sum(axis=1)
     nearest = [
         np.argmin(squares - 2 * points[begin : begin + piece] @ centres.T, axis=1)

@@ -1,4 +1,4 @@
-"""A state stored by component as [components, N] arrays, a layout on which numpy is fast."""
+"""A state stored as one [components, N] array per attribute, a layout that numpy processes fast."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 LABELS = 64
-"""Number of levels of the learnt label; the threshold of moving Gaussians, 0.5, is between two levels."""
+"""Number of quantization levels of the learnt label; the threshold for moving Gaussians, 0.5, is between two levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,15 +23,15 @@ class Columns:
     """N Gaussians stored component by component. Arrays are shared between states and must not be modified.
 
     Attributes:
-        means: [3, N] in metres.
-        factors: [9, N], entries of F in row-major order.
-        rotations: [4, N] quaternions (w, x, y, z).
-        colours: [3, N].
-        foreground: [N] learnt labels.
-        ids: [N].
-        opacities: [N], including those of retired Gaussians.
-        retired: [N] bool.
-        gloss: [3, M] for the first M Gaussians, or None.
+        means: [3, N] centres in metres.
+        factors: [9, N] entries of F in row-major order.
+        rotations: [4, N] material rotations as quaternions (w, x, y, z).
+        colours: [3, N] RGB colours.
+        foreground: [N] learnt labels; Gaussians above 0.5 move.
+        ids: [N] Gaussian ids.
+        opacities: [N] opacities; retired Gaussians keep theirs.
+        retired: [N] bool, whether each Gaussian is retired.
+        gloss: [3, M] gloss of the first M Gaussians, or None.
         environment: environment map for reflections, or None.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
@@ -99,7 +99,7 @@ class Columns:
         )
 
     def from_row(self, count: int) -> Columns:
-        """Returns the Gaussians from row ``count`` on, without gloss."""
+        """Returns the Gaussians from row ``count`` onwards, without gloss."""
         rows = {name: getattr(self, name)[..., count:] for name in BY_ROW}
         return self.replace(**rows, gloss=None, environment=None)
 
@@ -117,11 +117,11 @@ class Columns:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[N] bool: Gaussians that move according to their label and are not retired."""
+        """[N] bool: whether each Gaussian moves according to its label and is not retired."""
         return np.asarray((self.foreground > 0.5) & ~self.retired)
 
     def sizes(self) -> Array:
-        """Returns the sizes [N] in metres: the root mean square of the lengths of the axes.
+        """Returns the size of each Gaussian in metres, [N]: the root mean square of the lengths of its axes.
 
         >>> Columns.of(Gaussians.of_points([[0, 0, 2]], radius=0.1)).sizes()
         array([0.1], dtype=float32)
@@ -129,7 +129,7 @@ class Columns:
         return sizes_of(self.factors)
 
     def volumes(self) -> Float:
-        """Returns the determinants of F, [N]."""
+        """Returns the determinant of each factor F, [N]."""
         a, b, c, d, e, f, g, h, i = self.factors.astype(np.float64)
         return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
@@ -137,11 +137,11 @@ class Columns:
 BY_ROW = ("means", "factors", "rotations", "colours", "foreground", "ids", "opacities", "retired")
 """Names of the arrays with one column per Gaussian."""
 SHAPED = BY_ROW[:3]
-"""Those arrays of `BY_ROW` that define position and shape."""
+"""Arrays of `BY_ROW` that define position and shape."""
 
 
 def sizes_of(factors: Array) -> Array:
-    """Returns the sizes [N] in metres of factors [9, N]."""
+    """Returns the sizes in metres, [N], of Gaussians with the given factors [9, N]."""
     squares = np.zeros(factors.shape[1], np.float32)
     for plane in factors:
         squares += plane * plane
@@ -149,7 +149,7 @@ def sizes_of(factors: Array) -> Array:
 
 
 def levels_of(labels: NDArray[Any]) -> NDArray[np.int32]:
-    """Returns the level 0…63 of each learnt label; labels above 0.5 have levels of 32 or more.
+    """Quantizes learnt labels to levels 0…63; labels above 0.5 get level 32 or higher.
 
     >>> levels_of(np.array([0.0, 0.5, 0.501, 1.0]))
     array([ 0, 31, 32, 63], dtype=int32)
@@ -164,16 +164,16 @@ def label_of(levels: NDArray[Any]) -> Array:
 
 
 def products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Returns the products a∘b of quaternions [4, N] by component; b is applied first."""
+    """Returns the quaternion products a∘b, [4, N]; b is applied first."""
     return np.stack(product_components(a, b))
 
 
 def multiply_rows(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) -> list[NDArray[Any]]:
-    """Multiplies one matrix per Gaussian with vectors or matrices; returns the components, each [N].
+    """Multiplies one 3×3 matrix per Gaussian by a vector or matrix; returns the components, each [N].
 
     Args:
-        rows: rows of the left matrices, three by three arrays [N].
-        planes: [3, N] vectors, or [9, N] matrices in row-major order.
+        rows: left matrices, as three rows of three arrays [N].
+        planes: [3, N] right vectors, or [9, N] right matrices in row-major order.
 
     >>> one, zero = np.ones(1), np.zeros(1)
     >>> multiply_rows([[zero, one, zero], [one, zero, zero], [zero, zero, one]], np.array([[5.0], [6], [7]]))
@@ -188,7 +188,7 @@ def multiply_rows(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) 
 
 
 def decorrelate_colours(colours: NDArray[Any]) -> NDArray[Any]:
-    """Returns green, red − green and blue − green, [3, N], since the channels are correlated.
+    """Converts RGB to green, red − green and blue − green, [3, N], because the channels are correlated.
 
     >>> decorrelate_colours(np.array([[5], [3], [2]])).ravel(), restore_colours(np.array([[3], [2], [-1]])).ravel()
     (array([ 3,  2, -1]), array([5, 3, 2]))
@@ -210,7 +210,7 @@ def relative_rotations(after: Array, before: Array) -> Float:
 
 
 def rotation_vectors(turns: NDArray[Any]) -> NDArray[Any]:
-    """Returns 2 tan(θ/2) times the axis of each rotation [4, N], as [3, N]; the length is close to θ for small θ."""
+    """Converts rotations [4, N] to vectors [3, N]: 2 tan(θ/2) times the axis, with length near θ for small angles."""
     w = turns[0]
     return np.asarray(turns[1:] * (2 * np.where(w < 0, -1, 1) / np.maximum(np.abs(w), 1e-6)))
 

@@ -1,4 +1,4 @@
-"""Encoder state at the end of a compact file, from which a writer resumes an interrupted file."""
+"""Encoder state at the end of a compact file, from which a writer can resume."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from scas4d_core.compact.records import Record
 
 @dataclass(frozen=True, eq=False)
 class EncoderState:
-    """State from which a writer continues a file.
+    """State that a writer needs to continue a file.
 
     Attributes:
         head: header of the file.
-        records: records up to the last state.
+        records: all records up to the last state.
         record: record of the last state.
-        state: the last state as decoded.
+        state: last state, as decoded.
         born: all Gaussians so far, as decoded from their birth records.
-        clusters: clusters of all Gaussians so far.
+        clusters: clusters of these Gaussians.
         since_key: number of states since the last key frame.
     """
 

@@ -1,7 +1,7 @@
-"""Encodes one state against a reference state known to the reader: cluster motion, and residuals per Gaussian.
+"""Encodes a state relative to a reference state that the reader also has: cluster motion, and residuals per Gaussian.
 
-The reference is a decoded state, so errors do not accumulate: the next frame corrects the errors of the previous one.
-Needs only numpy.
+The reference is a decoded state, so errors do not accumulate: each frame corrects the errors of the previous one.
+Requires only numpy.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 MIN_VOLUME_RATIO = 0.1
-"""Bound on the ratio of decoded to true volume; outside this ratio and its inverse, a Gaussian is coded exactly.
+"""Minimum ratio of decoded to true volume; its inverse is the maximum. Other Gaussians are coded exactly.
 
 This affects thin Gaussians whose axis error is as large as the axis: they would lose their volume or be inverted.
 """
 SLACK = 1 + 1e-4
-"""Tolerance factor on bounds, for float32 rounding."""
+"""Factor by which bounds are relaxed to allow for float32 rounding."""
 SHIFT_STEP = 0.5
-"""Quantization step of a cluster's translation, relative to the median step of a centre."""
+"""Quantization step of a cluster's translation, relative to the median step of the moving Gaussians' centres."""
 LARGEST_STEP = 1e90
-"""Exclusive upper bound on valid steps; larger ones would produce non-finite states."""
+"""Exclusive upper bound on valid steps; larger steps would produce non-finite states."""
 COARSEST = 0.01
 """Maximum quantization step of A."""
 _STEPS = struct.Struct("<dd")
-"""Steps of A and t."""
+"""Quantization steps of A and t."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class EncodedFrame:
     """An encoded state, and the state as decoded by a reader.
 
     Attributes:
-        body: the encoded bytes.
-        decoded: the state as decoded by a reader.
-        errors: the largest error of each attribute, in the units of ``Bounds``.
+        body: encoded bytes.
+        decoded: state as decoded by a reader.
+        errors: largest error of each attribute, in the units of ``Bounds``.
     """
 
     body: bytes
@@ -69,9 +69,9 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     """Encodes a state that has the same Gaussians as the reference.
 
     Args:
-        reference: [N] reference Gaussians, as decoded by the reader.
-        state: [N] exact Gaussians.
-        clusters: clusters of the N Gaussians.
+        reference: reference state of N Gaussians, as decoded by the reader.
+        state: exact state of the same Gaussians.
+        clusters: clusters of these Gaussians.
         bounds: error bounds.
 
     >>> from scas4d_core.gaussians import Gaussians
@@ -124,12 +124,12 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
 
 @dataclass(frozen=True, eq=False)
 class FrameDelta:
-    """The changes encoded in the body of one state.
+    """The changes encoded in the body of a state record.
 
     Attributes:
         steps: quantization steps of A and t.
-        motion: [12, clusters] A and t in these steps.
-        residuals: rows [R] and quantized residuals [P, R] of each attribute.
+        motion: [12, clusters] A and t of each cluster, in quantization steps.
+        residuals: maps each attribute to its coded rows [R] and their quantized residuals [P, R].
         rows, values: exactly coded rows [E] and their values [12, E].
         retired, environment: new values, or None if unchanged.
     """
@@ -144,20 +144,20 @@ class FrameDelta:
 
     @classmethod
     def read(cls, body: bytes, reference: Columns, clusters: Clusters) -> FrameDelta:
-        """Parses the body of a state.
+        """Parses the body of a state record.
 
         Args:
-            body: the encoded bytes.
-            reference, clusters: reference state and clusters of the same Gaussians.
+            body: encoded bytes.
+            reference, clusters: reference state, and clusters of its Gaussians.
 
         Raises:
-            PlaneError: the bytes are not such a state.
+            PlaneError: the bytes are not a valid state of these Gaussians.
         """
         if len(body) < _STEPS.size:
-            raise PlaneError(f"{len(body)} bytes are no state")
+            raise PlaneError(f"{len(body)} bytes are too few for a state")
         steps = _STEPS.unpack_from(body)
         if not (np.abs(steps) < LARGEST_STEP).all():
-            raise PlaneError(f"steps {steps} cannot be")
+            raise PlaneError(f"quantization steps {steps} are out of range")
         offset, motion = _STEPS.size, np.zeros((12, clusters.count), np.int64)
         for plane in motion:
             plane[:], offset = unpack(body, clusters.count, offset)
@@ -169,19 +169,19 @@ class FrameDelta:
         retired, offset = read_mask(body, offset, len(reference))
         environment, offset = read_array(body, offset)
         if offset != len(body):
-            raise PlaneError(f"{len(body) - offset} bytes follow the state")
+            raise PlaneError(f"{len(body) - offset} unexpected bytes after the state")
         return cls(steps, motion, residuals, rows, values, retired, environment)
 
     def apply_shape(
         self, state: Columns, clusters: Clusters, bounds: Bounds, places: NDArray[np.intp] | None
     ) -> Columns:
-        """Applies the changes of centres, axes and rotations to a state; gloss rotates with its cluster.
+        """Applies the changes to centres, axes and rotations; gloss rotates with its cluster.
 
         Args:
-            state: reference Gaussians, possibly a subset.
+            state: reference Gaussians, or a subset of them.
             clusters: clusters of these Gaussians.
             bounds: error bounds.
-            places: column of ``state`` for each coded row; None if they are identical.
+            places: maps each reference row to its column in ``state``; None if ``state`` contains all rows.
         """
         partial = DecodedState.of(bounds, _predict(state, clusters, self.motion, self.steps))
         for name in SHAPE:
@@ -191,7 +191,7 @@ class FrameDelta:
         return apply_exact(partial.state, self.rows if places is None else places[self.rows], self.values)
 
     def apply_appearance(self, state: Columns, bounds: Bounds) -> Columns:
-        """Applies all other changes to a state."""
+        """Applies the remaining changes: appearance, retirement and environment."""
         partial = DecodedState(bounds, state, np.zeros(0, np.float32))
         for name in appearance_attributes(state):
             partial = partial.apply_residual(name, scattered(*self.residuals[name], coded_shape(state, name)[1]))
@@ -199,22 +199,22 @@ class FrameDelta:
 
 
 def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) -> Columns:
-    """Decodes an encoded state.
+    """Decodes a state encoded by ``encode``.
 
     Args:
         reference, clusters, bounds: the same values as passed to ``encode``.
-        body: the encoded bytes.
+        body: encoded bytes.
 
     Raises:
-        PlaneError: the bytes are not such a state.
+        PlaneError: the bytes are not a valid state of these Gaussians.
     """
     return apply_deltas(reference, clusters, bounds, [FrameDelta.read(body, reference, clusters)])
 
 
 def apply_deltas(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[FrameDelta]) -> Columns:
-    """Applies several changes of the same Gaussians in order.
+    """Applies successive changes to the same Gaussians.
 
-    Gaussians whose shape is not coded by any change are skipped.
+    Only Gaussians in a cluster, or with coded shape changes, are processed for shape.
     """
     if _codes_all_rows(reference, clusters):
         for change in changes:
@@ -241,7 +241,7 @@ def errors_of(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _shape_errors(decoded: Columns, state: Columns) -> dict[str, Array]:
-    """Returns the error of each Gaussian [N] in centre, axes and rotation."""
+    """Returns the errors of each Gaussian's centre, axes and rotation, each [N]."""
     sizes = np.maximum(state.sizes(), np.float32(1e-12))
     turns = rotation_vectors(relative_rotations(state.rotations, decoded.rotations))
     return {
@@ -252,7 +252,7 @@ def _shape_errors(decoded: Columns, state: Columns) -> dict[str, Array]:
 
 
 def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
-    """Returns the largest errors of the appearance attributes."""
+    """Returns the largest error of each appearance attribute."""
 
     def largest(found: Array, true: Array) -> float:
         return float(np.abs(found - true).max(initial=0))
@@ -267,17 +267,17 @@ def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _codes_all_rows(reference: Columns, clusters: Clusters) -> bool:
-    """Returns whether all rows are coded: if all move or any has gloss, searching static rows would only cost time."""
+    """Returns whether all rows are coded; if all move or there is gloss, looking for static rows would waste time."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 
 def _changing(
     reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds
 ) -> tuple[NDArray[np.intp] | None, dict[str, float]]:
-    """Returns the Gaussians [E] whose shape or position is coded, because they move or exceed the bounds; None for all.
+    """Finds the Gaussians whose shape or position must be coded because they move or exceed the bounds.
 
     Returns:
-        The rows, and the largest errors of the other Gaussians.
+        Their rows [E], or None for all rows; and the largest error of each attribute over the other Gaussians.
     """
     if _codes_all_rows(reference, clusters):
         return None, {}
@@ -289,14 +289,14 @@ def _changing(
 
 
 def _predict(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], steps: tuple[float, float]) -> Columns:
-    """Moves the reference with its clusters."""
+    """Predicts a state by moving the reference with its clusters."""
     table = planes.T.astype(np.float64)
     motion = ClusterMotion(table[:, :9].reshape(-1, 3, 3) * steps[0], table[:, 9:] * steps[1])
     return motion.predict(clusters, reference)
 
 
 def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[float, float]:
-    """Returns the steps of A and t, chosen so that each moves a Gaussian by a fraction of its own step."""
+    """Returns the quantization steps of A and t; each moves a Gaussian by a fraction of its own position step."""
     moving = clusters.labels > 0
     if not moving.any():
         return 1.0, 1.0
@@ -307,7 +307,7 @@ def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[floa
 
 
 def _out_of_bounds(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.bool_]:
-    """Returns which Gaussians [N] exceed the bounds of centre or axes, or lose their volume."""
+    """Returns [N] bool: whether each Gaussian exceeds the bounds on centre or axes, or loses its volume."""
     sizes = true.sizes()
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(found.factors - true.factors).max(axis=0) <= SLACK * bounds.axes * sizes
@@ -316,7 +316,7 @@ def _out_of_bounds(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.
 
 
 def lost_volume(found: Columns, true: Columns) -> NDArray[np.bool_]:
-    """Returns which Gaussians [N] have a decoded volume that differs too much from a nonzero true volume."""
+    """Returns [N] bool: whether each Gaussian's decoded volume differs too much from a nonzero true volume."""
     with np.errstate(over="ignore", invalid="ignore"):
         volumes, volumes_decoded = true.volumes(), found.volumes()
         low, high = (
@@ -333,12 +333,12 @@ def apply_exact(
     retired: NDArray[np.bool_] | None = None,
     environment: Array | None = None,
 ) -> Columns:
-    """Applies exactly coded values: centres and axes [12, E] of some rows, the retired mask and the environment.
+    """Applies exactly coded values: centres and axes of some rows, the retired mask and the environment.
 
     Args:
-        state: the state to change.
-        rows, values: rows and their values; None for no rows.
-        retired, environment: new values; None keeps those of the state.
+        state: state to change.
+        rows, values: rows [E], and their centres and axes [12, E]; None for no rows.
+        retired, environment: new values; None keeps the current ones.
     """
     if rows is not None and values is not None and len(rows):
         means, factors = state.means.copy(), state.factors.copy()

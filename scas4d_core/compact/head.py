@@ -1,4 +1,4 @@
-"""The header of a compact file, which defines the meaning of its numbers. It is JSON, readable from any language."""
+"""The header of a compact file: JSON metadata that defines how its numbers are interpreted."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class FileHeader:
-    """Metadata of a whole file.
+    """Metadata that applies to a whole file.
 
     Attributes:
         world: transform from the user's world to the world of the states.
-        bounds: error bounds of every state.
+        bounds: error bounds of all states.
         background: background colour, RGB in 0…1.
         rig: cameras in the user's world, or None if unknown.
         frames_per_second: nominal frame rate, or None if unknown; each frame has its own time.
-        metadata: JSON values about the file.
+        metadata: additional JSON values about the file.
 
     >>> head = FileHeader(WorldFrame(np.zeros(3)))
     >>> FileHeader.read(head.text(), "a file").bounds == head.bounds
@@ -68,7 +68,7 @@ class FileHeader:
 
         Raises:
             FileError: the text is not a valid header.
-            FormatError: the file has another version of the format.
+            FormatError: the file has an unsupported format version.
         """
         try:
             record = json.loads(text)
@@ -98,7 +98,7 @@ class FileHeader:
                 dict(record["metadata"]),
             )
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise FileError(f"{name}: its head lacks something or is wrong ({error})") from None
+            raise FileError(f"{name}: the header is incomplete or invalid ({error})") from None
 
 
 def _camera_record(camera: Camera) -> dict[str, Any]:

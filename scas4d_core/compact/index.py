@@ -18,7 +18,7 @@ _FOOTER = struct.Struct("<Q8s")
 """Last bytes of the file: offset of the index record, and magic bytes."""
 _COUNT = struct.Struct("<I")
 NO_INDEX = (ValueError, TypeError, OverflowError, RecursionError, struct.error, zstandard.ZstdError)
-"""Exceptions raised by bytes that are not a valid index; the reader then scans the records."""
+"""Exceptions raised when parsing an invalid index; the reader then scans the records instead."""
 _ROW = np.dtype(
     [("kind", "u1"), ("frame", "<i8"), ("time", "<f8"), ("offset", "<u8"), ("size", "<u4"), ("checksum", "<u4")]
 )

@@ -1,7 +1,7 @@
-"""Encodes integers as bytes: planes of small values, packed to 2, 4 or 8 bits with escapes, then zstandard.
+"""Encodes integers as bytes: small values are packed to 2, 4 or 8 bits with escapes, then compressed with zstandard.
 
 A plane is one component of an attribute over all rows, mostly zeros and ones. Zstandard's Huffman coder spends at least
-one bit per byte, so values with less than a bit of entropy are first packed several to a byte.
+one bit per byte, so values with less than one bit of entropy are first packed, several to a byte.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ Ints = NDArray[np.int32]
 Unsigned = NDArray[np.uint32]
 
 LEVEL = 3
-"""Compression level of zstandard; higher levels take several times as long and save one to two percent."""
+"""Zstandard compression level; higher levels take several times as long and save one to two percent."""
 NARROW = (2, 4, 8)
-"""Possible bits per value; 0 marks a plane of zeros."""
+"""Possible numbers of bits per value; 0 marks an all-zero plane."""
 WIDE = 16
 """Mode of a plane that is split in two: the low bytes, and a plane of the remaining bits."""
 ESCAPE = 24
 """Approximate cost of an escaped value in bits: four bytes, of which one or two are nonzero."""
 MOST = 1 << 31
-"""Exclusive upper bound on the absolute value of a number."""
+"""Exclusive upper bound on the absolute value of an encoded integer."""
 _HEAD = struct.Struct("<BII")
-"""Mode, number of escapes, and number of bytes that follow (in a wide plane, of its low bytes)."""
+"""Mode, number of escapes, and size in bytes of the data that follows (in a wide plane, of its low bytes)."""
 
 
 class PlaneError(ValueError):
@@ -42,7 +42,7 @@ def pack(values: NDArray[Any]) -> bytes:
     """
     numbers = np.asarray(values)
     if len(numbers) and (int(numbers.max()) >= MOST or int(numbers.min()) <= -MOST):
-        raise OverflowError(f"values of a plane are below {MOST} in size, and one of these is not")
+        raise OverflowError(f"values of a plane must be below {MOST} in absolute value")
     small = numbers.astype(np.int32)
     folded = np.empty(len(small), np.uint32)
     folded[:] = ((small << 1) ^ (small >> 31)).view(np.uint32)
@@ -74,7 +74,7 @@ def unpack(data: bytes | memoryview, count: int, offset: int = 0) -> tuple[Ints,
 
 
 def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> tuple[Unsigned, int]:
-    """Decodes unsigned values; ``wider`` is the number of bytes that a value may still have."""
+    """Decodes unsigned values; ``wider`` limits how many more planes may be nested."""
     if len(data) < offset + _HEAD.size:
         raise PlaneError(f"the data ends at byte {len(data)}, within a plane")
     bits, escapes, size = _HEAD.unpack_from(data, offset)
@@ -83,7 +83,7 @@ def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> 
         return np.zeros(count, np.uint32), offset
     end = offset + size
     if bits not in (*NARROW, WIDE) or escapes > count or len(data) < end or wider == 0:
-        raise PlaneError(f"a plane of {bits} bits, {escapes} escapes and {size} bytes cannot be at byte {offset}")
+        raise PlaneError(f"invalid plane of {bits} bits, {escapes} escapes and {size} bytes at byte {offset}")
     if bits == WIDE:
         low = np.frombuffer(decompress(data[offset:end], count), np.uint8)
         high, end = _unpacked(data, count, end, wider - 1)
@@ -95,7 +95,7 @@ def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> 
     if escapes:
         escaped = np.flatnonzero(small == (1 << bits) - 1)
         if len(escaped) != escapes:
-            raise PlaneError(f"a plane has {len(escaped)} escapes, its head says {escapes}")
+            raise PlaneError(f"a plane has {len(escaped)} escapes, but its header declares {escapes}")
         unsigned[escaped] = np.frombuffer(body, "<u4", escapes, packed)
     return unsigned, end
 
@@ -106,19 +106,19 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(data: bytes | memoryview, size: int) -> bytes:
-    """Decompresses a zstandard frame of ``size`` bytes.
+    """Decompresses a zstandard frame that contains exactly ``size`` bytes.
 
     Raises:
-        PlaneError: the frame has another size, or is damaged. At most ``size`` bytes are allocated.
+        PlaneError: the frame contains a different number of bytes, or is damaged. At most ``size`` bytes are allocated.
     """
     try:
         if zstandard.frame_content_size(data) != size:
-            raise PlaneError(f"{zstandard.frame_content_size(data)} bytes where {size} belong")
+            raise PlaneError(f"{zstandard.frame_content_size(data)} bytes instead of {size}")
         content: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     except zstandard.ZstdError as error:
         raise PlaneError(f"not a zstandard frame ({error})") from None
     if len(content) != size:
-        raise PlaneError(f"{len(content)} bytes where {size} belong")
+        raise PlaneError(f"{len(content)} bytes instead of {size}")
     return content
 
 
@@ -139,7 +139,7 @@ def _bits(unsigned: Unsigned) -> int:
 
 
 def _joined(small: NDArray[np.uint8], bits: int) -> NDArray[np.uint8]:
-    """Packs values of ``bits`` bits several to a byte, the first in the lowest bits."""
+    """Packs several values of ``bits`` bits into each byte, the first in the lowest bits."""
     per_byte = 8 // bits
     if per_byte == 1:
         return small

@@ -1,4 +1,4 @@
-"""Reads a compact file, even while it is being written or if it was truncated. Needs only numpy and zstandard."""
+"""Reads a compact file, even while it is being written or if it was truncated. Requires only numpy and zstandard."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 
 STATES = (RecordKind.KEY, RecordKind.DELTA)
 AT_ONCE = 8
-"""Maximum number of states decoded at a time."""
+"""Maximum number of states decoded together."""
 MAX_PER_BYTE = 4
-"""Maximum number of Gaussians per byte, so that a wrong count cannot exhaust the memory."""
+"""Maximum plausible number of Gaussians per byte, so that a corrupt count cannot exhaust memory."""
 
 
 class CompactReader:
@@ -50,10 +50,10 @@ class CompactReader:
         path: path of the file.
 
     Attributes:
-        head: world transform, bounds, background and cameras.
-        damage: description of damage after which no frames are listed, or None.
-        about: values about the whole file from the index, such as the largest ``errors`` by attribute; empty without an
-            index.
+        head: header with the world transform, bounds, background and cameras.
+        damage: description of the damage after which no frames are listed, or None.
+        about: values about the whole file from its index, such as the largest error of each attribute (``errors``);
+            empty without an index.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -96,7 +96,7 @@ class CompactReader:
                 self.refresh()
             if not self._records or self._records[0].kind is not RecordKind.HEAD:
                 raise FileError(
-                    f"{self.path.name}: its head is not there{self._why()}; it was cut, or is not written yet"
+                    f"{self.path.name}: the header is missing{self._why()}; it was truncated or not yet written"
                 )
             self.head = FileHeader.read(read_body(self._file, self._records[0], self.path.name), self.path.name)
         except BaseException:
@@ -140,7 +140,7 @@ class CompactReader:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """[T] times in seconds, in the order of ``frames``."""
+        """[T] frame times in seconds, in the order of ``frames``."""
         return np.array([record.time for record in self._states], np.float64)
 
     @property
@@ -149,7 +149,7 @@ class CompactReader:
         return sum(self._born_count(record) for record in self._births)
 
     def state(self, index: int) -> Gaussians:
-        """Returns the state of a frame in the world of ``head.world``. Its arrays must not be modified.
+        """Returns the state of a frame in the internal world of ``head.world``. Its arrays must not be modified.
 
         Raises:
             FileError: the file has no such frame.
@@ -158,7 +158,7 @@ class CompactReader:
         place = bisect_right(self._frames, index) - 1
         if place < 0 or self._frames[place] != index:
             held = f"{self._frames[0]} to {self._frames[-1]}" if self._frames else "none"
-            raise FileError(f"{self.path.name}: frame {index} is not in the file{self._why()}; it has frames: {held}")
+            raise FileError(f"{self.path.name}: frame {index} is not in the file{self._why()}; it has frames {held}")
         begin = place
         while (
             self._states[begin].kind is RecordKind.DELTA and begin > 0 and not (self._last and self._last[0] == begin)
@@ -181,8 +181,7 @@ class CompactReader:
 
         Returns:
             The copied frames, up to the first damaged one. They include this file's first frame and the key frame
-            before
-            ``first``, on which the others depend.
+            before ``first``, on which the others depend.
 
         Raises:
             FileError: no frame is in the range.
@@ -211,14 +210,14 @@ class CompactReader:
         return copied
 
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
-        """Returns the part of each Gaussian [N], −1 for none, as last stored up to a frame; None if there is none."""
+        """Returns the part label of each Gaussian [N], −1 for none, last stored up to a frame; None if not stored."""
         records = [record for record in self._parts if index is None or record.frame <= index]
         if not records:
             return None
         body = read_body(self._file, records[-1], self.path.name)
         count = int.from_bytes(body[:4], "little")
         if count > self.count:
-            raise self._damaged(records[-1], PlaneError(f"parts of {count} Gaussians, there are {self.count}"))
+            raise self._damaged(records[-1], PlaneError(f"parts of {count} Gaussians, but only {self.count} exist"))
         try:
             return unpack(body, count, 4)[0].astype(np.int64) - 1
         except PlaneError as error:
@@ -251,7 +250,7 @@ class CompactReader:
         return min(one.offset - HEAD_SIZE for one in self._records if one.frame >= index)
 
     def note(self, index: int) -> dict[str, Any]:
-        """Returns the note on a frame as JSON values; empty if there is none.
+        """Returns the note on a frame as a dict of JSON values, empty if there is none.
 
         Raises:
             DamagedFileError: the note is damaged.
@@ -289,11 +288,11 @@ class CompactReader:
         return -1 if state.kind is RecordKind.BORN else sum(birth.frame <= state.frame for birth in self._births)
 
     def _decoded(self, places: list[int], before: Columns | None) -> Columns:
-        """Decodes consecutive states of the same Gaussians and returns the last; only the first of them may be a key.
+        """Decodes consecutive states of the same Gaussians; returns the last. Only the first may be a key frame.
 
         Args:
-            places: positions of the states.
-            before: the state before them, if decoded.
+            places: indices of the states, in file order.
+            before: previous state, or None if it is not decoded.
         """
         first = self._states[places[0]]
         born, clusters = self._newborn_until(first.frame)
@@ -310,13 +309,13 @@ class CompactReader:
             raise self._damaged(self._states[places[-1]], error) from None
 
     def _change(self, place: int, reference: Columns, clusters: Clusters) -> FrameDelta:
-        """Decodes the changes in the record of a state."""
+        """Parses the changes in the record of a state."""
         record = self._states[place]
         body = read_body(self._file, record, self.path.name)
         if record.kind is RecordKind.DELTA:
             expected = checksum_bytes(self._states[place - 1])
             if body[: len(expected)] != expected:
-                raise self._damaged(record, PlaneError("the state before it is another one"))
+                raise self._damaged(record, PlaneError("it was coded against a different previous state"))
             body = body[len(expected) :]
         try:
             return FrameDelta.read(body, reference, clusters)
@@ -349,7 +348,7 @@ class CompactReader:
         return int.from_bytes(self._file.read(4), "little")
 
     def _counted(self, body: bytes, record: Record) -> int:
-        """Returns the Gaussian count at the start of a body, after a plausibility check against its size."""
+        """Returns the Gaussian count at the start of a body, after a plausibility check against the body size."""
         count = int.from_bytes(body[:4], "little")
         if len(body) < 4 or count > MAX_PER_BYTE * len(body) + 1024:
             raise self._damaged(record, PlaneError(f"{count} Gaussians in {len(body)} bytes"))

@@ -1,7 +1,7 @@
-"""Records of a compact file: a header with checksum, so that files are listed without reading bodies, and a body.
+"""Records of a compact file: a checksummed header, which suffices to list the records, and a body.
 
-A file can be read while it is written: an incomplete record at its end is ignored. Damage before that is reported with
-its offset.
+A file can be read while it is being written: an incomplete record at its end is ignored. Damage before that is reported
+with its offset.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ _CHECKSUM = struct.Struct("<I")
 HEAD_SIZE = _HEAD.size + _CHECKSUM.size
 COUNT_BYTES = 4
 LONGEST = 1 << 24
-"""Maximum size of a note's text in bytes, so that a damaged file cannot exhaust the memory."""
+"""Maximum size of a note's text in bytes, so that a damaged file cannot exhaust memory."""
 
 
 class RecordKind(IntEnum):
-    """Kinds of records, by the content of their body."""
+    """Kinds of records, which differ in the content of the body."""
 
     HEAD = 1
     """JSON: version, world, bounds."""
     BORN = 2
     """Gaussians coded without a reference: those of the first frame, or newborn ones."""
     KEY = 3
-    """A key state, coded against the birth records of its Gaussians."""
+    """A key state, coded relative to the birth records of its Gaussians."""
     DELTA = 4
-    """A state, coded against the previous one."""
+    """A state coded relative to the previous one."""
     PARTS = 5
     """The part label of each Gaussian."""
     INDEX = 6
     """Offsets of all records; the last record of a file."""
     NOTE = 7
-    """JSON about the frame whose state follows next."""
+    """JSON about the frame whose state follows."""
 
 
 class FileError(ValueError):
-    """Raised if a file is not a compact file, or has another version; the message names the file and the problem."""
+    """Raised if a compact file cannot be read or written; the message names the file and the problem."""
 
 
 class FormatError(FileError):
-    """Raised if a compact file has another format version; the file is left unchanged."""
+    """Raised if a compact file has an unsupported format version; the file is left unchanged."""
 
 
 class DamagedFileError(FileError):
-    """Raised if a compact file has damaged bytes; the message names the file and the offset."""
+    """Raised if a compact file is damaged; the message names the file and the offset."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Record:
     """Location of a record in a file.
 
     Attributes:
-        kind: kind of the body.
-        frame: frame index, −1 for none.
+        kind: kind of the record.
+        frame: frame index, or −1 for none.
         time: time in seconds.
         offset: offset of the body in the file.
         size: size of the body in bytes.
@@ -85,7 +85,7 @@ class Record:
         return self.offset + self.size
 
     def at(self, offset: int) -> Record:
-        """Returns the record with its header at the given file offset."""
+        """Returns a copy of the record whose header is at the given file offset."""
         return replace(self, offset=offset + HEAD_SIZE)
 
 
@@ -103,12 +103,12 @@ def record_bytes(kind: RecordKind, body: bytes, frame: int = -1, time: float = 0
 
 
 def checksum_bytes(record: Record) -> bytes:
-    """Returns the checksum of a record's body; a delta starts with that of the previous state."""
+    """Returns the checksum of a record's body as bytes; a delta begins with the checksum of the previous state."""
     return _CHECKSUM.pack(record.checksum)
 
 
 def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
-    """Yields the complete records from an offset on, ignoring an incomplete one at the end.
+    """Yields the complete records from an offset onwards; an incomplete record at the end is ignored.
 
     Args:
         file: the open file.
@@ -116,14 +116,14 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
         name: name of the file, for messages.
 
     Raises:
-        DamagedFileError: the bytes where a record should begin are not a record.
+        DamagedFileError: there is no valid record where one should begin.
     """
     file.seek(0, 2)
     size = file.tell()
     while offset + HEAD_SIZE <= size:
         file.seek(offset)
         data = file.read(HEAD_SIZE)
-        if not any(data) and _is_zero(file):  # after a power cut, the file's length may be on disk without its data
+        if not any(data) and _is_zero(file):  # after a power failure, the end of a file may be zeros
             return
         record = parse_head(data, offset, name)
         if record.end > size:
@@ -133,7 +133,7 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
 
 
 def _is_zero(file: BinaryIO) -> bool:
-    """Returns whether only zeros follow."""
+    """Returns whether the rest of the file is zero."""
     while piece := file.read(1 << 20):
         if any(piece):
             return False
@@ -165,7 +165,7 @@ def parse_head(data: bytes, offset: int, name: str) -> Record:
         raise DamagedFileError(f"{name}: no record begins at byte {offset}; the file is damaged there")
     _, kind, frame, time, size, checksum = _HEAD.unpack(head)
     if kind not in RecordKind.__members__.values():
-        raise FileError(f"{name}: a record of kind {kind} is at byte {offset}; a later version of scas4d wrote it")
+        raise FileError(f"{name}: unknown record kind {kind} at byte {offset}; a later version of scas4d wrote it")
     return Record(RecordKind(kind), frame, time, offset + HEAD_SIZE, size, checksum)
 
 
@@ -199,7 +199,7 @@ def note_bytes(note: Mapping[str, Any]) -> bytes:
     """
     text = json.dumps(dict(note), allow_nan=False).encode()
     if len(text) > LONGEST:
-        raise ValueError(f"a note of {len(text)} bytes is too long; {LONGEST} are the most")
+        raise ValueError(f"a note of {len(text)} bytes is too long; the maximum is {LONGEST}")
     return len(text).to_bytes(COUNT_BYTES, "little") + compress(text)
 
 
@@ -211,7 +211,7 @@ def read_note(body: bytes) -> dict[str, Any]:
     """
     size = int.from_bytes(body[:COUNT_BYTES], "little")
     if len(body) <= COUNT_BYTES or size > LONGEST:
-        raise PlaneError(f"a note of {size} bytes in {len(body)}")
+        raise PlaneError(f"invalid note of {size} bytes in a body of {len(body)}")
     try:
         note = json.loads(decompress(body[COUNT_BYTES:], size))
     except (ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""Decodes a state attribute by attribute, with residuals quantized to the error bounds. Needs only numpy."""
+"""Decodes a state attribute by attribute, from residuals quantized to the error bounds. Requires only numpy."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from scas4d_core.gaussians import rotation_rows
 Array = NDArray[np.float32]
 
 SCALE_STEP = 0.08
-"""Quantization step of the log of a size. The size that steps are relative to is within 4 % of the true one."""
+"""Quantization step of a log size. Decoded sizes, which scale other steps, are within 4 % of the true ones."""
 MARGIN = 0.95
 """Safety factor on steps that are relative to a size, to cover the size's own quantization error."""
 LARGEST = 1 << 30
-"""Residuals of at least this many steps are coded exactly, as are non-finite numbers."""
+"""Limit in quantization steps; centres and axes with larger or non-finite residuals are coded exactly."""
 SHAPE = ("sizes", "rotations", "factors", "means")
 """Attributes that are coded first, in this order; each improves the prediction of the next."""
 
@@ -43,7 +43,7 @@ def appearance_attributes(state: Columns) -> tuple[str, ...]:
 
 
 def coded_shape(state: Columns, name: str) -> tuple[int, int]:
-    """Returns the numbers of components and rows that are coded of an attribute."""
+    """Returns the number of coded components and rows of an attribute."""
     if name == "gloss" and state.gloss is not None:
         return 3, state.gloss.shape[1]
     return {"sizes": 1, "factors": 9, "foreground": 1}.get(name, 3), len(state)
@@ -51,7 +51,7 @@ def coded_shape(state: Columns, name: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class DecodedState:
-    """A partially decoded state: the prediction by the clusters, refined by one attribute after another.
+    """A partially decoded state: the clusters' prediction, refined one attribute at a time.
 
     Earlier attributes refine the prediction of later ones: axes are rotated by the decoded rotation, and steps scale
     with the decoded size.
@@ -114,7 +114,7 @@ class DecodedState:
         factors = np.stack(multiply_rows(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)
         rotations /= np.sqrt(np.square(rotations).sum(axis=0))
-        # Rows without rotation stay bit-identical, whichever other rows are coded with them.
+        # Rows without rotation must stay bit-identical, regardless of which other rows are coded with them.
         rotations = np.where(vectors.any(axis=0), rotations, self.state.rotations)
         return replace(self, state=self.state.replace(rotations=rotations, factors=factors))
 

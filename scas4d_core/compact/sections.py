@@ -1,4 +1,4 @@
-"""Sections of a coded state: residuals of rows, masks and exact arrays. Decoding allocates only what the rows need."""
+"""Sections of a coded state: residuals, masks and exact arrays. Decoding never allocates more than the rows need."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from scas4d_core.compact.planes import Ints, PlaneError, compress, decompress, p
 Floats = NDArray[np.float32]
 
 SPARSE = 0.6
-"""Share of changed rows below which a mask marks them."""
+"""Fraction of changed rows below which only these rows are coded, with a mask."""
 NONE, ALL, SOME = 0, 1, 2
-"""First byte of a section: it has values of no row, of all rows, or of the rows in a mask."""
+"""First byte of a section: values for no rows, for all rows, or for the rows in a mask."""
 LARGEST_ARRAY = 1 << 24
 """Maximum size of an exact array in bytes."""
 
 
 def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: int = 0) -> bytes:
-    """Encodes residuals [P, N] of an attribute, component by component, for no row, all rows or masked rows.
+    """Encodes residuals [P, N] of an attribute, component by component, for no rows, all rows or masked rows.
 
     Args:
-        planes: residuals [P, N].
-        rows: [N] rows among ``total`` that the planes belong to; None for all rows.
-        total: number of all rows, if ``rows`` is given.
+        planes: [P, N] residuals.
+        rows: [N] row index of each residual; None if there is one for every row.
+        total: total number of rows, if ``rows`` is given.
 
     >>> planes = np.array([[0, 0, 5, 0], [0, 0, 1, 0]])
     >>> read_residuals(write_residuals(planes), 0, 2, 4)[0]
@@ -70,7 +70,7 @@ def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tup
     """Decodes a section to its coded rows [R], their residuals [components, R], and the offset of its end.
 
     Raises:
-        PlaneError: the bytes are not such a section.
+        PlaneError: the bytes are not a valid section.
     """
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
@@ -116,13 +116,13 @@ def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
         return None, offset
     dimensions = body[offset] if offset < len(body) else 0
     if not 0 < dimensions <= 4 or len(body) < offset + 1 + 4 * dimensions:
-        raise PlaneError(f"an array of {dimensions} dimensions cannot be at byte {offset}")
+        raise PlaneError(f"invalid array of {dimensions} dimensions at byte {offset}")
     shape = struct.unpack_from(f"<{dimensions}I", body, offset + 1)
     size = 4
     for length in shape:
         size *= length
     if size > LARGEST_ARRAY:
-        raise PlaneError(f"an array of {size} bytes is none of a state")
+        raise PlaneError(f"an array of {size} bytes is too large for a state")
     data, offset = _read_sized(body, offset + 1 + 4 * dimensions, size)
     return np.frombuffer(data, "<f4").reshape(shape).astype(np.float32), offset
 
@@ -144,11 +144,11 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
         raise PlaneError(f"the data ends at byte {len(body)}, within a count")
     (count,) = struct.unpack_from("<I", body, offset)
     if not 0 < count <= most:
-        raise PlaneError(f"{count} of {most} rows cannot be coded exactly")
+        raise PlaneError(f"invalid number of exactly coded rows: {count} of {most}")
     data, offset = _read_sized(body, offset + 4, 4 * count * (1 + width))
     rows = np.frombuffer(data, "<u4", count).astype(np.intp)
     if int(rows.max()) >= most:
-        raise PlaneError(f"row {int(rows.max())} of {most} is coded")
+        raise PlaneError(f"row {int(rows.max())} is out of range for {most} rows")
     values = np.frombuffer(data, "<f4", count * width, 4 * count).reshape(width, count).astype(np.float32)
     return rows, values, offset
 
@@ -159,7 +159,7 @@ def _read_kind(body: bytes, offset: int) -> tuple[int, int]:
         raise PlaneError(f"the data ends at byte {len(body)}, before a section")
     kind = body[offset]
     if kind not in (NONE, ALL, SOME):
-        raise PlaneError(f"a section of kind {kind} cannot be at byte {offset}")
+        raise PlaneError(f"invalid section of kind {kind} at byte {offset}")
     return kind, offset + 1
 
 
@@ -173,5 +173,5 @@ def _read_sized(body: bytes, offset: int, size: int) -> tuple[bytes, int]:
         raise PlaneError(f"the data ends at byte {len(body)}, within a size")
     (length,) = struct.unpack_from("<I", body, offset)
     if len(body) < offset + 4 + length:
-        raise PlaneError(f"{length} bytes at byte {offset + 4} end after the data, at {len(body)}")
+        raise PlaneError(f"{length} bytes at byte {offset + 4} extend beyond the end of the data, at {len(body)}")
     return decompress(body[offset + 4 : offset + 4 + length], size), offset + 4 + length

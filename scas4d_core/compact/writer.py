@@ -35,7 +35,7 @@ from scas4d_core.gaussians import Gaussians
 ERRORS = "errors"
 """Key under which a note stores the largest errors of its frame."""
 KEY_EVERY = 8
-"""Interval between key frames; to decode one frame, a reader decodes at most this many."""
+"""Interval between key frames; a reader decodes at most this many states to access one frame."""
 
 
 class CompactWriter:
@@ -45,8 +45,8 @@ class CompactWriter:
         path: path of the file, which must not exist.
         head: header of the file.
         key_every: interval between key frames.
-        clustered: False skips clustering, which dominates the time for a file of one frame; further frames would become
-            larger.
+        clustered: whether to cluster the Gaussians. Clustering dominates the time for a single-frame file, but makes
+            further frames smaller.
 
     Attributes:
         errors: largest error of each attribute so far, in the units of ``Bounds``.
@@ -93,9 +93,9 @@ class CompactWriter:
 
     @classmethod
     def resume(cls, path: Path | str, key_every: int = KEY_EVERY) -> CompactWriter:
-        """Continues an unclosed file after its last complete state; anything after it is truncated.
+        """Resumes an unclosed file after its last complete state; anything after that is discarded.
 
-        ``errors`` cover the frames that have a note, and all frames added from now on.
+        ``errors`` covers the existing frames that have a note, and all frames added from now on.
 
         Raises:
             FileNotFoundError: the file does not exist.
@@ -103,9 +103,9 @@ class CompactWriter:
         """
         with CompactReader(path) as reader:
             if reader.is_closed:
-                raise FileError(f"{reader.path.name}: it is complete, with its index; start another file")
+                raise FileError(f"{reader.path.name}: the file is already complete; start another file")
             if reader.damage is not None or not reader.frames:
-                raise FileError(f"{reader.path.name}: it cannot be continued ({reader.damage or 'it has no state'})")
+                raise FileError(f"{reader.path.name}: it cannot be resumed ({reader.damage or 'it has no state'})")
             last = reader.encoder_state()
             known = [reader.note(index).get(ERRORS, {}) for index in reader.frames]
         writer = cls.__new__(cls)
@@ -134,17 +134,17 @@ class CompactWriter:
     def add(
         self, index: int, time: float, state: Gaussians, note: Mapping[str, Any] | None = None
     ) -> Mapping[str, float]:
-        """Writes the state of a frame; returns its largest error by attribute.
+        """Writes the state of a frame; returns the largest error of each attribute.
 
         Args:
             index: frame index, greater than all previous ones.
             time: time in seconds.
-            state: the Gaussians of the previous frame in the same order, followed by the newborn ones with their ids.
-            note: JSON values about the frame; written before its state, together with its ``errors``.
+            state: Gaussians of the previous frame in the same order, followed by newborn ones with new ids.
+            note: JSON values about the frame, which are written before its state together with its ``errors``.
 
         Raises:
             FileError: the frame cannot follow the previous ones.
-            ValueError: the note is not valid JSON.
+            ValueError: the note cannot be serialized as JSON.
         """
         self._check(index, state)
         note_bytes(note or {})
@@ -178,7 +178,7 @@ class CompactWriter:
         return errors
 
     def add_parts(self, index: int, labels: NDArray[np.integer]) -> None:
-        """Writes the part of each Gaussian, valid from the last frame on.
+        """Writes the part label of each Gaussian, valid from the last frame onwards.
 
         Args:
             index: index of the last frame.
@@ -191,7 +191,7 @@ class CompactWriter:
         known = 0 if self._born is None else len(self._born)
         if index != self._record.frame or values.shape != (known,):
             raise FileError(
-                f"{self.path.name}: parts {values.shape} of frame {index} cannot follow frame {self._record.frame} of "
+                f"{self.path.name}: parts {values.shape} of frame {index} do not match frame {self._record.frame} with "
                 f"{known} Gaussians"
             )
         self._append(record_bytes(RecordKind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
@@ -202,22 +202,22 @@ class CompactWriter:
         if index <= last:
             raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in ascending order")
         if not len(state):
-            raise FileError(f"{name}: frame {index} has no Gaussian; begin with a frame that has some")
+            raise FileError(f"{name}: frame {index} has no Gaussians; start with a frame that has some")
         if (born := self._born) is not None:
             known = len(born)
             if len(state) < known or not np.array_equal(state.ids[:known], born.ids):
-                raise FileError(f"{name}: frame {index} has other Gaussians than frame {last}; they are never removed")
+                raise FileError(f"{name}: frame {index} has different Gaussians from frame {last}; do not remove any")
             if self._opacities is not None and not np.array_equal(state.own_opacities[:known], self._opacities):
-                raise FileError(f"{name}: frame {index} has other opacities than frame {last}; they are fixed at birth")
+                raise FileError(f"{name}: frame {index} changes opacities of frame {last}; they are fixed at birth")
             if _glossy(state.gloss) != (0 if born.gloss is None else born.gloss.shape[1]):
-                raise FileError(f"{name}: frame {index} has gloss of {_glossy(state.gloss)} Gaussians, others before")
+                raise FileError(f"{name}: frame {index} has gloss for {_glossy(state.gloss)} Gaussians, unlike before")
         for field in ("means", "factors", "rotations", "colours", "own_opacities", "gloss"):
             if (array := getattr(state, field)) is None or np.isfinite(array).all():
                 continue
             wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
             raise FileError(
-                f"{name}: frame {index}: {len(wrong)} Gaussians have {field} that are not finite, rows "
-                f"{wrong[:5].tolist()}; leave the frame out, or repair them"
+                f"{name}: frame {index}: {len(wrong)} Gaussians have non-finite {field}, rows "
+                f"{wrong[:5].tolist()}; omit the frame, or fix these Gaussians"
             )
 
     def close(self) -> None:

@@ -1,1 +1,1 @@
-"""Compiles kernels ahead of their first use in several processes, and tracks which ones are cached."""
+"""Compiles kernels in parallel processes before their first use, and tracks which ones are cached."""

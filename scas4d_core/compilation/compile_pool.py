@@ -1,8 +1,8 @@
-"""A pool of processes that compile kernels in parallel, and functions that wait for them.
+"""A pool of processes that compile kernels in parallel, and a function that waits for them.
 
-Each process of the pool compiles the first kernel that no other process has claimed, until none is left. At most one
-process per core compiles for one cache at a time; the limit is shared by service, tests and commands. Results are
-bit-identical whichever process compiled a kernel.
+Each process of the pool claims and compiles one kernel after another until none is left. At most one process per core
+compiles for the same cache at a time; the service, tests and commands share this limit. Results are bit-identical
+regardless of which process compiled a kernel.
 """
 
 from __future__ import annotations
@@ -26,38 +26,39 @@ log = logging.getLogger("scas4d.kernels")
 MAX_PROCESSES = 4
 """Maximum number of processes. Each needs about 350 MB, and the slowest kernel takes a sixth of the total time."""
 NICE = 10
-"""Added to the niceness of processes that compile ahead, so that frames, views and requests have priority."""
+"""Increase in niceness of processes that compile in advance, so that frames, views and requests take priority."""
 GC_THRESHOLDS = (200_000, 20, 1000)
 """Thresholds of Python's garbage collector, tuned for a compiler with millions of long-lived objects.
 
-The default thresholds cost a tenth of the time; disabling collection raises memory use by half.
+The default thresholds would take a tenth of the time; disabling collection would raise memory use by half.
 """
 POLL_S = 0.05
 PARENT_EVERY_S = 0.5
 TRIES = 2
-"""Number of pools started for the same kernels; the first one may have been killed."""
+"""Maximum number of pools started for the same kernels, because the first one may have been killed."""
 
 OnProgress = Callable[[int, int], None]
 """Called with the number of compiled kernels and the total number to wait for."""
 
 _pool: list[subprocess.Popen[bytes]] = []
-"""Processes started by this process."""
+"""Pool processes started by this process."""
 
 
 def processes() -> int:
-    """Returns how many processes may compile at a time: one per core, at most `MAX_PROCESSES`."""
+    """Returns how many processes may compile at the same time: one per core, at most `MAX_PROCESSES`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MAX_PROCESSES)
 
 
 def compile_kernels(wanted: Iterable[str], then: Iterable[str]) -> int:
-    """Compiles kernels that no other process compiles; runs in a process of the pool.
-
-    Returns the number of kernels that could not be compiled.
+    """Compiles kernels that no other process has claimed; this is the main function of a pool process.
 
     Args:
         wanted: names of the groups to compile first.
-        then: names of the groups to compile afterwards at low priority.
+        then: names of the groups to compile afterwards, at low priority.
+
+    Returns:
+        Number of kernels that could not be compiled.
     """
     _end_with_parent()
     gc.freeze()
@@ -94,15 +95,16 @@ def _compile_all(marks: CompiledMarkers, groups: Iterable[KernelGroup]) -> int:
 def wait_for_kernels(
     wanted: Iterable[KernelGroup], then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> bool:
-    """Waits until the kernels of the groups ``wanted`` are cached; starts processes to compile them if needed.
+    """Waits until all kernels of the ``wanted`` groups are cached, and starts processes to compile them if needed.
 
     Args:
         wanted: groups to wait for.
-        then: groups that the same processes compile afterwards, without waiting for them here.
-        on_progress: called at the start if there are kernels to wait for, and whenever more kernels are compiled.
+        then: groups that the same processes compile afterwards; this function does not wait for them.
+        on_progress: called at the start if any kernels are missing, and whenever more kernels have been compiled.
 
     Returns:
-        False if the kernels could not be compiled ahead of time; they are then compiled on their first call.
+        True if the kernels are cached. False if they could not be compiled in advance; each is then compiled when it
+        is first called.
     """
     wanted, then = tuple(wanted), tuple(then)
     kernels = kernels_of(wanted)
@@ -124,7 +126,7 @@ def wait_for_kernels(
         _pool[:] = [process for process in _pool if process.poll() is None]
         if not _pool and not marks.is_compiling(processes()):
             if tries == TRIES:
-                log.warning("kernels could not be compiled in advance; the first frames wait for them")
+                log.warning("kernels could not be compiled in advance; the first frames will take longer")
                 return False
             tries += 1
             if not _start(wanted, then):
@@ -135,7 +137,7 @@ def wait_for_kernels(
 
 
 def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
-    # Pass sys.path on, since the sources may be reachable only through this process's path.
+    # Pass sys.path on, since the package may be importable only with the path of this process.
     program = (
         "import sys; groups = [given.split(';') if given else [] for given in sys.argv[1:3]]; "
         "sys.path[:] = sys.argv[3:]; "
@@ -147,13 +149,13 @@ def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         except OSError:  # no interpreter found, e.g. in an embedded Python
             return False
-        threading.Thread(target=process.wait, daemon=True).start()  # otherwise it would remain a zombie
+        threading.Thread(target=process.wait, daemon=True).start()  # avoids zombie processes
         _pool.append(process)
     return True
 
 
 def _end_with_parent() -> None:
-    """Exits this process soon after its parent process has ended."""
+    """Exits this process soon after its parent process ends."""
     parent = os.getppid()
 
     def watch() -> None:

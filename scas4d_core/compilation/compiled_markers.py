@@ -1,7 +1,7 @@
-"""Markers of compiled kernels: empty files next to the cache, and lock files of the compiling processes.
+"""Markers for compiled kernels (empty files next to the cache), and lock files of the processes that compile.
 
 A marker means that a kernel is cached for this version, checkout and processor. Numba keys its cache by source path, so
-each checkout has its own markers. Locks are released when their process ends.
+each checkout has its own markers. A lock is released when its process ends.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scas4d_core.compilation.manifest import Kernel
 from scas4d_core.kernels.cache import locked
 
 SLOT_WAIT_S = 1.0
-"""Seconds for which a process retries to get a slot, because `is_compiling` briefly locks slots to check them."""
+"""Seconds for which a process keeps trying to get a slot, because `is_compiling` briefly locks slots to check them."""
 
 
 def open_markers() -> CompiledMarkers | None:
@@ -37,10 +37,10 @@ def open_markers() -> CompiledMarkers | None:
 
 
 class CompiledMarkers:
-    """The markers in a folder, which is created if needed.
+    """Markers for compiled kernels, stored in a folder.
 
     Args:
-        folder: folder for this version, checkout and processor.
+        folder: folder for this version, checkout and processor; created if it does not exist.
 
     Raises:
         OSError: the folder cannot be created.
@@ -62,7 +62,7 @@ class CompiledMarkers:
 
     @contextmanager
     def claim(self, kernel: Kernel) -> Iterator[bool]:
-        """Yields True to one process at a time, which may compile the kernel, and False to all others."""
+        """Yields True to one process at a time, which may then compile the kernel, and False to all others."""
         with locked(self.folder / f"{kernel.key}.lock", wait=False) as mine:
             yield mine
 

@@ -1,4 +1,4 @@
-"""Compiles one kernel of the manifest for its argument types, into the cache."""
+"""Compiles a kernel of the manifest for its argument types and stores it in the cache."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scas4d_core.compilation.manifest import Kernel
 
 
 def types_of(arguments: str) -> tuple[Any, ...]:
-    """Parses argument types in the notation of ``Kernel`` to Numba types.
+    """Converts argument types from the notation of ``Kernel`` to Numba types.
 
     >>> types_of("f i*2 none s2")
     (float32, UniTuple(int64, 2), none, Array(int32, 2, 'C', False, aligned=True))
@@ -34,7 +34,7 @@ def _type_of(word: str) -> Any:
 
 
 def compile_kernel(kernel: Kernel) -> None:
-    """Compiles a kernel into the cache, or loads it if it is cached already.
+    """Compiles a kernel into the cache, or loads it if it is already cached.
 
     Raises:
         Exception: the function does not exist, or Numba cannot compile it for these types.

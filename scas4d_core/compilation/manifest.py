@@ -1,8 +1,8 @@
 """Kernels that scenes call, with their argument types, grouped by the stage that needs them.
 
-Numba compiles a kernel on its first call, for the types of that call. This list states the types in advance so that
-several processes can share the work; a test compares it with the calls of a scene. A kernel missing from the list still
-works, but the process that first calls it has to compile it.
+Numba compiles a kernel on its first call, for the argument types of that call. This list declares the types in advance
+so that several processes can share the work; a test compares it with the calls of a scene. A kernel missing from the
+list still works, but the first process to call it must compile it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class KernelGroup(StrEnum):
     """Groups of kernels, by the stage that needs them."""
 
     FIRST_FRAME = "first frame"
-    """Needed for frame 0 and for every view."""
+    """Needed for frame 0 and to render any view."""
     UPDATE = "update"
     """Needed for updates with any combination of effects."""
     ENTANGLED = "update, entangled covariance"
@@ -28,13 +28,15 @@ class KernelGroup(StrEnum):
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel for given argument types.
+    """A kernel with specific argument types.
 
     Attributes:
         group: group that the kernel belongs to.
-        module, name: module within ``scas4d_core``, and name of the function.
-        arguments: one word per argument. f, d: float32, float64; i, s: int64, int32; u, w, y: uint32, uint64, uint8; b:
-            bool; none: None. A number after the letter is the number of array axes; i*2 is a tuple of two int64.
+        module: module of the function, relative to ``scas4d_core``.
+        name: name of the function.
+        arguments: one word per argument. The first letter is the type: f, d for float32, float64; i, s for int64,
+            int32; u, w, y for uint32, uint64, uint8; b for bool. A number after it is the number of array axes. i*2 is
+            a tuple of two int64, and none is None.
     """
 
     group: KernelGroup
@@ -44,7 +46,7 @@ class Kernel:
 
     @property
     def key(self) -> str:
-        """File name that is unique to this kernel and its argument types."""
+        """Unique file name for this kernel and its argument types."""
         return f"{self.module}.{self.name}-{hashlib.sha256(self.arguments.encode()).hexdigest()[:8]}"
 
 
@@ -53,7 +55,7 @@ def _of(group: KernelGroup, *rows: str) -> tuple[Kernel, ...]:
     return tuple(Kernel(group, module, name, arguments) for module, name, arguments in split)
 
 
-# In each group, the kernels that compile slowest come first, which balances the load best.
+# In each group, the kernels that take longest to compile come first, which balances the load best.
 KERNELS = (
     *_of(
         KernelGroup.FIRST_FRAME,
@@ -111,5 +113,5 @@ def kernels_of(groups: Iterable[KernelGroup]) -> list[Kernel]:
 
 
 def groups_of_update(covariance: str) -> tuple[KernelGroup, ...]:
-    """Returns the groups that updates need; ``covariance`` is the update setting of that name."""
+    """Returns the groups that updates need for a given value of the update setting ``covariance``."""
     return (KernelGroup.SEPARATE if covariance == "separate" else KernelGroup.ENTANGLED), KernelGroup.UPDATE

@@ -1,4 +1,4 @@
-"""The interface of an effect: its texts for users, its part of an update, and the evidence for it.
+"""Interface of an effect: its user-facing texts, its part of an update, and the evidence for it.
 
 Effect modules must not import Numba or torch at import time, because settings are validated with them.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class EffectGroup(StrEnum):
-    """The groups of effects."""
+    """Groups of related effects."""
 
     MOTION = "motion"
     COHERENCE = "coherence"
@@ -33,19 +33,20 @@ class EffectGroup(StrEnum):
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect; its module has one instance named ``EFFECT``.
+    """An effect; each effect module has one instance named ``EFFECT``.
 
     Attributes:
-        name: key in ``effect_names.EFFECTS``. group: group of related effects.
-        description: a sentence for users. disambiguation: what separates it from other effects that could explain the
-            same pixels.
-        cost: cost of an update with the effect, compared with one without.
-        auto: whether the effect needs evidence; otherwise it is on unless it is refused.
-        on_above, off_below: values of ``Evidence.share`` at or above which it is switched on, and below which it is
-            switched off.
+        name: key in ``effect_names.EFFECTS``.
+        group: group of related effects.
+        description: one sentence for users.
+        disambiguation: how the effect is separated from others that could explain the same pixels.
+        cost: additional cost of an update with the effect.
+        auto: whether the effect needs evidence to be on; otherwise it is on unless it is refused.
+        on_above, off_below: values of ``Evidence.share`` at or above which the effect is switched on, and below which
+            it is switched off.
         without_masks: whether the effect can be on in a scene whose first frame has no masks.
-        committed_arrays: names of its arrays in ``Attempt.carried`` that are committed with each frame. A cold start
-            without a checkpoint has these and those of ``first_frame_arrays``. They should be small.
+        committed_arrays: names of the effect's arrays in ``Attempt.carried`` that are committed with each frame; they
+            should be small. Only these arrays and those of ``first_frame_arrays`` survive the loss of a checkpoint.
     """
 
     name: str
@@ -60,44 +61,45 @@ class Effect:
     committed_arrays: tuple[str, ...] = ()
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns fault and remedy if the effect cannot be on with these settings; None if it can."""
+        """Returns the fault and the remedy if the effect cannot be on with these settings; None if it can."""
         return None
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns arrays of frame 0 for the evidence or the part, or None. Not called if the effect is pinned off."""
+        """Returns arrays of frame 0 that the evidence or the part needs, or None; not called if pinned off."""
         return None
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns fault and remedy if the effect cannot be off with these settings; None if it can."""
+        """Returns the fault and the remedy if the effect cannot be off with these settings; None if it can."""
         return None
 
     def on_at_first(self, seen: FrameObservation) -> bool:
-        """Returns true if the effect is on after the first frame until idle; it must keep arrays of that frame."""
+        """Returns true if the effect is switched on by the first frame; requires ``first_frame_arrays``."""
         return False
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the evidence in a frame; None if the frame gives none, in which case the switch is unchanged."""
+        """Returns the evidence from a frame; None if the frame gives none, in which case the switch is unchanged."""
         return None
 
     def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
-        """Returns arrays for later frames in addition to those of its part; None keeps the existing arrays.
+        """Returns arrays for later frames, in addition to those of the effect's part; None keeps the existing arrays.
 
-        Called after each learnt frame, before the evidence is computed. Also called while the effect is off, unless it
-        is pinned off.
+        Called after each learnt frame, before the evidence is computed. It is also called while the effect is off,
+        unless it is pinned off.
 
         Args:
-            on: whether the effect took part in the frame.
+            seen: the learnt frame.
+            on: whether the effect took part in the update of the frame.
         """
         return None
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """Returns the result of a frame with Gaussians added, retired or revived.
 
-        Called while the effect is on, after each learnt frame and before its commit. Rows may change nowhere else.
-        Existing rows keep their order: return ``replace(seen.result, gaussians=..., parents=..., carried=...)`` with
-        Gaussians from ``Gaussians.concatenate``, ``retire`` and ``revive``. ``parents`` includes those of previous
-        effects. Arrays in ``carried`` with a row per Gaussian are extended afterwards: new rows are copies of the
-        parents' rows, or zeros.
+        Called while the effect is on, after each learnt frame and before its commit. Rows may not change anywhere
+        else. Existing rows keep their order: return ``replace(seen.result, gaussians=..., parents=..., carried=...)``
+        with Gaussians from ``Gaussians.concatenate``, ``retire`` and ``revive``. ``parents`` includes the parents from
+        previous effects. Arrays in ``carried`` with a row per Gaussian are extended afterwards: new rows are copies of
+        the parents' rows, or zeros.
         """
         return seen.result
 
@@ -107,26 +109,27 @@ class Effect:
 
 
 Refusal = tuple[str, str]
-"""Fault and remedy."""
+"""The fault and its remedy."""
 
 
 def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
-    """Returns fault and remedy if a rate or weight of the update is 0.
+    """Returns the fault and the remedy if a rate or weight of the update is 0.
 
     Args:
-        key: name in the update settings, such as "rate_colour" or "weights.rigidity".
+        settings: settings of the scene.
+        key: name of the rate or weight in the update settings, such as "rate_colour" or "weights.rigidity".
     """
     if attrgetter(key)(settings.update) > 0:
         return None
-    return f"update.{key} is 0", f"give it a {'weight' if key.startswith('weights.') else 'rate'} above 0"
+    return f"update.{key} is 0", f"set a {'weight' if key.startswith('weights.') else 'rate'} above 0"
 
 
 @cache
 def effect(name: str) -> Effect:
-    """Returns the effect with a name.
+    """Returns the effect with the given name.
 
     Raises:
-        KeyError: there is no such effect.
+        KeyError: if there is no such effect.
 
     >>> effect("floor").group
     <EffectGroup.COHERENCE: 'coherence'>

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for an effect in the frames so far.
+    """Evidence for an effect, from the frames so far.
 
     Attributes:
-        share: 0…1, what the effect explains or would explain; compared with the thresholds of the effect.
-        text: explanation for people, such as "gains of the cameras differ by 8 %".
+        share: share that the effect explains or would explain, 0…1; compared with the thresholds of the effect.
+        text: human-readable explanation, such as "camera c2 is off by 0.8 pixels".
     """
 
     share: float
@@ -29,12 +29,12 @@ class Evidence:
 
 @dataclass(eq=False)
 class FitTime:
-    """The time for fitting the Gaussians added in a frame, outside the update.
+    """Time limit and time spent for fitting the Gaussians added in a frame, outside the update.
 
     Attributes:
-        end: ``perf_counter`` value at which fits must end; None for no limit.
-        spent: seconds used by fits. postponed: work that did not fit the time, in words; the next frame detects it
-            again.
+        end: ``perf_counter`` value at which fits must end; no limit if None.
+        spent: time spent on fits, in seconds.
+        postponed: descriptions of fits for which there was no time; the next frame detects them again.
     """
 
     end: float | None = None
@@ -47,11 +47,15 @@ class FrameObservation:
     """A learnt frame, as input for the evidence of effects.
 
     Attributes:
-        index: index of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
-        rig: the cameras in the internal world, with their current poses. views: that were learnt from. renderer:
-            renders states of the scene.
-        room: number of Gaussians that may still be added to the scene. time: for fitting them.
-        suspects: views of excluded cameras, which were not learnt from.
+        index: index of the frame.
+        before: previous state Θ_{t−1}.
+        result: update result, with Θ_t, the trace of the update, and the arrays of the effects.
+        rig: cameras in the internal world, with their current poses.
+        views: training views used by the update.
+        renderer: renderer for states of the scene.
+        room: number of Gaussians that may still be added to the scene.
+        time: time limit for fitting added Gaussians.
+        suspects: views of excluded cameras, which the update did not use.
     """
 
     index: int

@@ -1,4 +1,4 @@
-"""Switches of a scene's effects: pinned by the settings, or decided from evidence with hysteresis.
+"""On/off switches of a scene's effects: pinned by the settings, or decided from evidence with hysteresis.
 
 A switch changes between two frames. It is committed with the frame whose evidence changed it. A resumed scene continues
 with the switches of its checkpoint, so that a replay makes the same decisions.
@@ -29,9 +29,11 @@ class Switch:
     """The switch of one effect.
 
     Attributes:
-        on: whether the effect takes part in updates. since: frame after which the switch last changed.
-        pinned: whether the settings fix it. share, text: the latest evidence, see ``Evidence``. idle: number of
-            consecutive frames with evidence below the switch-off threshold.
+        on: whether the effect takes part in updates.
+        since: index of the frame after which the switch last changed.
+        pinned: whether the settings pin the switch.
+        share, text: latest evidence, see ``Evidence``.
+        idle: number of consecutive frames with evidence below the switch-off threshold.
     """
 
     on: bool
@@ -44,11 +46,11 @@ class Switch:
 
 Switches = Mapping[str, Switch]
 NO_EVIDENCE: Mapping[str, Evidence] = MappingProxyType({})
-"""Empty evidence."""
+"""No evidence for any effect."""
 
 
 def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
-    """Yields name, mode, fault and remedy of each effect whose pin contradicts the settings."""
+    """Yields the name, mode, fault and remedy of each effect whose pin contradicts the settings."""
     for name, mode in settings.effects.items():
         if mode == "on" and (refusal := effect(name).refusal(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
@@ -62,10 +64,13 @@ def first_switches(
     """Returns the switches before any update: pinned, on by default, or on because of evidence in frame 0.
 
     Args:
-        index: of the first frame. found: evidence in the fit of frame 0, by effect. masked: whether frame 0 has masks.
+        settings: settings of the scene.
+        index: index of the first frame.
+        found: evidence from the fit of frame 0, keyed by effect name.
+        masked: whether frame 0 has masks.
 
     Raises:
-        InputError: a pinned effect contradicts the settings.
+        InputError: if a pinned effect contradicts the settings.
 
     >>> from scas4d_core.settings import Settings
     >>> switches = first_switches(Settings.model_validate({"effects": {"rigidity": "off"}}), 0)
@@ -96,7 +101,7 @@ def encode_switches(switches: Switches) -> dict[str, dict[str, Any]]:
 
 
 def decode_switches(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
-    """Returns the switches from JSON data.
+    """Returns the switches decoded from JSON data.
 
     >>> decode_switches(encode_switches({"floor": Switch(on=True, since=3)}))["floor"].since
     3
@@ -108,7 +113,9 @@ def decide_switches(switches: Switches, settings: Settings, seen: FrameObservati
     """Returns the switches for the next frame.
 
     Args:
-        switches: used for the update of the frame. settings: settings of the scene. seen: the learnt frame.
+        switches: switches used for the update of the frame.
+        settings: settings of the scene.
+        seen: the learnt frame.
     """
     return {name: _decide_switch(name, switch, settings, seen) for name, switch in switches.items()}
 
@@ -128,7 +135,7 @@ def _decide_switch(name: str, switch: Switch, settings: Settings, seen: FrameObs
 
 
 def first_frame_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Arrays]:
-    """Returns the arrays that the effects keep from the first frame, by effect."""
+    """Returns the arrays that the effects keep from the first frame, keyed by effect name."""
     by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
@@ -140,10 +147,12 @@ def first_frame_arrays(switches: Switches, settings: Settings, seen: FrameObserv
 
 
 def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> FrameObservation:
-    """Returns the observation of a learnt frame with the arrays that the effects record.
+    """Returns the observation of a learnt frame, extended by the arrays that the effects record.
 
     Args:
-        switches: used for the update of the frame. settings: settings of the scene. seen: the learnt frame.
+        switches: switches used for the update of the frame.
+        settings: settings of the scene.
+        seen: the learnt frame.
     """
     by_effect = {}
     for name, switch in switches.items():
@@ -159,7 +168,7 @@ def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation
 
 
 def committed_arrays(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
-    """Returns the carried arrays that are committed with later frames, by effect."""
+    """Returns the carried arrays that are committed with later frames, keyed by effect name."""
     kept = {
         name: {key: own[key] for key in effect(name).committed_arrays if key in own} for name, own in carried.items()
     }
@@ -172,7 +181,9 @@ def switches_after_first_frame(
     """Returns the switches after the first frame.
 
     Args:
-        found: from ``first_frame_arrays``. seen: the first frame.
+        found: arrays returned by ``first_frame_arrays``.
+        switches: switches before the first frame.
+        seen: the first frame.
     """
     return {
         name: replace(switch, on=True) if name in found and effect(name).on_at_first(seen) else switch
@@ -181,15 +192,16 @@ def switches_after_first_frame(
 
 
 def names_on(switches: Switches) -> tuple[str, ...]:
-    """Returns the active effects in registry order."""
+    """Returns the names of the active effects in registry order."""
     return tuple(name for name in EFFECTS if name in switches and switches[name].on)
 
 
 def register_effects(builder: PlanBuilder, effects: Sequence[str] | None = None) -> PlanBuilder:
-    """Registers effects with a builder and returns it.
+    """Registers effects with a builder and returns the builder.
 
     Args:
-        effects: the active effects; None for those active in a scene without evidence.
+        builder: builder of the update plan.
+        effects: names of the active effects; by default, those that are on without evidence.
     """
     if effects is None:
         effects = names_on(first_switches(Settings(scene=builder.scene, update=builder.update), 0))

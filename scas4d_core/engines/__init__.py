@@ -1,6 +1,6 @@
-"""Engines that compute updates and fits behind one interface, one engine per device.
+"""Engines that run updates and fits on different devices behind a common interface.
 
-``cpu`` holds the kernels that the service runs. ``torch`` is the reference: plain PyTorch with autograd in float64,
-against which every other engine is tested. ``plan`` and ``engine`` define the values that cross the interface.
-``renderer`` is the interface for all other rendering: probe views, checks, births, frame 0 and client views.
+The service uses the engine in ``cpu``. ``torch`` is the reference implementation in plain PyTorch, with autograd in
+float64, against which all other engines are tested. ``plan`` and ``engine`` define the data that the update loop and an
+engine exchange. ``renderer`` is the interface for all other rendering, such as checks, frame 0 and client views.
 """

@@ -1,60 +1,135 @@
-"""Selection of the engine for a device. Engines are imported lazily, because each one needs its own libraries."""
+"""Selection of the engine for a device. Engines are imported lazily, because their dependencies are optional."""
 
 from __future__ import annotations
+
+import ctypes
+import importlib.util
+import os
+import sys
+from functools import cache
+from typing import Literal
 
 from scas4d_core.engines.engine import UpdateEngine
 from scas4d_core.engines.fit import FitEngine
 from scas4d_core.engines.limits import Limits
 from scas4d_core.engines.renderer import Renderer
 
+Device = Literal["cpu", "gpu"]
 
-def engine_of(device: str) -> UpdateEngine:
-    """Returns a new update engine for a device.
+WARP_DEVICE = "SCAS4D_WARP_DEVICE"
+"""Environment variable with the Warp device that device "gpu" stands for; "cpu" runs the same kernels without a GPU,
+slowly, for tests."""
+
+
+class DeviceError(ValueError):
+    """A scene requires a GPU that cannot be used.
 
     Args:
-        device: device name from the settings; only "cpu" is supported so far.
+        reason: why it cannot be used.
+
+    >>> print(DeviceError("NVIDIA Warp is not installed"))
+    device 'gpu' cannot be used: NVIDIA Warp is not installed; see docs/gpu.md, or choose device 'cpu' or 'auto'
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"device 'gpu' cannot be used: {reason}; see docs/gpu.md, or choose device 'cpu' or 'auto'")
+
+
+@cache
+def gpu_fault() -> str | None:
+    """Returns why no GPU can be used, or None if one can.
+
+    The answer is determined once per process. NVIDIA Warp is only imported if there is a driver.
+    """
+    if importlib.util.find_spec("warp") is None:
+        return "NVIDIA Warp is not installed (extra gpu)"
+    if WARP_DEVICE in os.environ:
+        return None
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return "no NVIDIA driver is installed"
+    import warp
+
+    if warp.get_cuda_device_count() == 0:
+        return "no NVIDIA GPU can be used, or the driver is older than the CUDA version of NVIDIA Warp requires"
+    return None
+
+
+def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
+    """Returns the device for a setting; "auto" is the GPU if one can be used, otherwise the CPU.
+
+    Args:
+        device: value of the setting ``device``.
 
     Raises:
-        ValueError: if no engine supports the device.
+        DeviceError: the setting requires a GPU, but none can be used.
+
+    >>> resolve_device("cpu")
+    'cpu'
+    """
+    if device == "cpu":
+        return "cpu"
+    fault = gpu_fault()
+    if device == "auto":
+        return "gpu" if fault is None and WARP_DEVICE not in os.environ else "cpu"
+    if fault is not None:
+        raise DeviceError(fault)
+    return "gpu"
+
+
+def warp_device() -> str:
+    """Returns the Warp device of device "gpu"."""
+    return os.environ.get(WARP_DEVICE, "cuda:0")
+
+
+def engine_of(device: Device) -> UpdateEngine:
+    """Returns a new update engine for a device.
 
     >>> engine_of("cpu").name
     'cpu'
     """
-    if device == "cpu":
-        from scas4d_core.engines.cpu.engine import CpuEngine
+    if device == "gpu":
+        from scas4d_core.engines.warp.engine import WarpEngine
 
-        return CpuEngine()
-    raise ValueError(f"device {device!r} has no engine; choose 'cpu'")
+        return WarpEngine(warp_device())
+    from scas4d_core.engines.cpu.engine import CpuEngine
+
+    return CpuEngine()
 
 
-def renderer_of(device: str, background: tuple[float, float, float], limits: Limits) -> Renderer:
+def renderer_of(device: Device, background: tuple[float, float, float], limits: Limits) -> Renderer:
     """Returns a new full-image renderer for a device.
 
     Args:
-        device: see ``engine_of``. background: RGB in 0…1. limits: constants of the rasterizer.
-
-    Raises:
-        ValueError: if no renderer supports the device.
+        device: device; see ``resolve_device``.
+        background: background colour, RGB in 0…1.
+        limits: rasterizer constants.
     """
-    if device == "cpu":
-        from scas4d_core.engines.cpu.renderer import CpuRenderer
+    if device == "gpu":
+        from scas4d_core.engines.warp.renderer import WarpRenderer
 
-        return CpuRenderer(background, limits=limits)
-    raise ValueError(f"device {device!r} has no renderer; choose 'cpu'")
+        return WarpRenderer(background, limits, warp_device())
+    from scas4d_core.engines.cpu.renderer import CpuRenderer
+
+    return CpuRenderer(background, limits=limits)
 
 
 def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
-    """Returns a new engine for one fit, with the renderer's device, background and limits but its own buffers.
+    """Returns a new engine for one fit, with its own buffers but the renderer's device, background and limits.
 
     Args:
+        renderer: renderer that determines the device, background and limits.
         mask_weight: weight of the mask loss, which is added to the image loss and only affects the labels.
-
-    Raises:
-        ValueError: if the renderer's device has no engine for fits.
     """
     from scas4d_core.engines.cpu.fit import CpuFitEngine
     from scas4d_core.engines.cpu.renderer import CpuRenderer
 
     if isinstance(renderer, CpuRenderer):
         return CpuFitEngine(renderer.with_new_buffers(mask_weight))
-    raise ValueError(f"{type(renderer).__name__} has no engine for fits; choose device 'cpu'")
+    from scas4d_core.engines.warp.fit import WarpFitEngine
+    from scas4d_core.engines.warp.renderer import WarpRenderer
+
+    if isinstance(renderer, WarpRenderer):
+        return WarpFitEngine(renderer, mask_weight)
+    raise TypeError(f"{type(renderer).__name__} has no engine for fits")

@@ -1,20 +1,21 @@
-"""Interface between the update loop and the device that computes it, and the values that cross it.
+"""Interface between the update loop and the engine that runs it, with the data they exchange.
 
-The loop (``update.frame_update``) decides, an engine computes. The calls of one attempt at a frame, in order::
+The loop (``update.frame_update``) makes the decisions; the engine does the computation. One attempt to update a frame
+makes these calls, in order::
 
     engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
     engine.load_views(views, probes)        # images of the frame
     engine.load_state(previous)             # Θ_{t−1} without motion
     engine.set_tables(tables)               # initial motion: none, or the motion of the previous frame
-    engine.probe(...)                       # image losses of the candidates on a few views
+    engine.probe(...)                       # image losses of the candidate states on a few views
     engine.begin(start)                     # reset the Adam moments to zero
-    engine.iterate(views, step)             # deform, render, compare, backward, Adam: once per iteration
-    engine.log(), engine.leave_out(views)   # after every camera was rendered: exclude outlier cameras
-    engine.probe(...)                       # for the stopping rule, and at the end
+    engine.iterate(views, step)             # once per iteration: deform, render, compare, backward, Adam
+    engine.log(), engine.leave_out(views)   # once all cameras have been rendered: exclude outlier cameras
+    engine.probe(...)                       # for the stopping criterion, and at the end
     engine.state(learnt=True)               # Θ_t
 
-Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` make the host wait for the device. That is
-about ten synchronizations per frame, and none during an iteration.
+Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` synchronize the host with the device. This
+happens about ten times per frame, and never during an iteration.
 """
 
 from __future__ import annotations
@@ -34,40 +35,43 @@ from scas4d_core.structure.hierarchy import Hierarchy
 
 Array = NDArray[np.float32]
 
+GAINS_MISSING = "begin was called without gains; enable UpdatePlan.camera_gains to estimate them"
+"""Message of ``UpdateEngine.gains`` if gains are not estimated."""
 REPORT = "report"
-"""Name of the stage in which an update prepares its own report: timers, colour shifts, writing and publishing."""
+"""Name of the stage in which an update compiles its report, including timings, colour shifts, I/O and publishing."""
 KEPT_PICTURES = 8
-"""Number of recent views whose renderings the log keeps, as evidence for effects."""
+"""Number of most recent views whose renderings are kept in the log, where effects can evaluate them."""
 KEPT_ROWS = 128
-"""Approximate number of rows of a kept rendering; larger ones are subsampled."""
+"""Approximate height of the renderings in the log; larger renderings are subsampled."""
 
 
 class EngineError(ValueError):
-    """The engine does not support what a plan requires.
+    """Raised if an engine does not support a feature that a plan or a fit requires.
 
-    Raised only by ``UpdateEngine.bind`` and ``FitEngine.load_table``.
+    Only ``UpdateEngine.bind`` and ``FitEngine.load_table`` raise this error.
 
     Args:
-        engine: name of the engine. asked: the unsupported fields of the plan.
+        engine: name of the engine.
+        asked: names of the unsupported features.
 
     >>> print(EngineError("torch", ["gloss"]))
-    engine torch cannot compute: gloss; switch the effect off, or choose another device
+    engine torch does not support: gloss; disable the effect or choose another device
     """
 
     def __init__(self, engine: str, asked: Sequence[str]) -> None:
         super().__init__(
-            f"engine {engine} cannot compute: {', '.join(asked)}; switch the effect off, or choose another device"
+            f"engine {engine} does not support: {', '.join(asked)}; disable the effect or choose another device"
         )
         self.engine, self.asked = engine, tuple(asked)
 
 
 @dataclass(eq=False)
 class Tables:
-    """The parameters of a deformation, on the host. All zeros means no motion.
+    """Deformation parameters in host memory. If all values are zero, nothing moves.
 
     Attributes:
-        clusters: one table per layer, coarse to fine: [K, 10] float32, columns r, t, c, s of equation (6).
-        deltas: [M, 9] float32, columns Δp, ΔR, Δs of equation (7).
+        clusters: [K, 10] float32 table per layer, coarse to fine, with columns r, t, c, s of equation (6).
+        deltas: [M, 9] float32 table with columns Δp, ΔR, Δs of equation (7).
     """
 
     clusters: list[Array]
@@ -75,28 +79,30 @@ class Tables:
 
     @classmethod
     def identity(cls, hierarchy: Hierarchy) -> Tables:
-        """Returns tables without motion."""
+        """Returns all-zero tables, which represent no motion."""
         clusters = [np.zeros((count, 10), np.float32) for count in hierarchy.sizes]
         return cls(clusters, np.zeros((len(hierarchy.rows), 9), np.float32))
 
     def copy(self) -> Tables:
-        """Returns a copy with its own arrays."""
+        """Returns a deep copy."""
         return Tables([values.copy() for values in self.clusters], self.deltas.copy())
 
 
 @dataclass(frozen=True, eq=False)
 class AttemptStart:
-    """Constants of the iterations of one attempt. A parameter with learning rate 0 is not updated.
+    """Optimizer settings that stay constant during one attempt. A parameter with learning rate 0 is not updated.
 
     Attributes:
         layers: Adam learning rates of each layer (r, t in metres, c and s), coarse to fine.
-        position, rotation, scale: learning rates of Δp (metres), ΔR, Δs.
-        colour, static_colour: learning rates of the RGB colours of moving and of static Gaussians.
+        position, rotation, scale: learning rates of Δp (metres), ΔR and Δs.
+        colour, static_colour: learning rates of the RGB colours of moving and static Gaussians, respectively.
         beta1, beta2: Adam's decay rates.
-        samples: samples of entries in the hierarchy's order, [S] int64 each; ``StepScalars.sample`` selects one.
-        gains: [cameras, 3] initial camera gains, in the plan's order; None: gains are not estimated.
+        samples: samples of the moving Gaussians, each [S] int64 indices in hierarchy order;
+            ``StepScalars.sample`` selects one.
+        gains: [cameras, 3] initial camera gains, in the plan's camera order, or None if gains are not estimated.
         curve: whether to compute terms that only affect the reported loss, not the state.
-        lap: callback that receives the name of each finished stage, from engines that synchronize after each stage.
+        lap: callback that is called with the name of each stage when it ends. Only engines that synchronize after
+            every stage call it.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -114,27 +120,28 @@ class AttemptStart:
 
     @property
     def cluster_columns(self) -> list[list[float]]:
-        """Learning rates of the ten columns r, t, c, s of each layer's table."""
+        """Learning rates of the ten columns (r, t, c, s) of each layer's table."""
         return [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in self.layers]
 
     @property
     def delta_columns(self) -> list[float]:
-        """Learning rates of the nine columns Δp, Δr, Δs of the deltas."""
+        """Learning rates of the nine columns (Δp, Δr, Δs) of the deltas."""
         return [self.position] * 3 + [self.rotation] * 3 + [self.scale] * 3
 
 
 @dataclass(frozen=True)
 class StepScalars:
-    """The scalars that change between iterations.
+    """Scalars that may change from one iteration to the next.
 
     Attributes:
-        frozen: number of frozen layers, starting with the coarsest.
-        layers: factor on the learning rates of each layer; 0: the layer is not updated.
-        own: factor on the learning rates of Δp, ΔR, Δs. colour, gloss: factors on those of colours and gloss.
-        smooth_gloss: whether the updates of the gloss are averaged over neighbours after this step.
+        frozen: number of frozen layers, counted from the coarsest.
+        layers: learning rate factor of each layer; a layer with factor 0 is not updated.
+        own: learning rate factor of Δp, ΔR and Δs.
+        colour, gloss: learning rate factors of the colours and the gloss.
+        smooth_gloss: whether to average the gloss updates over neighbours after this step.
         rigidity: weight of the rigidity loss in this iteration.
-        sample: index of the attempt's sample whose neighbours are compared.
-        keep_pictures: whether the log keeps the rendering of this iteration.
+        sample: index into ``AttemptStart.samples``; the neighbour terms are evaluated for these Gaussians.
+        keep_pictures: whether to keep the renderings of this iteration in the log.
     """
 
     frozen: int
@@ -148,12 +155,21 @@ class StepScalars:
     keep_pictures: bool
 
 
+def kept_step(height: int, width: int) -> int:
+    """Returns the subsampling factor of a kept rendering.
+
+    >>> kept_step(720, 1280)
+    5
+    """
+    return max(1, min(height, width) // KEPT_ROWS)
+
+
 class Thinned(NamedTuple):
     """A subsampled rendering.
 
     Attributes:
-        every: step between the kept rows and columns.
-        planes: [5, h, w] float32: RGB before the camera's exposure, label, remaining transmittance.
+        every: subsampling factor along rows and columns.
+        planes: [5, h, w] float32 channels: RGB before the camera's exposure, label, and remaining transmittance.
     """
 
     every: int
@@ -162,16 +178,18 @@ class Thinned(NamedTuple):
     @classmethod
     def of(cls, features: Array, transmittance: Array) -> Thinned:
         """Subsamples a rendering: features [4, H, W] and remaining transmittance [H, W]."""
-        every = max(1, min(transmittance.shape) // KEPT_ROWS)
+        every = kept_step(*transmittance.shape)
         return cls(every, np.concatenate([features[:, ::every, ::every], transmittance[None, ::every, ::every]]))
 
 
 class ViewRecord(NamedTuple):
-    """The log entry of one rendering of a training view.
+    """Log entry for one rendering of a training view.
 
     Attributes:
-        view: index of the view. psnr: dB. colour_shift: [3] mean of the picture minus mean of the rendering, RGB in
-            0…1, with the camera's exposure applied.
+        view: index of the view.
+        psnr: PSNR of the rendering, in dB.
+        colour_shift: [3] mean of the training image minus mean of the rendering, RGB in 0…1, with the camera's
+            exposure applied.
     """
 
     view: int
@@ -181,12 +199,13 @@ class ViewRecord(NamedTuple):
 
 @dataclass(eq=False)
 class IterationLog:
-    """The log of the iterations since ``begin``.
+    """Log of all iterations since ``begin``.
 
     Attributes:
-        losses: weighted sum of the loss terms, per iteration. rendered: records of all renderings, in order.
-        pictures: the kept renderings by view index, oldest first.
-        guards: number of times that each guard was triggered (``guards.GUARDS``).
+        losses: weighted sum of the loss terms of each iteration.
+        rendered: records of all renderings, in order.
+        pictures: maps view indices to their most recent subsampled renderings, oldest first.
+        guards: maps the name of each guard (see ``guards.GUARDS``) to the number of times it was triggered.
     """
 
     losses: list[float] = field(default_factory=list)
@@ -195,7 +214,7 @@ class IterationLog:
     guards: dict[str, int] = field(default_factory=dict)
 
     def keep(self, view: int, picture: Thinned) -> None:
-        """Adds a rendering and drops all but the newest ``KEPT_PICTURES``."""
+        """Adds a rendering and drops all but the ``KEPT_PICTURES`` most recent ones."""
         self.pictures.pop(view, None)
         self.pictures[view] = picture
         for old in list(self.pictures)[:-KEPT_PICTURES]:
@@ -203,85 +222,87 @@ class IterationLog:
 
 
 class UpdateEngine(Protocol):
-    """Computes the updates of one scene on one device and owns the memory that they use.
+    """Runs the updates of one scene on one device and owns the required memory.
 
     Attributes:
-        name: name of the engine, for messages.
+        name: name of the engine, used in messages.
     """
 
     name: str
 
     @property
     def renderer(self) -> Renderer:
-        """Returns the renderer of states, with the background and limits of the plan."""
+        """Returns a renderer for states, with the background and limits of the plan."""
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """Allocates buffers and compiles kernels for the updates of a plan.
+        """Allocates buffers and compiles kernels for a plan.
 
         Raises:
-            EngineError: if the engine does not support what the plan requires.
+            EngineError: if the engine does not support a feature that the plan requires.
         """
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
-        """Loads the images of a frame; views that are already loaded are reused.
+        """Loads the images of a frame. Views that are already loaded are reused.
 
         Args:
             views: training views; ``iterate`` refers to them by index.
-            probes: views for comparing states, of the same cameras; ``probe`` refers to them by index.
+            probes: views of the same cameras that are used to compare states; ``probe`` refers to them by index.
         """
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads Θ_{t−1} without motion or learned colours."""
+        """Loads Θ_{t−1} and discards any motion and learned colours."""
 
     def set_tables(self, tables: Tables) -> None:
         """Sets the parameters of the deformation."""
 
     def begin(self, start: AttemptStart) -> None:
-        """Starts the iterations of an attempt, with zero Adam moments and an empty log."""
+        """Prepares the iterations of an attempt, with zero Adam moments and an empty log."""
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
         """Runs one iteration: deform, render, compare, backward, Adam step.
 
         Args:
-            views: indices of the views; the image and mask losses are averaged over them.
+            views: indices of the views to render; image and mask losses are averaged over them.
+            step: scalars of this iteration.
         """
 
     def leave_out(self, views: Sequence[int]) -> None:
-        """Excludes views, by index, from the rest of the attempt; the gains of their cameras stay unchanged."""
+        """Excludes the views with the given indices from the rest of the attempt, and freezes their cameras' gains."""
 
     def wait(self, iteration: int) -> None:
-        """Waits until the device is close to an iteration, so that host timings reflect the device's work."""
+        """Waits until the device has nearly reached an iteration, so that host timings reflect device work."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
-        """Returns the image losses of a state on some of the probe views.
+        """Returns the image loss of a state on each of the selected probe views.
 
         Args:
-            which: indices of the views. moved: whether Θ_{t−1} is deformed by the tables.
+            which: indices of the probe views.
+            moved: whether to deform Θ_{t−1} with the current tables.
             learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def tables(self) -> Tables:
-        """Returns the current parameters of the deformation."""
+        """Returns the current deformation parameters."""
 
     def log(self) -> IterationLog:
         """Returns the log of the iterations so far."""
 
     def state(self, learnt: bool) -> Gaussians:
-        """Returns Θ_{t−1} deformed by the tables, with accumulated material rotations.
+        """Returns Θ_{t−1} deformed by the current tables, with accumulated material rotations.
 
         Args:
             learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def gradients(self) -> dict[str, Array]:
-        """Returns the gradients of the last iteration's loss, for tests; call it before anything else is rendered.
+        """Returns the gradients of the last iteration's loss, for tests. Call it before rendering anything else.
 
-        The keys are "cluster 0" … [K, 10] and "deltas" [M, 9], with the columns of ``Tables``. If they are learned,
-        "colours" [N, 3], "gloss" [M, 3] and "environment" are included.
+        The keys are "cluster 0" … [K, 10] and "deltas" [M, 9], with the columns of ``Tables``. "colours" [N, 3],
+        "gloss" [M, 3] and "environment" are included if they are learned.
         """
 
     def exposures(self) -> Mapping[str, Array]:
-        """Returns the current [C, 2] gain and offset of each camera with views, by camera name."""
+        """Returns the current exposure of each camera with views, keyed by camera name: [C, 2] gain and offset."""
 
     def gains(self) -> Array:
-        """Returns the [cameras, 3] gains, updated with the renderings since the last round."""
+        """Returns the camera gains [cameras, 3], including measurements since the last complete round."""

@@ -1,8 +1,8 @@
-"""Camera gains and the exposures they imply: one factor per channel, applied to linear light before the sRGB curve.
+"""Camera gains and the resulting exposures. A gain is one factor per channel on linear light, before the sRGB curve.
 
-On the power segment of the sRGB curve, s = 1.055 L^(1/2.4) − 0.055, scaling the light by γ maps a value s to
+On the power segment of the sRGB curve, s = 1.055 L^(1/2.4) − 0.055. Scaling the light by γ maps a value s to
 a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. The gain a of a camera is
-therefore the median over pixels of (picture + 0.055) / (rendering + 0.055).
+therefore estimated as the median over pixels of (image + 0.055) / (rendering + 0.055).
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 FOOT = np.float32(0.055)
-"""Offset of the sRGB curve's power segment, see above."""
+"""Offset of the power segment of the sRGB curve; see the module docstring."""
 MIDDLE = np.float32(0.5)
-"""Value in 0…1 at which a gain and offset, as estimated in frame 0, are converted to a single gain."""
+"""Pixel value in 0…1 at which a gain and offset from frame 0 are converted to an equivalent gain."""
 LOOKED_AT = 4096
-"""Approximate number of pixels sampled per picture on a regular grid; more pixels do not change the median."""
+"""Approximate number of pixels sampled per image on a regular grid; more pixels do not change the median."""
 DARK, SATURATED = 0.05, 0.985
-"""Range of values in 0…1 that are used for measuring a gain; darker pixels are noisy and on the linear segment."""
+"""Range of pixel values in 0…1 used to measure a gain. Darker pixels are noisy and on the linear segment."""
 PIXELS = 100
-"""Minimum number of usable pixels per channel; with fewer, the camera's gain is left unchanged."""
+"""Minimum number of usable pixels per channel; with fewer, the camera's gain is not updated."""
 SHARE = 0.5
-"""Fraction of the difference to the measured gains that is applied per round over the cameras. An update of 100
-iterations has three to eight rounds, enough to follow a drift, while a single outlier round has little effect."""
+"""Fraction of the difference between measured and current gains that is applied per round. An update of 100 iterations
+has three to eight rounds. This is enough to follow a drift, while a single outlier round has little effect."""
 LARGEST = 2.0
-"""Upper bound of a gain a, and inverse of the lower bound; 2 corresponds to 5 times the light."""
+"""Maximum gain a; the minimum is its inverse. A gain of 2 corresponds to about 5 times the light."""
 CAMERAS = 4
-"""Minimum number of measured cameras; with fewer, gains cannot be told apart from colours that few cameras see."""
+"""Minimum number of measured cameras. With fewer, gains are indistinguishable from colours that few cameras see."""
 ENOUGH = 0.5
-"""Minimum share of the rig's cameras in a frame for updating gains; with few cameras, local errors bias the gains."""
+"""Minimum fraction of the rig's cameras needed to update the gains; with few cameras, local errors bias the gains."""
 
 
 def gain_to_exposure(gain: Array) -> Array:
-    """Converts a gain per channel [3] to the gain and offset [3, 2] of a picture's values.
+    """Converts a gain per channel [3] to an exposure, a gain and offset for pixel values [3, 2].
 
     >>> gain_to_exposure(np.ones(3, np.float32))[0]
     array([1., 0.], dtype=float32)
@@ -45,13 +45,13 @@ def gain_to_exposure(gain: Array) -> Array:
 
 
 def exposure_to_gain(exposure: Array) -> Array:
-    """Returns the gain [3] that has the same effect on ``MIDDLE`` as a gain and offset [3 or more, 2]."""
+    """Returns the gain [3] that has the same effect on the value ``MIDDLE`` as an exposure [3 or more, 2]."""
     gain: Array = (exposure[:3, 0] * MIDDLE + exposure[:3, 1] + FOOT) / (MIDDLE + FOOT)
     return gain
 
 
 def measured_gain(picture: Array, shown: Array) -> Array:
-    """Returns the gain [3] of a picture relative to its rendering without exposure, both [3, H, W]; NaN if unknown."""
+    """Returns the gain [3] of an image [3, H, W] relative to its rendering before exposure; NaN if not measurable."""
     gain = np.full(3, np.nan, np.float32)
     every = max(1, int(sqrt(picture[0].size / LOOKED_AT)))
     for channel in range(3):
@@ -63,14 +63,15 @@ def measured_gain(picture: Array, shown: Array) -> Array:
 
 
 def update_gains(gains: Array, measured: dict[int, Array], cameras: int) -> Array | None:
-    """Returns the gains after a round over the cameras, or None if the round has too few measurements.
+    """Returns the gains after a round over the cameras, or None if there are too few measurements.
 
-    The gains move by ``SHARE`` of the measured difference. Their mean logarithm is preserved, because a change that
-    all cameras share is a change of the light.
+    Each gain changes by ``SHARE`` of the difference from its measured value. The mean logarithm of the gains is
+    preserved, because a change common to all cameras is a change in lighting.
 
     Args:
-        gains: [cameras of the rig, 3]. measured: result of ``measured_gain`` by row of ``gains``.
-        cameras: number of cameras that take part in the frame.
+        gains: [cameras of the rig, 3] current gains.
+        measured: maps rows of ``gains`` to the results of ``measured_gain``.
+        cameras: number of cameras that contribute to the frame.
     """
     rows = [row for row, gain in measured.items() if np.isfinite(gain).all()]
     if len(rows) < CAMERAS or cameras < ENOUGH * len(gains):

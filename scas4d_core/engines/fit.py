@@ -1,10 +1,11 @@
-"""Interface between the loop of a fit and the device that computes it, and the values that cross it.
+"""Interface between the optimization loop of a fit and the engine that runs it, with the data they exchange.
 
-The loop (``fit.gaussian_fit``) decides, an engine computes. ``choose.fit_engine_of`` creates an engine::
+The loop (``fit.gaussian_fit``) makes the decisions; the engine does the computation. ``choose.fit_engine_of`` creates
+an engine::
 
-    engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
-    engine.load_table(table)             # parameters and moments; repeat whenever the host has changed them
-    engine.iterate(view, scalars)        # activate, render, compare, backward, Adam: once per iteration
+    engine.load_views(views, fixed)      # training images, and the fixed Gaussians of each view
+    engine.load_table(table)             # parameters and moments; call again after changing them on the host
+    engine.iterate(view, scalars)        # once per iteration: activate, render, compare, backward, Adam
     engine.table(), engine.state()       # the fitted parameters and Gaussians
 """
 
@@ -26,18 +27,18 @@ Array = NDArray[np.float32]
 MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
     slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 11), slice(11, 14), slice(14, 15)
 )  # fmt: skip
-"""Columns of the parameter table: metres, quaternion, log metres, logit, RGB in 0…1, logit."""
+"""Columns of the parameter table: mean in metres, quaternion, log scale, opacity logit, RGB in 0…1, label logit."""
 COLUMNS = 15
 
 
 @dataclass(eq=False)
 class RenderingStatistics:
-    """Per-Gaussian sums over the renderings since rows last changed, used for density control.
+    """Per-Gaussian statistics for density control, accumulated since rows were last added or removed.
 
     Attributes:
-        screen_gradients: [N] sum of the norms of the screen-space gradients, in units of half the picture's size.
-        rendered: [N] number of renderings that contained the Gaussian.
-        factors: [N, 3, 3] as rendered by the last iteration, before its step.
+        screen_gradients: [N] sum of screen-space gradient norms, in units of half the image size.
+        rendered: [N] number of renderings in which the Gaussian was visible.
+        factors: [N, 3, 3] covariance factors rendered in the last iteration, before its Adam step.
     """
 
     screen_gradients: NDArray[np.float64]
@@ -46,22 +47,23 @@ class RenderingStatistics:
 
     @classmethod
     def empty(cls, count: int) -> RenderingStatistics:
-        """Returns zero statistics for a number of Gaussians."""
+        """Returns statistics initialized to zero for ``count`` Gaussians."""
         return cls(np.zeros(count), np.zeros(count, np.int64), np.zeros((count, 3, 3), np.float32))
 
 
 class FitGloss(Protocol):
-    """Gloss and environment of the fitted Gaussians, as learned by one type of engine.
+    """Engine-specific representation of the gloss and environment that a fit learns.
 
     Attributes:
-        gloss: [N, 3] normals times strengths. environment: see ``Gaussians``.
+        gloss: [N, 3] normal of each Gaussian, scaled by its gloss strength.
+        environment: environment light; see ``Gaussians``.
     """
 
     gloss: Array
     environment: Array
 
     def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Self:
-        """Returns the gloss of some rows with their moments, then copies of the parents' rows with zero moments."""
+        """Returns the gloss of ``rows`` with their moments, followed by copies of ``parents`` with zero moments."""
 
 
 @dataclass(eq=False)
@@ -69,9 +71,12 @@ class FitTable:
     """The parameters of a fit and their Adam moments.
 
     Attributes:
-        parameters, first, second: [N, 15] float32, columns as above. steps: number of Adam steps so far.
-        beta1, beta2: Adam's decay rates. statistics: None if they are not needed.
-        gloss: learned direction-dependent part of the colours; None: colours do not depend on direction.
+        parameters: [N, 15] float32 parameters; see the column constants above.
+        first, second: [N, 15] float32 first and second Adam moments.
+        beta1, beta2: Adam's decay rates.
+        steps: number of Adam steps so far.
+        statistics: statistics for density control, or None if they are not needed.
+        gloss: learned view-dependent part of the colours, or None if colours do not depend on the view.
     """
 
     parameters: Array
@@ -88,8 +93,9 @@ class FitScalars(NamedTuple):
     """Learning rates and options of one iteration.
 
     Attributes:
-        rates: [15] float32, Adam learning rate of each column; a column with rate 0 is not updated.
-        gloss: factor on the learning rates of the gloss. colour_shift: whether to measure the colour shift.
+        rates: [15] float32 Adam learning rate of each column; a column with rate 0 is not updated.
+        gloss: factor that scales the learning rates of the gloss.
+        colour_shift: whether to measure the colour shift.
     """
 
     rates: Array
@@ -98,13 +104,15 @@ class FitScalars(NamedTuple):
 
 
 class FitLoss(NamedTuple):
-    """Losses of the rendering of one iteration, before its step.
+    """Losses of one iteration, computed before its Adam step.
 
     Attributes:
-        view: index of the view. loss: weighted sum of image and mask loss. psnr: dB.
+        view: index of the rendered view.
+        loss: weighted sum of image and mask loss.
+        psnr: PSNR of the rendering, in dB.
         exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset; valid until the
             next iteration.
-        colour_shift: [3] mean of the picture minus mean of the rendering; None if it was not requested.
+        colour_shift: [3] mean of the training image minus mean of the rendering, or None if it was not requested.
     """
 
     view: int
@@ -115,31 +123,33 @@ class FitLoss(NamedTuple):
 
 
 class FitEngine(Protocol):
-    """Computes one fit on one device."""
+    """Runs the iterations of one fit on one device."""
 
     @property
     def renderer(self) -> Renderer:
-        """Returns the renderer of states, which shares its buffers with the iterations."""
+        """Returns a renderer for states; it shares its buffers with the iterations."""
 
     def load_views(self, views: Sequence[TrainingView], fixed: Sequence[Gaussians] = ()) -> None:
-        """Loads the pictures of the fit. Each iteration reads the current exposure of its view.
+        """Loads the training images of the fit. Each iteration reads the current exposure of its view.
 
         Args:
-            fixed: for each view, Gaussians that are rendered with the fitted ones but not updated; empty: none.
+            views: training views; ``iterate`` refers to them by index.
+            fixed: Gaussians of each view that are rendered with the fitted ones but not updated. If empty, there are
+                none.
         """
 
     def load_table(self, table: FitTable) -> None:
         """Loads parameters, moments, statistics and gloss.
 
         Raises:
-            EngineError: if the engine cannot learn this kind of gloss.
+            EngineError: if the engine does not support this type of gloss.
         """
 
     def iterate(self, view: int, scalars: FitScalars) -> FitLoss:
-        """Runs one iteration: renders a view, compares it with its picture, backpropagates the loss and steps Adam."""
+        """Runs one iteration: renders a view, computes and backpropagates its loss, and takes an Adam step."""
 
     def table(self) -> FitTable:
         """Returns the current parameter table."""
 
     def state(self) -> Gaussians:
-        """Returns the fitted Gaussians without the fixed ones; their labels are between 0 and 1."""
+        """Returns the fitted Gaussians, without the fixed ones. Their labels are values between 0 and 1."""

@@ -1,4 +1,4 @@
-"""The free parameters of a deformation; all others stay at the identity."""
+"""Selection of the free parameters of a deformation. All other parameters stay at the identity."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Freedom:
-    """Flags for the free columns of the cluster tables and per-Gaussian deltas. All other columns stay exactly 0.
+    """Selects which columns of the cluster tables and per-Gaussian deltas are optimized; all others stay exactly 0.
 
     Attributes:
-        cluster_rotation, cluster_translation, cluster_scaling: r, t, and c with s of the clusters of all layers.
-        own_position, own_rotation, own_scale: Δp, ΔR, Δs of each Gaussian.
-        prediction: whether the free parameters are initialized with the previous motion instead of 0.
+        cluster_rotation: whether r is free for the clusters of all layers.
+        cluster_translation: whether t is free for the clusters of all layers.
+        cluster_scaling: whether c and s are free for the clusters of all layers.
+        own_position, own_rotation, own_scale: whether Δp, ΔR and Δs of each Gaussian are free.
+        prediction: whether to initialize the free parameters with the previous motion instead of 0.
 
     >>> Freedom(own_scale=True).clusters
     False

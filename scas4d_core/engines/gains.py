@@ -1,4 +1,4 @@
-"""Estimation of camera gains during an update: each round over the cameras measures every gain once."""
+"""Estimation of camera gains during an update. Each round measures the gain of every camera once."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ Array = NDArray[np.float32]
 
 
 class GainEstimator:
-    """Estimates the camera gains of an attempt and applies them to the exposures of the views.
+    """Estimates the camera gains during one attempt and applies them to the exposures of the views.
 
     Args:
-        gains: [cameras, 3] initial gains. rows: row of each camera, by name. views: views whose exposures are set in
-            place.
+        gains: [cameras, 3] initial gains.
+        rows: maps each camera name to its row in ``gains``.
+        views: training views, whose exposures are updated in place.
     """
 
     def __init__(self, gains: Array, rows: Mapping[str, int], views: Sequence[TrainingView]) -> None:
@@ -28,14 +29,15 @@ class GainEstimator:
         self._expose()
 
     def leave_out(self, views: Sequence[TrainingView]) -> None:
-        """Excludes views from further rounds; their exposures stay unchanged."""
+        """Excludes views from further rounds and leaves their exposures unchanged."""
         self._views = [view for view in self._views if view not in views]
 
     def record_rendering(self, view: TrainingView, shown: Array) -> None:
-        """Measures a camera's gain in its rendering; the second rendering of a camera starts a new round.
+        """Measures a camera's gain from a rendering. If the camera was already measured, a new round starts first.
 
         Args:
-            shown: [3, H, W] rendering without exposure.
+            view: training view that was rendered.
+            shown: [3, H, W] rendering, before the camera's exposure is applied.
         """
         row = self._rows[view.name]
         if row in self._measured:
@@ -43,7 +45,7 @@ class GainEstimator:
         self._measured[row] = measured_gain(view.target, shown)
 
     def finish_round(self) -> None:
-        """Ends a round and updates gains and exposures with its measurements."""
+        """Ends the current round and updates the gains and exposures from its measurements."""
         settled = update_gains(self.gains, self._measured, len(self._views))
         if settled is not None:
             self.gains = settled

@@ -1,4 +1,4 @@
-"""Constants of a rasterizer: the alpha that bounds a Gaussian's support, and the transmittance that ends a pixel."""
+"""Rasterizer constants, such as the minimum alpha of a Gaussian and the transmittance at which a pixel is complete."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from scas4d_core.cameras import Camera, WorldFrame, rig_inside
 
 
 class Limits(NamedTuple):
-    """Constants that must be equal for two rasterizers to agree.
+    """Rasterizer constants; two rasterizers only agree if they use the same values.
 
     Attributes:
-        alpha_floor: a Gaussian covers exactly the pixels where its alpha is at least this value. Smaller alphas are
-            invisible in 8-bit pictures. Culling by this support is exact.
-        alpha_cap: upper bound of a Gaussian's alpha; it bounds 1/(1 − alpha) in the backward pass.
-        transmittance_stop: a pixel is finished when its transmittance would fall below this value.
-        low_pass: pixels², added to the diagonal of the projected covariance, so that a Gaussian covers a pixel.
-        near: metres; Gaussians closer than this are culled.
-        tangent_margin: how far x/z (y/z) may lie beyond the picture's border before the projection's Jacobian is
-            evaluated at a clamped position; in units of half the picture's width (height).
+        alpha_floor: minimum alpha. A Gaussian covers exactly the pixels where its alpha is at least this value; lower
+            values are invisible in 8-bit images. Culling to this support is therefore exact.
+        alpha_cap: upper bound of a Gaussian's alpha, which bounds 1/(1 − alpha) in the backward pass.
+        transmittance_stop: blending of a pixel stops before its transmittance would fall below this value.
+        low_pass: value added to the diagonal of the projected covariance so that a Gaussian covers at least about one
+            pixel, in pixels².
+        near: depth of the near plane, in metres; closer Gaussians are culled.
+        tangent_margin: margin around the image within which the projection's Jacobian is exact, as a fraction of half
+            the image width (for x/z) or height (for y/z). Beyond it, the Jacobian is evaluated at a clamped position.
     """
 
     alpha_floor: float = guards.ALPHA_FLOOR
@@ -32,15 +33,15 @@ class Limits(NamedTuple):
 
 
 NEAR_SHARE = 0.1
-"""Near plane as a share of the rig's radius, used if the scene does not define one."""
+"""Depth of the near plane as a fraction of the rig's radius, used if the scene does not define one."""
 
 
 def scene_limits(near: float | str, rig_radius: float) -> Limits:
     """Returns the rasterizer constants for one scene.
 
     Args:
-        near: metres, or "auto" for ``NEAR_SHARE`` of the rig's radius.
-        rig_radius: metres.
+        near: depth of the near plane in metres, or "auto" for ``NEAR_SHARE`` times the rig's radius.
+        rig_radius: radius of the camera rig, in metres.
 
     >>> scene_limits("auto", rig_radius=3.0).near  # metres
     0.30000000000000004
@@ -48,13 +49,15 @@ def scene_limits(near: float | str, rig_radius: float) -> Limits:
     0.05
     """
     if isinstance(near, str):
-        # A single camera has no radius.
+        # A rig with a single camera has radius 0.
         near = NEAR_SHARE * rig_radius if rig_radius > 0 else Limits().near
     return Limits(near=near)
 
 
 def rig_limits(near: float | str, world: WorldFrame, cameras: Sequence[Camera]) -> Limits:
-    """Returns the rasterizer constants for a scene from its cameras in the user's world; see ``scene_limits``.
+    """Returns the rasterizer constants for a scene, given its cameras in user world coordinates.
+
+    See ``scene_limits``.
 
     >>> import numpy as np
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)

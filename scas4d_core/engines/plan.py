@@ -1,4 +1,4 @@
-"""Plan of a scene's updates: plain values that the effects fill in when they register."""
+"""Plan of a scene's updates: a plain record whose fields the effects set when they register."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float32]
 Plane = tuple[float, float, float, float]
 
 MAX_SCALE = 0.02
-"""Metres; the scale loss limits axes longer than this to their length in frame 0 (paper, scale loss)."""
+"""Axis length in metres up to which the scale loss is always 0 (paper, scale loss); see ``Structure.length_bounds``."""
 
 
 @dataclass(eq=False)
@@ -27,8 +27,9 @@ class ColourPlan:
     """Selects which colours an update learns.
 
     Attributes:
-        moving, static: whether the colours of the moving and of the static Gaussians are free.
-        changing_light: whether the light changes, so that colours learn faster (``effects.appearance.light``).
+        moving, static: whether the colours of moving and static Gaussians are learned.
+        changing_light: whether the lighting changes, which requires higher colour learning rates
+            (``effects.appearance.light``).
     """
 
     moving: bool = False
@@ -38,27 +39,32 @@ class ColourPlan:
 
 @dataclass(eq=False)
 class UpdatePlan:
-    """The loss terms, parameters and options of a scene's updates.
+    """Loss terms, free parameters and options of a scene's updates.
 
-    A term that no effect requests is not computed: its weight is 0 or its value is None.
+    If no effect requests a term, its weight stays 0 or its value None, and it is not computed.
 
     Attributes:
-        cameras: names of the rig's cameras, in the rig's order.
-        background: RGB in 0…1 behind all Gaussians. limits: constants of the rasterizer.
-        cluster_map, covariance: variants of equations (6) and (5), see ``engines.torch.deformation``.
-        image, soft_colour: weights of the image loss and of the mean absolute change of colours.
-        mask: weight of the mask loss. axis_length: weight of the scale loss, equation (8).
-        neighbour_terms: whether any effect requests terms between neighbours.
+        cameras: names of the rig's cameras, in rig order.
+        background: background colour, RGB in 0…1.
+        limits: rasterizer constants.
+        cluster_map: variant of equation (6); see ``engines.torch.deformation``.
+        covariance: variant of equation (5); see ``engines.torch.deformation``.
+        image: weight of the image loss.
+        soft_colour: weight of the soft-colour loss, the mean absolute colour change.
+        mask: weight of the mask loss.
+        axis_length: weight of the scale loss, equation (8).
+        neighbour_terms: whether any effect requests a neighbour term.
         rigidity, isometry, rotation: weights of the neighbour terms.
-        rigidity_fades: whether the weight of rigidity decays to 0 during an update (``effects.coherence.bending``).
-        floor: plane (a, b, c, d) in metres of the internal world; a·x + b·y + c·z + d > 0 is below the floor.
-        floor_weight: weight of the mean depth below the floor.
-        freedom: the free parameters of the deformation.
-        colours: the colours to learn; None: none.
+        rigidity_fades: whether the rigidity weight decays to 0 during an update (``effects.coherence.bending``).
+        floor: floor plane (a, b, c, d) in internal world coordinates, in metres. Points with
+            a·x + b·y + c·z + d > 0 are below the floor.
+        floor_weight: weight of the floor loss, the mean depth below the floor.
+        freedom: free parameters of the deformation.
+        colours: colours to learn, or None if no colours are learned.
         gloss: whether gloss and environment are learned (``effects.appearance.direction``).
         camera_gains: whether camera gains are estimated (``effects.appearance.camera_gain``).
-        full_images: whether every pixel can change; otherwise only pixels that moving Gaussians reach.
-        disables_skip: whether frames that Θ_{t−1} already reproduces well are updated too, because an effect learns
+        full_images: whether any pixel may change. If false, only pixels covered by moving Gaussians can change.
+        disables_skip: whether to update even frames that Θ_{t−1} already reproduces well, because an effect learns
             from them.
         learns_labels: whether moving Gaussians are detected from motion if no masks are given.
     """
@@ -88,7 +94,7 @@ class UpdatePlan:
     learns_labels: bool = False
 
     def learns_colours(self) -> ColourPlan:
-        """Returns the plan of the colours, and creates it on the first call."""
+        """Returns the colour plan, creating it on the first call."""
         if self.colours is None:
             self.colours = ColourPlan()
         return self.colours
@@ -96,12 +102,13 @@ class UpdatePlan:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """The clusters and neighbours of the moving Gaussians, which an update deforms.
+    """Clusters and neighbour graph of the moving Gaussians.
 
     Attributes:
-        hierarchy: clusters of the M moving Gaussians. neighbours: neighbour graph; None if no term needs it.
-        roots: [N, 3] metres, positions of all Gaussians in frame 0.
-        first_lengths: [M, 3] metres, axis lengths of the moving Gaussians in frame 0.
+        hierarchy: cluster hierarchy of the M moving Gaussians.
+        neighbours: neighbour graph, or None if no term needs it.
+        roots: [N, 3] positions of all Gaussians in frame 0, in metres.
+        first_lengths: [M, 3] axis lengths of the moving Gaussians in frame 0, in metres.
     """
 
     hierarchy: Hierarchy
@@ -111,6 +118,6 @@ class Structure:
 
     @property
     def length_bounds(self) -> Array:
-        """[M, 3] metres, the length above which the scale loss penalizes each axis."""
+        """[M, 3] axis lengths above which the scale loss applies, in metres."""
         bounds: Array = np.maximum(self.first_lengths, np.float32(MAX_SCALE))
         return bounds

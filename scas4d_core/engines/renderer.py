@@ -16,17 +16,17 @@ Array = NDArray[np.float32]
 
 
 CHANNELS = 4
-"""Number of features rendered per pass: red, green, blue, label."""
+"""Number of feature channels rendered per pass: red, green, blue, label."""
 BLOCK = 4
-"""Side of a block in pixels, see ``Renderer.reached``."""
+"""Side length of a block in pixels; see ``Renderer.reached``."""
 
 
 class Picture(NamedTuple):
-    """A rendered picture. It may share a buffer of the renderer, which the next call overwrites.
+    """A rendered image. It may be a view into a renderer buffer, which the next call overwrites.
 
     Attributes:
-        features: [C, H, W] float32, before the camera's exposure.
-        transmittance: [H, W] float32, remaining transmittance.
+        features: [C, H, W] float32 feature channels, before the camera's exposure is applied.
+        transmittance: [H, W] float32 remaining transmittance.
     """
 
     features: Array
@@ -34,7 +34,7 @@ class Picture(NamedTuple):
 
 
 def psnr_of(squares: float, pixels: int) -> float:
-    """Returns the PSNR in dB of a picture from its summed squared error over pixels and RGB; finite for equal pictures.
+    """Returns the PSNR in dB, given the squared error summed over pixels and RGB; finite even if the error is 0.
 
     >>> round(psnr_of(0.03 * 64, pixels=64), 6)  # an error of 0.1 in every value
     20.0
@@ -43,11 +43,12 @@ def psnr_of(squares: float, pixels: int) -> float:
 
 
 class Comparison(NamedTuple):
-    """Comparison of a rendered state with the picture of a view.
+    """Comparison of a rendered state with the training image of a view.
 
     Attributes:
-        psnr: dB. image_loss: 0.8 L1 + 0.2 (1 − SSIM), weighted.
-        colour_shift: [3] mean of the picture minus mean of the rendering, RGB in 0…1, with exposure applied.
+        psnr: PSNR of the rendering, in dB.
+        image_loss: weighted image loss, 0.8 L1 + 0.2 (1 − SSIM).
+        colour_shift: [3] mean of the training image minus mean of the rendering, RGB in 0…1, with exposure applied.
     """
 
     psnr: float
@@ -56,11 +57,16 @@ class Comparison(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients of a loss with respect to the renderer's inputs; the next call overwrites these buffers.
+    """Gradients of a loss with respect to the renderer's inputs, in buffers that the next call overwrites.
+
+    Gaussians that are not rendered have zero gradients.
 
     Attributes:
-        means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] for the projected means.
-            Gaussians that are not rendered have gradient 0.
+        means: [N, 3] gradients of the means.
+        factors: [N, 3, 3] gradients of the covariance factors.
+        opacities: [N] gradients of the opacities.
+        features: [N, C] gradients of the features.
+        screen: [N, 2] gradients of the projected means.
     """
 
     means: Array
@@ -73,8 +79,8 @@ class Gradients(NamedTuple):
 class Renderer(Protocol):
     """Renders states of one scene, with its background and limits.
 
-    Colours are those that the camera sees, gloss included. If ``features`` [N, C] are given, they are rendered instead;
-    C is a multiple of ``CHANNELS``.
+    The rendered colours include view-dependent gloss. If ``features`` [N, C] are given, they are rendered instead of
+    RGB and label; C must be a multiple of ``CHANNELS``.
     """
 
     def render(
@@ -86,35 +92,40 @@ class Renderer(Protocol):
         depth_channel: int = -1,
         background: Array | None = None,
     ) -> Picture:
-        """Renders RGB and label of a state as a camera sees it, without the camera's exposure.
+        """Renders RGB and label of a state from a camera, without applying the camera's exposure.
 
         Args:
+            state: Gaussians to render.
+            camera: camera in kernel format.
             features: [N, C] features to render instead of RGB and label.
-            depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres along z).
-            background: [C] float32 behind all Gaussians; None: the scene's background, and 0 in further channels.
+            depth_channel: channel of ``features`` to overwrite with the depth of each mean (metres along z), or −1.
+            background: [C] float32 background. If None, the scene's background is used for RGB and 0 for all other
+                channels.
         """
 
     def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
-        """Renders a state and compares it with the picture of a view; see ``render``."""
+        """Renders a state and compares it with the training image of a view; see ``render``."""
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """Returns the [N, P] sums over pixels of planes [P, H, W], weighted by each Gaussian's blending weights; P ≤ 4.
+        """Returns [N, P] sums of ``planes`` [P, H, W] over all pixels, weighted by each Gaussian's blending weights.
 
-        A plane of ones gives the number of pixels that each Gaussian covers.
+        P is at most 4. A plane of ones gives the number of pixels that each Gaussian covers.
         """
 
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """Returns the residual (picture minus rendering) summed over pixels with each Gaussian's blending weights.
+        """Sums the residuals (training image minus rendering), weighted by each Gaussian's blending weights.
 
         Args:
-            learnt: [N] 1 for the Gaussians whose sums are needed.
-            most: limit to which residuals are clipped, RGB in 0…1.
+            state: Gaussians to render.
+            view: training view.
+            learnt: [N] uint8 mask of the Gaussians whose sums are needed.
+            most: magnitude to which residuals are clipped; RGB values are in 0…1.
 
         Returns:
-            [N, 3] weighted RGB sums without the camera's exposure, and [N] sums of the weights (pixels).
+            [N, 3] weighted sums of the RGB residuals before exposure, and [N] sums of the weights, in pixels.
         """
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """Returns a padded [h, w] bool grid of the ``BLOCK``-pixel blocks that the rows' supports intersect."""
+        """Returns a padded [h, w] mask of the ``BLOCK``-pixel blocks that the supports of ``rows`` intersect."""

@@ -1,4 +1,4 @@
-"""Host-side records of training views and their cameras, which every engine uploads to its device."""
+"""Training views and cameras in host memory, which each engine uploads to its device."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from scas4d_core.cameras import Camera
 Array = NDArray[np.float32]
 
 SIDE = 8
-"""Side in pixels of the squares whose mean colours are compared between frames; averaging reduces their noise."""
+"""Side length, in pixels, of the squares whose mean colours are compared between frames. Averaging reduces noise."""
 LABEL = 3
-"""Index of the label channel, after red, green and blue."""
+"""Index of the label channel, which follows red, green and blue."""
 
 
 class CameraArrays(NamedTuple):
-    """A camera in kernel format: ``pose`` [3, 4] and ``lens`` [6] (fx, fy, cx, cy, width, height), float32."""
+    """A camera in the format that kernels expect.
+
+    Attributes:
+        pose: [3, 4] float32 world-to-camera transform.
+        lens: [6] float32 intrinsics: fx, fy, cx, cy, width, height.
+        width, height: image size in pixels.
+    """
 
     pose: Array
     lens: Array
@@ -29,26 +35,27 @@ class CameraArrays(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera) -> CameraArrays:
-        """Converts a ``Camera`` of the internal world."""
+        """Converts a ``Camera`` in internal world coordinates."""
         pose = np.ascontiguousarray(camera.world_to_camera[:3], dtype=np.float32)
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
         return cls(pose, lens, camera.width, camera.height)
 
     @property
     def centre(self) -> Array:
-        """[3] metres, the camera centre in the internal world."""
+        """[3] camera centre in internal world coordinates, in metres."""
         centre: Array = -(self.pose[:, :3].T @ self.pose[:, 3])
         return centre
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """The pictures of one camera in one frame.
+    """The image and optional mask of one camera in one frame.
 
     Attributes:
-        name: name of the camera. camera: the camera in kernel format.
-        target: [C, H, W] float32, RGB in 0…1, followed by the mask if the frame has one; C is 3 or 4.
-        exposure: [C, 2] gain and offset of the camera; those of the label are 1 and 0.
+        name: name of the camera.
+        camera: camera in kernel format.
+        target: [C, H, W] float32 image, RGB in 0…1, followed by the mask if the frame has one. C is 3 or 4.
+        exposure: [C, 2] gain and offset of each channel; 1 and 0 for the mask.
     """
 
     name: str
@@ -58,21 +65,21 @@ class TrainingView:
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:
-        """[3] mean RGB of the picture, in 0…1; computed on first access."""
+        """[3] mean RGB of the image, in 0…1; computed on first access."""
         return means(self.target[:3])
 
     @cached_property
     def squares(self) -> Array:
-        """[h, w, 3] mean colours of the picture's complete squares of ``SIDE`` pixels; computed on first access."""
+        """[h, w, 3] mean colours of all complete ``SIDE``-pixel squares of the image; computed on first access."""
         height, width = self.target.shape[1] // SIDE, self.target.shape[2] // SIDE
         part = self.target[:3, : height * SIDE, : width * SIDE]
-        columns = part.reshape(3, height, SIDE, width * SIDE).sum(axis=2)  # rows first: five times faster
+        columns = part.reshape(3, height, SIDE, width * SIDE).sum(axis=2)  # five times faster with rows first
         sums = columns.reshape(3, height, width, SIDE).sum(axis=3)
         return np.ascontiguousarray(np.moveaxis(sums / np.float32(SIDE * SIDE), 0, -1))
 
 
 def means(planes: Array) -> NDArray[np.float64]:
-    """Returns the mean [C] of each of the planes [C, H, W]; summing rows in float32 is twice as fast."""
+    """Returns the mean [C] of each plane [C, H, W]. Rows are summed in float32, which is twice as fast."""
     _, height, width = planes.shape
     result: NDArray[np.float64] = planes.sum(axis=2).sum(axis=1, dtype=np.float64) / (height * width)
     return result

@@ -1,4 +1,4 @@
-"""Writes files atomically, and imports packages that only some exports need. Needs only the standard library."""
+"""Writes files atomically, and imports packages that only some exports need. Requires only the standard library."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from scas4d_core.errors import InputError, message_of
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yields a temporary path next to ``path``; on success that file is renamed to ``path``, on an error it is deleted.
+    """Yields a temporary path next to ``path``. The file is renamed to ``path`` on success and deleted on error.
 
-    The temporary name keeps the suffix, because some libraries choose the format from it.
+    The temporary name keeps the suffix, because some libraries infer the format from it.
 
     Raises:
         InputError: the folder or the file cannot be written, or the disk is full.
@@ -40,7 +40,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 def check_writable(path: Path | str) -> None:
-    """Creates and removes a file next to ``path``, so that a long export fails early.
+    """Creates and removes a file next to ``path``, so that a long export to an unwritable folder fails early.
 
     Raises:
         InputError: the folder is not writable.
@@ -68,16 +68,16 @@ def translate_write_errors(path: Path | str) -> Iterator[None]:
     except OSError as error:
         raise InputError(
             f"out {str(path)!r} cannot be written ({message_of(error)})",
-            "give a path in a folder that exists and may be written to, on a disk with room",
+            "give a path in a folder that exists and is writable, on a disk with free space",
         ) from error
 
 
 def import_optional(name: str, export: str) -> Any:
-    """Imports a package of the extra ``exports``.
+    """Imports a package from the optional dependencies ``exports``.
 
     Args:
         name: name of the module.
-        export: the format, for the message.
+        export: name of the export format, for the error message.
 
     Raises:
         InputError: the package is not installed; the message includes the command that installs it.
@@ -91,5 +91,5 @@ def import_optional(name: str, export: str) -> Any:
     except ImportError as error:
         raise InputError(
             f"format {export!r} needs the package {name}, which is not installed",
-            "in the project's folder: pip install -e '.[exports]'",
+            "in the project folder, run pip install -e '.[exports]'",
         ) from error

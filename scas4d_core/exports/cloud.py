@@ -1,4 +1,4 @@
-"""The Gaussians of one frame as needed by exports: covariances decomposed, in the user's world, with harmonics and ids.
+"""The Gaussians of one frame in a form for export: decomposed covariances in the user's world, harmonics and ids.
 
 OpenCV axes are x right, y down, z forward; those of glTF, SPZ and USD are x right, y up, z towards the viewer. A half
 turn about x converts one to the other. It is a rotation, so nothing is mirrored, and it is its own inverse.
@@ -23,7 +23,7 @@ HALF_TURN = np.diag([1.0, -1.0, -1.0])
 _SOME_DIRECTION = np.array([[0.48, 0.6, 0.64]])
 """A direction in which no harmonic up to degree 3 is zero."""
 HARMONIC_SIGNS: Float = np.sign(basis_of(_SOME_DIRECTION @ HALF_TURN) / basis_of(_SOME_DIRECTION))[0]
-"""[16] signs of the harmonics' coefficients under the half turn; each harmonic is even or odd in (y, z)."""
+"""[16] sign of each harmonic's coefficient under the half turn; each harmonic is even or odd in (y, z)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,9 @@ class Cloud:
     """The exported Gaussians of one frame.
 
     Attributes:
-        splats: means, scales, rotations, opacities and colours; for view-dependent colours, the component of degree 0.
-        harmonics: [N, K, 3] coefficients of RGB − 0.5; K = 1, or 16 for view-dependent colours.
-        ids: [N] int64.
+        splats: means, scales, rotations, opacities and colours; only degree 0 of view-dependent colours.
+        harmonics: [N, K, 3] spherical harmonic coefficients of RGB − 0.5; K = 1, or 16 for view-dependent colours.
+        ids: [N] int64 Gaussian ids.
     """
 
     splats: Splats
@@ -73,7 +73,7 @@ class Cloud:
         )
 
     def rows(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
-        """Returns the Gaussians of the given rows ([N] bool, or indices)."""
+        """Returns the Gaussians at the given rows ([N] bool, or indices)."""
         kept = {name: getattr(self.splats, name)[chosen] for name in Splats.__dataclass_fields__}
         return Cloud(Splats(**kept), self.harmonics[chosen], self.ids[chosen])
 
@@ -84,10 +84,10 @@ def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) 
     Args:
         gaussians: N Gaussians in the internal world.
         world: transform from the user's world to the internal world.
-        retired: True keeps retired Gaussians with opacity 0; False omits them.
+        retired: whether to keep retired Gaussians, with opacity 0, instead of omitting them.
 
     Raises:
-        InputError: rows are not finite or have no volume; the message names row and id.
+        InputError: Gaussians are not finite or have no volume; the message gives their rows and ids.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1).retire([0])
     >>> found = cloud_of(state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
@@ -104,7 +104,7 @@ def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) 
 
 
 def linear_light(colours: NDArray[np.floating]) -> Float:
-    """Converts colours from the sRGB curve (IEC 61966-2-1) to linear light, after clipping them to 0…1.
+    """Converts sRGB colours (IEC 61966-2-1) to linear light, after clipping them to 0…1.
 
     >>> linear_light(np.array([0.0, 0.5, 1.0])).round(4)
     array([0.   , 0.214, 1.   ])

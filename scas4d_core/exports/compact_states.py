@@ -1,4 +1,4 @@
-"""Writes a sequence as a compact 4D file (``scas4d_core.compact``), which preserves ids and which Gaussians move."""
+"""Writes a sequence as a compact 4D file (``scas4d_core.compact``), which preserves the ids and the moving flags."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class CompactSequence:
     """Writes a sequence frame by frame. The file appears atomically on ``finish``.
 
     Args:
-        path: path of the file; an existing one is replaced.
+        path: path of the file; an existing file is replaced.
         world: transform from the user's world to the internal world.
         rig: rig in the user's world, or None.
-        labels: [N] part of each Gaussian by row, negative for none; None for no parts.
+        labels: [N] part label of each Gaussian, negative for none; None to store no parts.
         frames_per_second: nominal frame rate, or None.
         background: background colour, RGB in 0…1.
 
@@ -68,7 +68,7 @@ class CompactSequence:
                 raise
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Adds a frame: its index, its time in seconds, and its state in the internal world.
+        """Adds a frame, given its index, its time in seconds, and its state in the internal world.
 
         Raises:
             InputError: the frame cannot follow the previous ones, or has non-finite values.

@@ -1,4 +1,4 @@
-"""Export formats: names, suffixes, conventions and losses. docs/exports.md shows this table."""
+"""Export formats: names, suffixes, conventions and lost information. docs/exports.md shows them as a table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 USER_AXES = "user's, y down"
 Y_UP = "y up"
 WITH_PARTS = ("usd", "s4d")
-"""Formats that include parts if there are any."""
+"""Formats that store parts if the scene has any."""
 
 
 @dataclass(frozen=True)
@@ -22,16 +22,16 @@ class Format:
 
     Attributes:
         name: name used to select the format.
-        suffixes: suffixes of its files; the first is used for numbered files.
-        numbered: whether a sequence is one numbered file per frame, instead of a single file.
+        suffixes: file suffixes; the first is used for numbered files.
+        numbered: whether a sequence is written as one numbered file per frame instead of a single file.
         needs_parts: whether the format requires parts.
         axes, unit: axes and unit of positions.
-        colour: colour space and representation.
-        scale, opacity: linear, or logarithm or logit.
+        colour: colour space and encoding.
+        scale, opacity: encoding, such as linear, logarithm or logit.
         shape: encoding of the covariance.
-        ids: location of the ids, or "lost".
+        ids: where ids are stored, or "lost".
         lost: information that a reader cannot recover.
-        package: package required in addition to those for a reconstruction, or "".
+        package: packages required in addition to those for reconstruction, or "".
     """
 
     name: str
@@ -83,7 +83,7 @@ _FORMATS = (
         numbered=True,
         axes=USER_AXES,
         unit="the user's",
-        colour="sRGB, degree 0, 8 bits, cut to 0…1",
+        colour="sRGB, degree 0, 8 bits, clipped to 0…1",
         scale="linear, float32",
         opacity="linear, 8 bits",
         shape="quaternion (w, x, y, z) in 8 bits each, 3 scales",
@@ -114,9 +114,9 @@ _FORMATS = (
         colour="as glb, of the first frame",
         scale="linear, float32",
         opacity="linear, float32",
-        shape="as glb, in the part's own frame; an animation turns it",
+        shape="as glb, in the part's local frame, which is animated",
         ids="attribute `_ID`",
-        lost="bending within parts; what is born later; changes of colour and size; highlights turn with the part",
+        lost="bending within parts; Gaussians born later; changes of colour and size; highlights rotate with the part",
         needs_parts=True,
     ),
     Format(
@@ -130,7 +130,7 @@ _FORMATS = (
         opacity="linear, float32; 0 while absent",
         shape="quaternion (USD's quatf), 3 scales",
         ids="`primvars:scas4d:id`",
-        lost="indices of frames but the first (time codes follow the times); which Gaussians move",
+        lost="frame indices except the first (time codes follow the times); which Gaussians move",
         package="usd-core",
     ),
     Format(
@@ -144,7 +144,7 @@ _FORMATS = (
         opacity="–",
         shape="–",
         ids="column `id`",
-        lost="all but the centres of what moves",
+        lost="everything except the centres of moving Gaussians",
     ),
     Format(
         name="poses",
@@ -157,7 +157,7 @@ _FORMATS = (
         opacity="–",
         shape="–",
         ids="–",
-        lost="all but the rigid motion of the parts",
+        lost="everything except the rigid motion of the parts",
         needs_parts=True,
     ),
     Format(
@@ -166,19 +166,19 @@ _FORMATS = (
         numbered=False,
         axes="y down, from the `origin` in the header",
         unit="metre; the header has `metres_per_unit`",
-        colour="sRGB; gloss as it is",
-        scale="by the factor, within bounds in the header ([format.md](format.md))",
+        colour="sRGB; gloss unchanged",
+        scale="in the factor F, within the bounds in the header ([format.md](format.md))",
         opacity="linear",
         shape="the factor F, Σ = F Fᵀ, and the material rotation",
-        ids="kept",
-        lost="no more than the bounds allow",
+        ids="preserved",
+        lost="precision, within the bounds",
     ),
 )
 FORMATS: Mapping[str, Format] = MappingProxyType({each.name: each for each in _FORMATS})
 """All formats by name."""
 
 COLUMNS = ("name", "suffixes", "axes", "unit", "colour", "scale", "opacity", "shape", "ids", "lost")
-"""Columns of the documentation's table."""
+"""Columns of the table in the documentation."""
 
 
 def format_of(name: str) -> Format:
@@ -206,17 +206,17 @@ def check_suffix(path: Path, format: Format) -> None:
 
     >>> check_suffix(Path("a.txt"), FORMATS["tracks"])
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: out 'a.txt' is not a file name for format 'tracks'; let it end in .csv
+    scas4d_core.errors.InputError: out 'a.txt' has the wrong suffix for format 'tracks'; use .csv
     """
     if path.suffix.lower() not in format.suffixes:
         raise InputError(
-            f"out {str(path)!r} is not a file name for format {format.name!r}",
-            f"let it end in {' or '.join(format.suffixes)}",
+            f"out {str(path)!r} has the wrong suffix for format {format.name!r}",
+            f"use {' or '.join(format.suffixes)}",
         )
 
 
 def table() -> str:
-    """Returns the table as Markdown; formats that differ only in their name share a line.
+    """Returns the formats as a Markdown table; formats that differ only in name share a row.
 
     >>> print(table().splitlines()[0])
     | name | suffixes | sequence | axes | unit | colour | scale | opacity | shape | ids | lost |

@@ -1,6 +1,6 @@
-"""The container ``.glb`` (glTF 2.0, section 4): a JSON chunk and a binary chunk, with accessors into the latter.
+"""The ``.glb`` container (glTF 2.0, section 4): a JSON chunk, and a binary chunk referenced by accessors.
 
-Implemented without a package, because splats need only a small subset of glTF.
+Implemented without a third-party package, because splats need only a small subset of glTF.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ GENERATOR = "SCas4D"
 
 
 class Binary:
-    """Collects the arrays of one file.
+    """Collects the arrays of one ``.glb`` file.
 
     Attributes:
-        accessors, views: accessors and buffer views of the document.
+        accessors, views: accessors and buffer views of the JSON document.
         length: current size of the binary chunk in bytes.
 
     >>> binary = Binary()
@@ -54,12 +54,11 @@ class Binary:
         """Adds an array as an accessor with its own buffer view; returns the accessor's index.
 
         Args:
-            array: [N, …] array with N ≥ 1 and a dtype in ``COMPONENTS``. Rows of vertex attributes must have a multiple
-                of 4
-                bytes.
+            array: [N, …] array with N ≥ 1 and a dtype in ``COMPONENTS``. For vertex attributes, the row size must be a
+                multiple of 4 bytes.
             vertices: whether the array is a vertex attribute.
             bounds: whether to write min and max, which glTF requires for positions and times.
-            normalized: whether integers represent 0…1.
+            normalized: whether integers represent values in 0…1.
         """
         given = np.ascontiguousarray(array)
         accessor: dict[str, Any] = {
@@ -81,12 +80,12 @@ class Binary:
         return len(self.accessors) - 1
 
     def write(self, path: Path | str, document: Mapping[str, Any]) -> None:
-        """Writes a document with these arrays atomically.
+        """Writes a document and these arrays atomically.
 
         Args:
             path: path of the file.
-            document: JSON document without asset, buffers, views and accessors; its ``asset_extras`` become the asset's
-                ``extras``.
+            document: JSON document without asset, buffers, buffer views and accessors; its ``asset_extras`` become the
+                ``extras`` of the asset.
 
         Raises:
             InputError: the file would exceed 4 GiB, or cannot be written.
@@ -109,7 +108,7 @@ class Binary:
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + (8 + self.length if self._arrays else 0)
         if total > LONGEST:
-            raise InputError(f"out {str(path)!r} would have {total:,} bytes, and a .glb ends at 4 GiB", "export as ply")
+            raise InputError(f"out {str(path)!r} would have {total:,} bytes, but .glb allows 4 GiB", "export as ply")
         with atomic_path(path) as beside, beside.open("wb") as file:
             file.write(struct.pack("<4sII", b"glTF", 2, total))
             file.write(struct.pack("<I4s", len(text), b"JSON") + text)

@@ -1,15 +1,15 @@
 """Writes a frame as ``.glb`` with KHR_gaussian_splatting, as ratified by Khronos (its README in KhronosGroup/glTF).
 
 Scale is linear and nonnegative, opacity linear in 0…1, rotation a unit quaternion (x, y, z, w), all float32. Harmonics
-have the signs and the order of 3DGS. Drafts before the ratified text used the logarithm of the scale.
+have the signs and the order of 3DGS. Drafts of the extension used the logarithm of the scale.
 
-glTF has y up, z towards the viewer, and metres. Positions, rotations and harmonics are rotated by 180° about x and
-converted to metres *in the data*, and the node's transform is the identity. The extension says that a reader SHOULD
-rotate harmonics with the node, so some readers will not; the half turn only changes signs, so it is lossless.
-``asset.extras`` has ``metres_per_unit`` for the inverse conversion.
+In glTF, y points up and z towards the viewer, and lengths are in metres. Positions, rotations and harmonics are rotated
+by 180° about x and converted to metres *in the data*, and the node's transform is the identity. The extension says that
+a reader SHOULD rotate harmonics with the node, so some readers will not. The half turn only changes signs, so it is
+lossless. ``asset.extras`` stores ``metres_per_unit`` for the inverse conversion.
 
-``COLOR_0`` (linear light, 16 bits) is shown as points by readers without the extension. ``_ID`` contains the ids as
-float32, exact below 2²⁴; it is omitted if an id is larger.
+Readers without the extension show points with the colours ``COLOR_0`` (linear light, 16 bits). ``_ID`` contains the ids
+as float32, which is exact below 2²⁴; it is omitted if an id is larger.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0
 """Primitive mode of points."""
 EXACT_IDS = 2**24
-"""Limit below which float32 represents all integers; glTF allows no 32-bit integers as vertex attributes."""
+"""Limit below which float32 represents all integers; glTF does not allow 32-bit integers as vertex attributes."""
 DEGREES = ((0,), (1, 2, 3), (4, 5, 6, 7, 8), (9, 10, 11, 12, 13, 14, 15))
-"""Rows of the harmonics by degree."""
+"""Indices of the harmonics of each degree."""
 
 
 def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
@@ -42,7 +42,7 @@ def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
         world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: rows are not finite or have no volume, the file would exceed 4 GiB, or it cannot be written.
+        InputError: Gaussians are not finite or have no volume, the file would exceed 4 GiB, or it cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -104,7 +104,7 @@ def splat_primitive(binary: Binary, cloud: Cloud) -> dict[str, Any]:
 
 
 def asset_extras(world: WorldFrame) -> dict[str, Any]:
-    """Returns extras that relate the file's world to the user's: position · (1, −1, −1) / ``metres_per_unit``.
+    """Returns asset extras for converting to the user's world: position · (1, −1, −1) / ``metres_per_unit``.
 
     >>> asset_extras(WorldFrame(np.zeros(3), metres_per_unit=0.01))["metres_per_unit"]
     0.01

@@ -1,14 +1,14 @@
 """Writes an articulated asset: one ``.glb`` with a node per part, which contains its splats and its rigid motion.
 
-Each node has the Gaussians of the first frame in the part's local frame, and an animation of translation and rotation
-(linear; seconds since the first frame). Gaussians without a part do not move and are in the node ``standing``. Axes,
-units and attributes are those of ``gltf``. Deformation within a part, Gaussians born later, and changes of colour and
-size are lost. Highlights rotate with the part instead of staying fixed in the world.
+Each node contains the Gaussians of the first frame in the part's local frame. A linear animation gives its translation
+and rotation, with times in seconds since the first frame. Gaussians without a part do not move and are in the node
+``standing``. Axes, units and attributes are the same as in ``gltf``. Deformation within a part, Gaussians born later,
+and changes of colour and size are lost. Highlights rotate with the part instead of staying fixed in the world.
 
 The ``extras`` of a node report the residual of the rigid motion. ``residual_rms`` is the weighted RMS distance between
-the rigid prediction and the means over all frames after the first. ``residual_worst`` is that of the worst frame, whose
-index is ``worst_frame``. They are in the user's units, and with the suffix ``_percent`` in percent of the extent of the
-moving Gaussians.
+the rigid prediction and the means over all frames after the first. ``residual_worst`` is the distance in the worst
+frame, whose index is ``worst_frame``. Both are in the user's units; with the suffix ``_percent``, they are percentages
+of the extent of the moving Gaussians.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Float = NDArray[np.float64]
 
 @dataclass
 class _Keyframes:
-    """Key frames of one part's animation in glTF's axes and unit, and residuals in the user's unit."""
+    """Keyframes of one part's animation in glTF's axes and units, and residuals in the user's units."""
 
     times: list[float] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
@@ -54,15 +54,15 @@ class _Keyframes:
 
 
 class PartAsset:
-    """Writes the asset of a sequence. Keeps the first frame in memory, and 64 bytes per part of each later one.
+    """Writes a sequence as an articulated asset. Keeps the first frame in memory, and 64 bytes per part and frame.
 
     Args:
         path: path of the file.
         world: transform from the user's world to the internal world.
-        labels: [N] part of each Gaussian by row, negative for none.
+        labels: [N] part label of each Gaussian, negative for none.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder is not writable.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
@@ -103,8 +103,8 @@ class PartAsset:
             self._keys = {part: _Keyframes() for part in self._motion.parts}
         elif not time > self._latest:
             raise InputError(
-                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the frame before",
-                "give frames in the order of their times",
+                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the previous frame",
+                "give frames in chronological order",
             )
         self._latest = time
         for pose in self._motion.poses(gaussians):
@@ -114,7 +114,7 @@ class PartAsset:
         """Writes the file atomically.
 
         Raises:
-            InputError: there was no frame, or the file cannot be written.
+            InputError: no frame was added, or the file cannot be written.
         """
         if self._motion is None or self._first is None:
             raise InputError("there is no frame to export", "give at least one frame")

@@ -1,6 +1,6 @@
-"""Fits the rigid motion of parts since the first frame with weighted Kabsch over the means of their Gaussians.
+"""Fits the rigid motion of each part since the first frame, by weighted Kabsch over the means of its Gaussians.
 
-A Gaussian is weighted by its image coverage. If the means leave a rotation undetermined, such as that of a thin rod
+Each Gaussian is weighted by its image coverage. If the means leave a rotation undetermined, such as that of a thin rod
 about its axis, the Gaussians' material rotations determine it.
 """
 
@@ -23,21 +23,21 @@ Float = NDArray[np.float64]
 ROUNDS = 20
 """Maximum number of reweighting iterations; results stop changing after about ten."""
 PRECISION = 1e-6
-"""Precision of positions relative to the part's size, for float32 some metres from the origin."""
+"""Precision of float32 positions a few metres from the origin, relative to the part's size."""
 PULL = 1e-9
 """Weight of the prior rotation ``near`` relative to the points' spread; it matters only if R is ambiguous."""
 
 
 @dataclass(frozen=True, eq=False)
 class PartPose:
-    """A part in one frame. A point x₀ in its local frame is at ``rotation @ x₀ + position`` in the user's world.
+    """The pose of a part in one frame. It maps a local point x₀ to ``rotation @ x₀ + position`` in the user's world.
 
     The local frame has the user's axes; its origin is the weighted centre of the part in the first frame.
 
     Attributes:
         part: label of the part.
         rotation: [3, 3] rotation since the first frame.
-        position: [3] position of the origin, in the user's units.
+        position: [3] position of the local origin, in the user's units.
         residual: weighted RMS distance between the rigid prediction and the means, in the user's units.
     """
 
@@ -53,17 +53,17 @@ class PartPose:
 
 
 class PartMotion:
-    """Tracks parts from a first frame on. Stores the means of that frame, but no later frames.
+    """Tracks the rigid motion of parts from a first frame onwards. Stores the means of that frame, but no later frames.
 
     Gaussians that were born after the first frame, or are retired in the current one, are ignored.
 
     Args:
-        labels: [N] part of each Gaussian by row, negative for none.
+        labels: [N] part label of each Gaussian, negative for none.
         first: state of the first frame in the internal world.
         world: transform from the user's world to the internal world.
 
     Attributes:
-        parts: labels that have a Gaussian in the first frame, in increasing order.
+        parts: labels with at least one Gaussian in the first frame, in increasing order.
         extent: extent of the moving Gaussians in the first frame, in the user's units; the reference for percentages.
 
     Raises:
@@ -85,7 +85,7 @@ class PartMotion:
         self.extent = moving_extent(first) / world.metres_per_unit
         self.parts = sorted({int(part) for part in self._labels[first.present] if part >= 0})
         if not self.parts:
-            raise InputError("parts: no Gaussian of the first frame belongs to one", "ask for the parts of this scene")
+            raise InputError("parts: no Gaussian of the first frame belongs to a part", "give the parts of this scene")
         self.origins = {part: self._centre(self._start, self.rows(part)) for part in self.parts}
         self._first_turns = first.rotations
 
@@ -107,7 +107,7 @@ class PartMotion:
         return part_poses
 
     def _mean_material_rotation(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
-        """Returns the weighted mean [3, 3] of the rotations since the first frame, approximately a rotation."""
+        """Returns the weighted mean [3, 3] of the material rotations since the first frame; not exactly a rotation."""
         now = quaternions_to_matrices(gaussians.rotations[rows].astype(np.float64))
         then = quaternions_to_matrices(self._first_turns[rows].astype(np.float64))
         turn: Float = np.einsum("n,nik,njk->ij", weights, now, then)
@@ -122,11 +122,11 @@ class PartMotion:
 def majority_motion(
     before: NDArray[Any], after: NDArray[Any], weights: NDArray[Any] | None = None, near: NDArray[Any] | None = None
 ) -> tuple[Float, Float, float]:
-    """Fits the rigid motion of most points; arguments and results are those of ``rigid_motion``.
+    """Fits the rigid motion of the majority of points; arguments and results are the same as in ``rigid_motion``.
 
-    Outliers get Cauchy weights scaled by the median distance (Holland and Welsch 1977). They occur because a part
-    segmented by motion includes Gaussians of its neighbours, and interior ones that no image constrains. The returned
-    RMS distance is that of all points.
+    Cauchy weights, scaled by the median distance, suppress outliers (Holland and Welsch 1977). Outliers occur because a
+    part segmented by motion includes Gaussians of its neighbours, and interior ones that no image constrains. The
+    returned RMS distance is over all points.
 
     >>> before = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [2, 2, 2]])
     >>> shift = majority_motion(before, before + np.where(np.arange(6)[:, None] < 5, [0, 0, 1], [5, 0, 0]))[1]
@@ -166,9 +166,9 @@ def rigid_motion(
     determine R, because reflections are excluded: its determinant is +1.
 
     Args:
-        before, after: [M, 3] points, M ≥ 1.
+        before, after: [M, 3] corresponding points, M ≥ 1.
         weights: [M] nonnegative weights; None for equal weights.
-        near: [3, 3] exact or approximate rotation; None for the identity.
+        near: [3, 3] prior rotation, exact or approximate; None for the identity.
 
     Returns:
         R [3, 3], t [3], and the weighted RMS residual.
@@ -215,7 +215,7 @@ def part_labels(labels: NDArray[Any], count: int) -> NDArray[np.int64]:
     given = np.asarray(labels)
     if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
         raise InputError(
-            f"parts: labels have shape {given.shape} and type {given.dtype}", "give whole numbers [N], one per Gaussian"
+            f"parts: labels have shape {given.shape} and type {given.dtype}", "give integers [N], one per Gaussian"
         )
     result = np.full(count, -1, np.int64)
     result[: len(given)] = given[:count]

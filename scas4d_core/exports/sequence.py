@@ -1,4 +1,4 @@
-"""Exports a sequence of frames: numbered files in a folder or a ``.zip``, or one file, depending on the format."""
+"""Exports a sequence of frames as numbered files in a folder or ``.zip``, or as one file, depending on the format."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FRAME_WRITERS: dict[str, Callable[[Path, Gaussians, WorldFrame], None]] = {
     "spz4": lambda path, gaussians, world: write_spz(path, gaussians, world, version=4),
     "glb": write_glb,
 }
-"""Functions that write one frame, by format."""
+"""Maps each format with numbered files to the function that writes one frame."""
 
 
 class SequenceWriter(Protocol):
@@ -66,25 +66,26 @@ def export_sequence(
     background: Colour = (0.0, 0.0, 0.0),
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes frames in a format, with at most one state in memory.
+    """Writes frames in the given format, with at most one state in memory.
 
     Numbered files are named ``frame_000012.ply`` for frame 12. Each is written atomically and replaces an existing one.
     A ``.zip`` or a single file appears only when it is complete. After an error, complete numbered files remain in a
     folder; other outputs are removed.
 
     Args:
-        states: index, time in seconds and state of each frame, in increasing order, with states in the internal world.
+        states: index, time in seconds, and state in the internal world of each frame, in increasing order.
             For a ``CompactReader``: ``((i, t, reader.state(i)) for i, t in zip(reader.frames, reader.times))``.
-        format: a name in ``FORMATS``.
-        out: for numbered files, a folder (created if missing) or a ``.zip``; else a file with the format's suffix.
+        format: name of the format, one of ``FORMATS``.
+        out: output path: a folder (created if missing) or ``.zip`` for numbered files, otherwise a file with the
+            format's suffix.
         world: transform from the user's world to the internal world.
         rig: rig in the user's world; used by USD and ``s4d``.
-        parts: [N] part of each Gaussian by row, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
-        ids: ids of the Gaussians for ``tracks``; None for all moving ones.
-        frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. None derives the latter from
-            the first two frames.
+        parts: [N] part label of each Gaussian, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
+        ids: ids of the Gaussians to write for ``tracks``; None for all moving ones.
+        frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None, the latter is derived
+            from the first two frames.
         background: background colour, RGB in 0…1; stored only by ``s4d``.
-        progress: called after each frame.
+        progress: function called after each frame.
 
     Returns:
         The paths of the numbered files, or of the single file.
@@ -113,7 +114,7 @@ def export_sequence(
     coming = iter(states)
     waiting = list(islice(coming, 1))
     if not waiting:
-        raise InputError("states has no frame", "give a range that holds at least one committed frame")
+        raise InputError("states has no frames", "give a range that contains at least one committed frame")
     writer = _writer(wanted, target, world, rig, parts, ids, frames_per_second, background)
     done = 0
     paths: list[Path] = []
@@ -133,7 +134,7 @@ def export_sequence(
 
 
 def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Path]:
-    """Returns numbered files of this format for other frames, which an earlier, longer export left in the folder.
+    """Returns the folder's numbered files of this format for other frames, such as those left by an earlier export.
 
     >>> other_frames(Path("no_such_folder"), format_of("ply"), [0])
     []
@@ -148,7 +149,7 @@ def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Pat
 def _chain(
     waiting: list[tuple[int, float, Gaussians]], coming: Iterator[tuple[int, float, Gaussians]]
 ) -> Iterator[tuple[int, float, Gaussians]]:
-    """Yields the waiting frame and then the others, without keeping a reference to a frame."""
+    """Yields the waiting frame and then the others, without keeping references to yielded frames."""
     yield waiting.pop()
     yield from coming
 
@@ -202,7 +203,7 @@ class _Folder:
 class _Zip:
     """Numbered files in an uncompressed ``.zip``.
 
-    Each is first written to a temporary folder, so at most one is on disk at a time.
+    Each file is first written to a temporary folder, which contains at most one file at a time.
     """
 
     def __init__(self, path: Path, format: Format, world: WorldFrame) -> None:

@@ -2,8 +2,8 @@
 
 There is no header, just 32 bytes per Gaussian, little-endian: position 3×float32, scale 3×float32 (linear standard
 deviations), RGBA 4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. Axes and unit are the user's, as in the 3DGS
-``.ply``. Colour is that of degree 0, and opacity is linear. Viewers render a file while it loads, so the largest and
-most opaque Gaussians come first, as sorted by ``convert.py``. Row order and ids are lost.
+``.ply``. Colour is the degree 0 component, and opacity is linear. Viewers render a file while it loads, so the largest
+and most opaque Gaussians come first, as in ``convert.py``. Row order and ids are lost.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
         world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: rows are not finite or have no volume, or the file cannot be written.
+        InputError: Gaussians are not finite or have no volume, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -59,23 +59,23 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
 
 
 def read_splat(path: Path | str) -> Splats:
-    """Reads a file in its row order; rotations are normalized.
+    """Reads a ``.splat`` file in row order; rotations are normalized.
 
     Raises:
         InputError: the file does not exist, or its size is not a multiple of 32 bytes.
 
     >>> read_splat("README.md")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md: not a .splat file (... bytes are no multiple of 32); ...
+    scas4d_core.errors.InputError: README.md: not a .splat file (... bytes is not a multiple of 32); ...
     """
     try:
         content = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: not a .splat file ({error.strerror})", "give a path that can be read") from error
+        raise InputError(f"{path}: not a .splat file ({error.strerror})", "give the path of a readable file") from error
     if len(content) % ROW.itemsize:
         raise InputError(
-            f"{path}: not a .splat file ({len(content)} bytes are no multiple of {ROW.itemsize})",
-            "give a whole file, one that no program compressed",
+            f"{path}: not a .splat file ({len(content)} bytes is not a multiple of {ROW.itemsize})",
+            "give a complete, uncompressed file",
         )
     rows = np.frombuffer(content, ROW)
     turns = rows["rotation"].astype(np.float64) - 128

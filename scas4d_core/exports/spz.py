@@ -4,7 +4,7 @@ As SPZ's README states, axes are RUB: x right, y up, z backward, that is, the us
 gsply does not convert axes, so this module does. Lengths are in metres, which the format's ranges are designed for.
 Quantization, from gsply 0.4.6 and Niantic's ``load-spz.cc``:
 
-- positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m; the fractional bits f are the most with which the frame fits;
+- positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m, with the largest number of fractional bits f for which the frame fits;
 - scales: the logarithm in one byte, 16 steps per factor of e: ±3.2 %, clipped below 45 µm or above 379 m;
 - rotations: the smallest three components in 10 bits each, ±0.0007 per component;
 - opacity: one byte, linear, ±0.002; colour: one byte over −0.44…1.44, ±0.0037;
@@ -25,11 +25,11 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import OPACITY_MARGIN, SH_DEGREE_0, Splats
 
 VERSIONS = (3, 4)
-"""Versions that gsply writes: 3 is supported by most viewers, 4 by recent ones."""
+"""Versions that gsply can write: most viewers support 3, and recent ones also support 4."""
 POSITION_BITS = 23
-"""Bits of a position without its sign."""
+"""Number of bits of a position, excluding the sign."""
 MAX_FRACTIONAL_BITS = 24
-"""Maximum that gsply accepts."""
+"""Maximum number of fractional bits that gsply accepts."""
 
 
 def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version: int = 3) -> None:
@@ -39,11 +39,11 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
         path: path of the file.
         gaussians: state in the internal world.
         world: transform from the user's world to the internal world.
-        version: 3 or 4.
+        version: SPZ version, 3 or 4.
 
     Raises:
-        InputError: the version is not supported; gsply (for 4 also zstandard) is missing; rows are not finite or have
-            no volume; a position exceeds 4,194 km; or the file cannot be written.
+        InputError: the version is not supported; gsply (or zstandard for version 4) is missing; Gaussians are not
+            finite or have no volume; a position exceeds 4,194 km; or the file cannot be written.
 
     >>> write_spz("a.spz", Gaussians.of_points([[0, 0, 2]], radius=0.1), WorldFrame(np.zeros(3)), version=2)
     Traceback (most recent call last):
@@ -73,7 +73,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
 
 
 def fractional_bits(cloud: Cloud) -> int:
-    """Returns the most fractional bits f with which all positions fit into 24 bits; a step is 2⁻ᶠ of their unit.
+    """Returns the largest number of fractional bits f for which all positions fit into 24 bits; a step is 2⁻ᶠ units.
 
     Raises:
         InputError: a position is too far from the origin.
@@ -86,13 +86,13 @@ def fractional_bits(cloud: Cloud) -> int:
         if round(farthest * 2**bits) < 2**POSITION_BITS:
             return bits
     raise InputError(
-        f"a Gaussian is {farthest:.3g} m from the origin of the user's world, and SPZ ends at {2**22:,} m",
+        f"a Gaussian is {farthest:.3g} m from the origin of the user's world, but the limit of SPZ is {2**22:,} m",
         "move the origin of the calibration near the scene, or export as ply or glb",
     )
 
 
 def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
-    """Reads a file of version 1 to 4, with harmonics of degree 0 only, and converts it to OpenCV axes.
+    """Reads an SPZ file of version 1 to 4, ignoring harmonics above degree 0, and converts it to OpenCV axes.
 
     Args:
         path: path of the file.
@@ -109,7 +109,7 @@ def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
     try:
         data = gsply.read_spz(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not an SPZ file ({error})", "give a whole .spz file of version 1 to 4") from error
+        raise InputError(f"{path}: not an SPZ file ({error})", "give a complete .spz file of version 1 to 4") from error
     means, logs, quaternions, logits, base = (
         np.asarray(column, np.float64)
         for column in (data.means, data.scales, data.quats, data.opacities.reshape(-1), data.sh0)

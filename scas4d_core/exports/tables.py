@@ -1,4 +1,4 @@
-"""Writes tracks and part poses as CSV, for spreadsheets and scripts. World, axes and units are the user's.
+"""Writes tracks and part poses as CSV for spreadsheets and scripts, in the user's world, axes and units.
 
 Times are in seconds. Rows are ordered by frame; a Gaussian or part that is absent in a frame has no row for it.
 Coordinates have 12 significant digits, because the origin of a world may be far away.
@@ -26,7 +26,7 @@ POSE_COLUMNS = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz
 
 
 class _Table:
-    """A CSV file that is written row by row under a temporary name."""
+    """A CSV file that is written incrementally under a temporary name."""
 
     def __init__(self, path: Path | str, columns: Sequence[str]) -> None:
         self.path = Path(path)
@@ -59,7 +59,7 @@ class TrackTable(_Table):
     Args:
         path: path of the file.
         world: transform from the user's world to the internal world.
-        ids: ids of the Gaussians; None writes all moving ones in each frame.
+        ids: ids of the Gaussians to write; None for those moving in each frame.
 
     Raises:
         InputError: the file cannot be written.
@@ -80,7 +80,7 @@ class TrackTable(_Table):
         self._ids = None if ids is None else np.asarray(ids, np.int64).reshape(-1)
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Adds a frame: its index, its time in seconds, and its state in the internal world."""
+        """Adds a frame, given its index, its time in seconds, and its state in the internal world."""
         chosen = gaussians.moving if self._ids is None else gaussians.present & np.isin(gaussians.ids, self._ids)
         ids = gaussians.ids[chosen].tolist()
         means = self._world.to_user(gaussians.means[chosen])
@@ -92,15 +92,15 @@ class TrackTable(_Table):
 class PoseTable(_Table):
     """Writes the rigid motion of parts since the first frame (``part_motion``), frame by frame.
 
-    A point x of a part, in the user's world at the first frame, is at R (x − t₀) + t in a later one. Here, t is (tx,
-    ty, tz), R is the rotation of the unit quaternion (qw, qx, qy, qz), and t₀ is t in the first frame.
+    A point of a part at x in the first frame is at R (x − t₀) + t in a later frame, both in the user's world. Here, t
+    is (tx, ty, tz), R is the rotation of the unit quaternion (qw, qx, qy, qz), and t₀ is t in the first frame.
     ``residual`` is the weighted RMS distance between this prediction and the means of the part's Gaussians, in the
     user's units.
 
     Args:
         path: path of the file.
         world: transform from the user's world to the internal world.
-        labels: [N] part of each Gaussian by row, negative for none.
+        labels: [N] part label of each Gaussian, negative for none.
 
     Raises:
         InputError: the file cannot be written.
@@ -122,7 +122,7 @@ class PoseTable(_Table):
         self._motion: PartMotion | None = None
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Adds a frame: its index, its time in seconds, and its state in the internal world.
+        """Adds a frame, given its index, its time in seconds, and its state in the internal world.
 
         Raises:
             InputError: no Gaussian of the first frame belongs to a part.
@@ -138,7 +138,7 @@ class PoseTable(_Table):
 def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
     """Writes queried tracks with their confidence; points absent in a frame have no row.
 
-    The column ``id`` has the Gaussian with the largest weight for the point, so two points may share an id.
+    The column ``id`` contains the Gaussian with the largest weight for each point, so two points may share an id.
 
     Args:
         path: path of the file.

@@ -1,17 +1,18 @@
 """Writes a sequence as USD (usd-core 26.03 or later): UsdVol.ParticleField3DGaussianSplat with time samples.
 
-``/World/Gaussians`` has one fixed set of Gaussians for all frames; opacity is 0 before birth and during retirement. As
-the schema requires, scales and opacities are linear, and harmonics are grouped by Gaussian. Colours are sRGB image
-values; the schema cannot express that, so ``colorSpace`` of the harmonics states it. ``primvars:scas4d:id`` and
-``primvars:scas4d:part`` have the ids and the parts. ``/World/Parts/part_k`` are Xforms with the rigid motion of each
-part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` shows the centres of up to
-``MAX_TRACKS`` moving Gaussians as UsdGeomPoints with purpose guide. ``/World/Cameras`` has the cameras of the rig.
+``/World/Gaussians`` contains one fixed set of Gaussians for all frames; opacity is 0 before birth and during
+retirement. As the schema requires, scales and opacities are linear, and harmonics are grouped by Gaussian. Colours are
+sRGB image values; the schema cannot express that, so the ``colorSpace`` of the harmonics does.
+``primvars:scas4d:id`` and ``primvars:scas4d:part`` store the ids and part labels. ``/World/Parts/part_k`` are Xforms
+with the rigid motion of each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` shows
+the centres of up to ``MAX_TRACKS`` moving Gaussians as UsdGeomPoints with purpose guide. ``/World/Cameras`` contains
+the cameras of the rig.
 
-The stage is y up, that is, the user's world rotated by 180° about x. Its unit is the user's, with ``metersPerUnit``. A
-time code is the seconds since the first frame times ``timeCodesPerSecond``.
+The stage is y-up, that is, the user's world rotated by 180° about x. Its unit is the user's, given by
+``metersPerUnit``. A time code is the number of seconds since the first frame times ``timeCodesPerSecond``.
 
 Frames are saved one by one, so memory use does not grow with their number. In return, a temporary copy next to the
-target doubles the disk space during the export.
+target doubles the disk space needed during the export.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
 MAX_TRACKS = 500
 """Maximum number of Gaussians shown as tracks, evenly spaced over the moving rows of the first frame."""
 TRACK_WIDTH = 0.005
-"""Diameter of a track's point, relative to the extent of the tracks."""
+"""Diameter of a track point, relative to the extent of the tracks."""
 REACH = 3.0
 """Number of standard deviations covered by the extent of the Gaussians."""
 COLOUR_SPACE = "srgb_rec709_scene"
@@ -61,11 +62,11 @@ class UsdSequence:
             ``.usdz``.
         world: transform from the user's world to the internal world.
         rig: rig in the user's world, or None.
-        labels: [N] part of each Gaussian by row, negative for none; None for no parts.
-        frames_per_second: time codes per second; None derives them from the first two frames.
+        labels: [N] part label of each Gaussian, negative for none; None to store no parts.
+        frames_per_second: time codes per second; None to derive them from the first two frames.
 
     Raises:
-        InputError: usd-core is missing or too old, the suffix is not USD's, or the folder is not writable.
+        InputError: usd-core is missing or too old, the suffix is not a USD suffix, or the folder is not writable.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -88,7 +89,7 @@ class UsdSequence:
     ) -> None:
         self.path = Path(path)
         if self.path.suffix not in SUFFIXES:
-            raise InputError(f"out {self.path.name!r} has no suffix of USD", f"give one of {', '.join(SUFFIXES)}")
+            raise InputError(f"out {self.path.name!r} has no USD suffix", f"use one of {', '.join(SUFFIXES)}")
         self._usd = import_optional("pxr.Usd", "usd")
         self._geometry, volume = import_optional("pxr.UsdGeom", "usd"), import_optional("pxr.UsdVol", "usd")
         self._sdf, self._tf, self._vt, self._gf = (
@@ -123,15 +124,15 @@ class UsdSequence:
         Args:
             index: frame index.
             time: time in seconds, later than all previous ones.
-            gaussians: state in the internal world. Rows keep their identity, and their number never decreases.
+            gaussians: state in the internal world. Each row must always be the same Gaussian; new ones are appended.
 
         Raises:
-            InputError: the time does not increase, rows are not finite or have no volume, or the disk is full.
+            InputError: the time does not increase, Gaussians are not finite or have no volume, or the disk is full.
         """
         if self._first_index is not None and not time > self._latest:
             raise InputError(
-                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the frame before",
-                "give frames in the order of their times",
+                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the previous frame",
+                "give frames in chronological order",
             )
         cloud = cloud_of(gaussians, self._world, retired=True).half_turned()
         if self._first_index is None:
@@ -164,7 +165,7 @@ class UsdSequence:
         """Completes the stage and renames the file to its final name.
 
         Raises:
-            InputError: there was no frame, or the file cannot be written.
+            InputError: no frame was added, or the file cannot be written.
         """
         try:
             if self._first_index is None:
@@ -286,7 +287,7 @@ class UsdSequence:
         else:
             done = self._layer.Export(str(beside))  # exporting drops replaced samples
         if not done:
-            raise InputError(f"out {str(self.path)!r} cannot be written by USD", "give a path that may be written to")
+            raise InputError(f"out {str(self.path)!r} cannot be written by USD", "give a writable path")
 
 
 def _extent(means: NDArray[Any], reach: NDArray[Any]) -> NDArray[Any]:

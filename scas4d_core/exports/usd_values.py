@@ -1,4 +1,4 @@
-"""USD values: arrays of Gaussians as typed attributes, poses and cameras in USD's axes, and time samples."""
+"""Converts arrays, poses and cameras to USD values and axes, and writes time samples."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ NEAREST, FARTHEST = 0.01, 1000.0
 
 
 class AnimatedValues:
-    """Time samples of an attribute with one value per Gaussian; samples are written only when values change.
+    """Writes time samples of an attribute with one value per Gaussian, but only when values change.
 
-    USD interpolates between samples, so before a change the previous frame's value is written too. Later births make
-    samples longer, so earlier samples are padded at the end (``lengthen``).
+    USD interpolates between samples, so before a change the previous frame's value is written too. Gaussians born later
+    make samples longer, so shorter samples are padded before the file is completed (``lengthen``).
 
     Args:
         attribute: USD attribute.
         typed: converts a numpy array to a USD array.
-        unborn: value before a birth; None uses the value at birth.
+        unborn: value of a Gaussian before its birth; None to use its value at birth.
     """
 
     def __init__(self, attribute: Any, typed: Callable[[Array], Any], unborn: float | None = None) -> None:
@@ -57,7 +57,7 @@ class AnimatedValues:
         self._last, self._unwritten = given, None
 
     def _is_stored(self, before: Array, after: Array) -> bool:
-        """Returns whether the previous samples, after padding, already have these values."""
+        """Returns whether the previous sample, after padding, already has these values."""
         grown = len(after) > len(before)
         return not (grown and self._unborn is not None) and np.array_equal(before, after[: len(before)])
 
@@ -75,7 +75,7 @@ class AnimatedValues:
                 yield
 
     def store_constant_as_default(self) -> None:
-        """Converts a single sample to the default value, which readers without time support use."""
+        """Stores the value of an attribute with a single sample as its default, for readers without time support."""
         codes = self._attribute.GetTimeSamples()
         if len(codes) == 1:
             value = self._attribute.Get(codes[0])
@@ -84,12 +84,12 @@ class AnimatedValues:
 
 
 def points_of(values: Array) -> Any:
-    """Converts [N, 3] to a USD array."""
+    """Converts values [N, 3] to a USD array."""
     return import_optional("pxr.Vt", "usd").Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def floats_of(values: Array) -> Any:
-    """Converts [N] to a USD array."""
+    """Converts values [N] to a USD array."""
     return import_optional("pxr.Vt", "usd").FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
@@ -99,7 +99,7 @@ def quaternions_of(values: Array) -> Any:
 
 
 def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
-    """Converts a pose in the user's world, [3, 3] and [3], and the part's local axes to the stage's axes.
+    """Converts a part's pose, [3, 3] and [3], from the user's axes to the stage's axes, both in the world and locally.
 
     >>> to_stage_pose(np.eye(3), np.array([1.0, 2, 3]))[1]
     array([ 1., -2., -3.])
@@ -108,11 +108,10 @@ def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
 
 
 def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
-    """Fills a UsdGeomCamera from a camera in the user's world.
+    """Sets the attributes of a UsdGeomCamera from a camera in the user's world.
 
-    A USD camera looks along −z with y up, which is an OpenCV camera after a half turn. At the focal length f, its
-    window
-    has the size (w/fx, h/fy)·f and the offset ((w/2 − cx)/fx, (cy − h/2)/fy)·f from the axis.
+    A USD camera looks along −z with y up, like an OpenCV camera after a half turn about x. At the focal length f, its
+    window has the size (w/fx, h/fy)·f and the offset ((w/2 − cx)/fx, (cy − h/2)/fy)·f from the axis.
     """
     gf, geometry = import_optional("pxr.Gf", "usd"), import_optional("pxr.UsdGeom", "usd")
     pose = np.eye(4)
@@ -131,12 +130,12 @@ def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
 
 @contextmanager
 def translate_usd_errors(path: Path) -> Iterator[None]:
-    """Converts errors of USD and the system during writing to an ``InputError`` that names the output."""
+    """Converts USD and system errors during writing to an ``InputError`` that names the output."""
     failure = import_optional("pxr.Tf", "usd").ErrorException
     try:
         with translate_write_errors(path):
             yield
     except failure as error:
         raise InputError(
-            f"out {str(path)!r} cannot be written (USD: {message_of(error)})", "give a path that may be written to"
+            f"out {str(path)!r} cannot be written (USD: {message_of(error)})", "give a writable path"
         ) from error

@@ -1,4 +1,4 @@
-"""Fits frame 0, and keeps the data of it that every update needs."""
+"""Fits frame 0, and collects the data of frame 0 that every update needs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.engines.choose import resolve_device
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.fit_schedule import REPORTED_SHORTFALL, FitProgress
 from scas4d_core.first_frame.glossy import fit_with_gloss_trial
@@ -31,13 +32,14 @@ Colour = tuple[float, float, float]
 
 
 def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
-    """Returns the settings with 'auto' replaced by the background colour.
+    """Returns the settings with the background 'auto' replaced by a colour from the images.
 
-    It is the colour of a plain backdrop, or else the mean colour. A background colour that is not in the images, such
-    as black in a bright room, causes dark seams in the fit. It also causes black holes in regions that no camera sees.
+    This is the colour of a plain backdrop if there is one, or else the mean colour. A background colour that is not in
+    the images, such as black in a bright room, causes dark seams, and black holes in regions that no camera sees.
 
     Args:
-        images: of frame 0.
+        settings: settings of the scene.
+        images: images of frame 0, keyed by camera name.
 
     >>> from scas4d_core.settings import Settings
     >>> green = np.full((64, 64, 3), (20, 200, 30), np.uint8)
@@ -65,7 +67,7 @@ def _set_background(settings: Settings, background: Sequence[float]) -> Settings
 
 
 def with_recorded_background(settings: Settings, history: History) -> Settings:
-    """Returns the settings with the background recorded for a scene; unchanged if its first frame cannot be read."""
+    """Returns the settings with the background that a scene recorded; unchanged if its first frame cannot be read."""
     if settings.scene.background != "auto":
         return settings
     with suppress(HistoryError):
@@ -78,8 +80,10 @@ class FirstFrame:
     """The data of frame 0 that every update needs.
 
     Attributes:
-        masked: whether frame 0 has masks. exposures: [3, 2] gain and offset of each channel, by camera name.
-        lengths: [N, 3] axis lengths of the Gaussians, in metres. background: RGB in 0…1.
+        masked: whether frame 0 has masks.
+        exposures: [3, 2] gain and offset of each colour channel, keyed by camera name.
+        lengths: [N, 3] axis lengths of the Gaussians, in metres.
+        background: background colour, RGB in 0…1.
     """
 
     masked: bool
@@ -88,7 +92,7 @@ class FirstFrame:
     background: Colour
 
     def record(self) -> dict[str, Any]:
-        """Returns the data that are not in the state of frame 0, as JSON values; committed with its report."""
+        """Returns the data that the state of frame 0 does not contain, as JSON values for the report of frame 0."""
         return {
             "masked": self.masked,
             "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
@@ -100,7 +104,8 @@ class FirstFrame:
         """Reads the data from the first frame of a history.
 
         Raises:
-            HistoryError: the frame cannot be read. KeyError: its report is incomplete.
+            HistoryError: the frame cannot be read.
+            KeyError: the report of the frame is incomplete.
         """
         first = history.indices[0]
         report = history.report(first)
@@ -122,13 +127,17 @@ def fit_static_scene(
     """Fits Θ_0 to the views of frame 0, starting from a point cloud.
 
     Args:
-        factory: creates the scene's views. views: of frame 0; their exposures are learnt in place.
-        positions: [P, 3] metres in the internal world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
-        scene, settings: of the scene and of frame 0.
+        factory: creates the views of the scene.
+        views: views of frame 0; their exposures are learnt in place.
+        positions: [P, 3] point positions in metres, in the internal world.
+        colours: [P, 3] point colours in 0…1.
+        foreground: [P] foreground label of each point in 0…1, or None.
+        scene: settings of the scene.
+        settings: settings of frame 0.
         progress: called after each iteration.
 
     Raises:
-        ValueError: the cloud is empty.
+        ValueError: the point cloud is empty.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot", image_scale=0.25)
@@ -153,13 +162,16 @@ def fit_first_frame(
     world: WorldFrame,
     on_progress: Callable[[Progress], None],
 ) -> StaticResult:
-    """Fits frame 0 to its images, from a given point cloud or from one computed from the images.
+    """Fits frame 0 to its images, starting from a given point cloud or from one computed from the images.
 
-    The cloud is computed in the internal world, so that the user's origin and unit do not change it.
+    The cloud is computed in the internal world, so that it does not depend on the user's origin and unit.
 
     Args:
-        frame: with images of the size of the factory's rig. points: points in the user's world. world: user to internal
-            transform.
+        frame: images and masks of frame 0, at the image size of the factory's rig.
+        points: initial point cloud in the user's world; None to compute one.
+        factory: creates the views of the scene.
+        settings: settings of the scene.
+        world: transform from the user's world to the internal world.
         on_progress: called with the progress of each stage.
     """
     if points is None:
@@ -180,22 +192,24 @@ def fit_first_frame(
         cloud, made, stage = _columns(inside), FirstCloud("given", len(points)), None
     views = factory.views(frame, {})
     result = fit_with_gloss_trial(
-        lambda: first_trainer(factory, views, *cloud, settings.scene, static, limit, stage, settings.device),
-        settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
+        lambda: first_trainer(
+            factory, views, *cloud, settings.scene, static, limit, stage, resolve_device(settings.device)
+        ),
+        settings.effects.get("direction", "auto"),
         lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )
     if result.ran_short_of_time and len(result.losses) <= (1 - REPORTED_SHORTFALL) * static.iterations:
-        limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, each phase as much shorter")
+        limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, all phases equally shorter")
     return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
 
 
 def _remaining_time(limit: TimeLimit) -> dict[str, float]:
-    """Returns the maximum remaining seconds of frame 0; empty without a limit."""
+    """Returns the maximum remaining seconds of frame 0 for a progress report; empty without a limit."""
     return {"seconds_at_most": max(0.0, limit.seconds_left())} if limit.bounded else {}
 
 
 def _figures(now: FitProgress, limit: TimeLimit) -> dict[str, float]:
-    """Returns the figures for a progress report of the fit."""
+    """Returns the loss and the remaining time for a progress report of the fit."""
     left = {} if now.seconds is None else {"seconds_left": now.seconds}
     return {"loss": now.loss, **left, **_remaining_time(limit)}
 

@@ -1,9 +1,9 @@
-"""Iteration schedule of the fit of frame 0: all iterations of the settings or, with a time limit, fewer in all phases.
+"""Iteration schedule of frame 0: all configured iterations or, if a time limit requires it, fewer in every phase.
 
-Learning rates, density control and other events are defined in iterations of the full schedule. If time is short, one
+Learning rates, density control and other events are defined in iterations of the full schedule. If time is short, each
 iteration advances the schedule by more than one. The fit thus completes all of its phases, like a shorter fit, instead
-of being cut off. The stride follows from the measured pace and is updated during the fit. With enough time, every
-iteration counts as one, and the result is the same as without a limit.
+of being cut off. The stride is computed from the measured pace and updated during the fit. With enough time, the stride
+is one, and the result is the same as without a limit.
 """
 
 from __future__ import annotations
@@ -19,30 +19,33 @@ from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.fit.gaussian_fit import FitStep
 
 MIN_ITERATIONS = 500
-"""Minimum number of iterations, even without enough time."""
+"""Minimum number of iterations, even if they exceed the time limit."""
 FIRST_TIMED = 10
 """Number of initial iterations that are not timed, because they load kernels and fill caches."""
 PLAN_EVERY = 25
-"""Number of iterations between two plans, over which the pace is measured."""
+"""Number of iterations between plans, over which the pace is measured."""
 TIME_TOLERANCE = 1.03
-"""Ratio of predicted to remaining time up to which nothing is shortened; predictions are not more accurate."""
+"""Ratio of predicted to remaining time up to which nothing is shortened, because predictions are not that accurate."""
 MIN_PLAN_CHANGE = 0.02
 """Relative change of the number of iterations above which a new plan is recorded."""
 REPORTED_SHORTFALL = 0.05
-"""Share of missing iterations above which the report mentions them; smaller losses are below the effect of the seed.
-The sample at half size, two seeds each: 35.33 dB; with 5, 10 and 20 % fewer 35.20, 35.29 and 35.24; with half of them
-35.03. *cloth* at half size, one seed: 28.91 dB; with 5 and 20 % fewer 28.91 and 28.88."""
+"""Fraction of missing iterations above which the report mentions them; the effect of fewer is below that of the seed.
+The sample at half size (two seeds) has 35.33 dB. With 5, 10 and 20 % fewer iterations it has 35.20, 35.29 and 35.24 dB,
+and with half of them 35.03 dB. *cloth* at half size (one seed) has 28.91 dB; with 5 and 20 % fewer iterations, it has
+28.91 and 28.88 dB."""
 MIN_COUNT_RATIO = 1.3
-"""Minimum ratio of Gaussian counts for separating the cost per Gaussian from that of the pixels."""
+"""Minimum ratio between Gaussian counts for separating the cost per Gaussian from the cost of the pixels."""
 
 
 @dataclass(frozen=True)
 class FitProgress:
-    """Progress of the fit.
+    """Progress of the fit of frame 0.
 
     Attributes:
-        done, planned: completed and total iterations. loss: of the last iteration. seconds: predicted remaining time;
-            None if unknown.
+        done: number of completed iterations.
+        planned: total number of iterations in the current plan.
+        loss: loss of the last iteration.
+        seconds: predicted remaining time in seconds; None if unknown.
     """
 
     done: int
@@ -55,14 +58,18 @@ class FitSchedule:
     """Plans the iterations of a fit within a time limit.
 
     Args:
-        iterations: iterations of the full schedule. limit: time limit of frame 0.
+        iterations: number of iterations of the full schedule.
+        limit: time limit of frame 0.
         expected: returns the expected number of Gaussians at a point of the schedule.
 
     Attributes:
-        done: completed iterations. at: position in the full schedule. stride: advance of the next iteration.
-        fits_again: whether another complete fit must follow in the same time. end: of this fit, in the full schedule.
-        shortened: whether any iteration has advanced by more than one.
-        planned: (iteration, total iterations) for each change of plan.
+        done: number of completed iterations.
+        at: position in the full schedule, in iterations.
+        stride: number of iterations by which the next iteration advances the full schedule.
+        fits_again: whether another complete fit must follow within the time limit.
+        end: position in the full schedule at which this fit ends.
+        shortened: whether any iteration has advanced the schedule by more than one.
+        planned: (iteration, total iterations) at each change of plan.
 
     >>> schedule = FitSchedule(4, TimeLimit(None), lambda at: 100.0)
     >>> [(step := schedule.begin_iteration()).begun for _ in range(2)], step.ended, schedule.planned
@@ -83,7 +90,7 @@ class FitSchedule:
         self._spent: list[float] = []
 
     def begin_iteration(self) -> FitStep:
-        """Starts the next iteration."""
+        """Starts the next iteration and returns its step."""
         self._began = self._limit.clock()
         begun, self.at = self.at, min(float(self.iterations), self.at + self.stride)
         self.shortened |= self.stride != 1
@@ -103,9 +110,9 @@ class FitSchedule:
 
     @property
     def record(self) -> list[tuple[int, int]]:
-        """``planned``, and the final number of iterations if the fit was shortened.
+        """The entries of ``planned`` and, if the fit was shortened, the final number of iterations.
 
-        A fit whose record has one entry is bit-identical to a fit without a limit.
+        A fit whose record has a single entry is bit-identical to a fit without a limit.
         """
         last = (self.done, self.done)
         return self.planned + [last] * (self.shortened and self.planned[-1] != last)
@@ -126,14 +133,12 @@ class FitSchedule:
             self.planned.append((self.done, self.total))
 
     def _seconds(self, begin: float, end: float) -> float:
-        """Returns the predicted seconds between two points of the full schedule, with the expected numbers of
-        Gaussians.
-        """
+        """Predicts the seconds between two points of the full schedule from the expected numbers of Gaussians."""
         times, counts = np.array(self._times), np.array(self._counts)
         each, more = times[-1], 0.0
         if counts.max() >= MIN_COUNT_RATIO * counts.min():
-            # The cost of an iteration is a constant for its pixels plus a term per Gaussian. In a linear fit over many
-            # iterations, one slowed by other processes has little weight.
+            # The cost of an iteration is a constant for its pixels plus a cost per Gaussian. In a linear fit over many
+            # iterations, an iteration that was slowed by other processes has little weight.
             more = max(0.0, float(np.polyfit(counts, times, 1)[0]))
             more = min(more, each / counts[-1])
         moments = np.linspace(begin, end, 33)

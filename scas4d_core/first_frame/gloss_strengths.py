@@ -1,6 +1,6 @@
-"""Gloss strengths from the images of frame 0: how strongly a surface's colour follows its predicted reflection.
+"""Estimates gloss strengths from the images of frame 0: how strongly a colour follows its predicted reflection.
 
-Gradient steps leave matte objects half as glossy as at the start, because the gradients there are small. Such objects
+Gradient descent leaves matte objects with half of the initial gloss, because their gradients are small. Such objects
 then show highlights in novel views. For given normals and environment, the strength is the slope of a regression line.
 """
 
@@ -23,22 +23,21 @@ Float = NDArray[np.float64]
 ENOUGH = 0.05
 """Minimum blending weight, in pixels, for a camera's colour of a Gaussian to count."""
 WHITE = 0.97
-"""Colour above which an image is saturated."""
+"""Colour value above which a colour is saturated."""
 FLATTEST = 0.2
-"""Cosine to the camera below which footprints extend beyond the outline."""
+"""Cosine between normal and camera direction below which footprints extend beyond the outline."""
 NEAR = 64
-"""Number of neighbours that share a slope; a single Gaussian rarely reflects two highlights."""
+"""Number of neighbours over which a slope is estimated; a single Gaussian rarely reflects two highlights."""
 CLEAR = 0.3
-"""Share of the light variation that the line must explain for full confidence in its slope; confidence is proportional
-below it.
-"""
+"""Fraction of the light variation that the line must explain for full confidence in its slope. If it explains less,
+confidence is proportional to the explained fraction."""
 ROUNDS = 3
-"""Number of averaging rounds over neighbours, in which uncertain strengths follow from reliable ones nearby."""
+"""Number of rounds of averaging over neighbours, which derive uncertain strengths from reliable ones nearby."""
 GLOSSY = 0.12
-"""Minimum mean explained share in the neighbourhood of a glossy surface. On frame 0 of `gloss`, the median is 0.005 on
-the matte stand, and 0.25 and 0.17 on vase and ring. In neighbourhoods with little evidence, strengths go to 0. Without
-this, the stand kept the initial 0.5 in places that reflect no lamp, and false highlights cost 0.3 dB over all
-images."""
+"""Minimum fraction of the light variation that must be explained, on average, around a point of a glossy surface. On
+frame 0 of `gloss`, the median is 0.005 on the matte stand, and 0.25 and 0.17 on vase and ring. Where there is less
+evidence, strengths decrease to 0. Without this, the stand kept the initial strength of 0.5 in places that reflect no
+lamp, and false highlights cost 0.3 dB over all images."""
 FAINTEST, STRONGEST = 0.004, 1.0
 """Bounds of the strength; a strength of 0 would leave the normal undefined."""
 TINY = 1e-12
@@ -47,20 +46,24 @@ TINY = 1e-12
 def estimate_strengths(
     normals: Array, environment: Array, state: Gaussians, views: Sequence[TrainingView], renderer: Renderer
 ) -> Array:
-    """Returns the [N, 1] strengths for unit normals [N, 3] in an environment.
+    """Returns the [N, 1] gloss strengths of the Gaussians, given their unit normals [N, 3] and the environment.
 
     Over the views, each Gaussian's light (its squared image colour) is a linear function of its predicted reflection.
     The slope is estimated over neighbours on the same side of the surface. If the line explains little, the strength
-    follows from reliable neighbours, or is near 0 if there are none.
+    is taken from reliable neighbours, or is near 0 if there are none.
 
     Args:
-        views: views of the state.
+        normals: [N, 3] unit surface normals.
+        environment: environment that is reflected.
+        state: Gaussians of the surface.
+        views: training views, whose images are used.
+        renderer: renderer of the state.
     """
     from scas4d_core.kernels.appearance.direction import DARK, FALL, OVER, shade
 
     means, count = state.means, len(state)
     shown = np.zeros((count, 4), np.float32)
-    sums = np.zeros((6, count, 3))  # of weights, light, reflection, reflection × light, reflection², light²
+    sums = np.zeros((6, count, 3))  # sums of weights, light, reflection, reflection × light, reflection², light²
     for view in views:
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         planes = np.ones((4, *view.target.shape[1:]), np.float32)
@@ -107,6 +110,6 @@ def estimate_strengths(
 
 
 def _over(values: Float, near: NDArray[np.int64], weights: Float) -> Float:
-    """Returns [N, C] weighted means of values [N, C] over neighbours [N, k]; weights [N, k] sum to 1."""
+    """Returns the [N, C] weighted means of values [N, C] over neighbours [N, k]; weights [N, k] sum to 1."""
     means: Float = np.einsum("nkc,nk->nc", values[near], weights)
     return means

@@ -1,8 +1,8 @@
-"""Frame 0 of glossy objects: a trial that detects them, and a fit with their reflections.
+"""Frame 0 with glossy objects: a trial that detects them, and a fit that models their reflections.
 
 Without gloss, the fit explains each camera's highlights by Gaussians off the surface that only this camera sees. These
-remain in later frames. An early trial finds whether colours depend on the viewing direction. If so, the environment is
-learnt on the current surface, and the fit restarts with both.
+persist in later frames. An early trial checks whether colours depend on the viewing direction. If they do, the
+environment is learnt on the current surface, and the fit restarts with this environment and surface.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit
 Array = NDArray[np.float32]
 
 TRIAL = 0.15
-"""Share of the iterations after which the trial runs: a surface exists, but few false Gaussians lie behind it."""
+"""Fraction of the iterations after which the trial runs: a surface exists, but there are few false Gaussians yet."""
 MIN_ITERATIONS = 100
-"""Minimum iterations of a fit for the trial; before, the residual is not limited by constant colours."""
+"""Minimum number of iterations of a fit with a trial; in a shorter fit, other errors dominate the residual."""
 MIN_VIEWS = 12
-"""Minimum number of views for the trial; with fewer, highlights are seen by one camera only and anything explains them.
-"""
+"""Minimum number of views for the trial; with fewer, only one camera sees each highlight and any model explains it."""
 MAX_STRIDE = 1.5
-"""Schedule stride above which there is no time for a trial. It takes as long as 350 iterations, and a surface from a
-shortened fit explains less (basketball in 600 iterations: 7 % for direction, in 3000 none)."""
+"""Schedule stride above which there is no time for a trial, which takes as long as 350 iterations. Moreover, the
+surface of a shortened fit explains less: on basketball, direction explains 7 % after 600 iterations, and nothing after
+3000."""
 ROUNDS = 8
 """Number of passes over all views in the trial."""
 RATE = 2.5e-3
 """Adam learning rate of colours in the trial."""
 LEARN_UNTIL = 0.5
-"""Share of the iterations until which the environment is learnt on the first surface; then the fit restarts."""
+"""Fraction of the iterations until which the environment is learnt on the first surface; then the fit restarts."""
 NORMALS_EVERY = 0.1
-"""Share of the iterations between two estimates of the normals during this phase."""
+"""Interval between estimates of the normals while the environment is learnt, as a fraction of the iterations."""
 LEARN_NORMALS_FROM = 0.6
-"""Share of the iterations after which normals are learnt; before, they are those of the first surface."""
+"""Fraction of the iterations after which normals are learnt; until then, the normals of the first surface are used."""
 SMOOTH_EVERY = 10
-"""Number of iterations between two averages over neighbours."""
+"""Number of iterations between averaging the gloss over neighbours."""
 
 
 def fit_with_gloss_trial(
@@ -59,7 +59,8 @@ def fit_with_gloss_trial(
     """Fits Θ_0, with view-dependent colours if they are needed.
 
     Args:
-        make: creates a trainer that has not started. mode: "auto" decides by a trial.
+        make: creates a new trainer.
+        mode: whether to use view-dependent colours; "auto" runs a trial to decide.
         progress: called after each iteration.
     """
     trainer = make()
@@ -72,14 +73,14 @@ def fit_with_gloss_trial(
         losses = GlossyFit(trainer, before).train(progress)
         trainer.schedule.shortened |= before.schedule.shortened
     evidence = {} if trial.evidence is None else {"direction": trial.evidence}
-    shortened = ["no trial of colours that depend on direction"] if trial.out_of_time else []
+    shortened = ["no trial of view-dependent colours"] if trial.out_of_time else []
     return replace(trainer.result(losses), evidence=evidence, shortened=shortened)
 
 
 def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:
     """Returns the surface normals scaled by gloss strength, [N, 3], and the means.
 
-    Without `environment` the initial strength is used.
+    Without an environment, the initial gloss strength is used.
     """
     state, views, renderer = trainer.gaussians(), trainer.views, trainer.fit.renderer
     normals = surface_normals(state, views, renderer)
@@ -89,15 +90,17 @@ def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[A
 
 
 class GlossTrial:
-    """Decides whether colours depend on direction, using the surface of an unfinished fit.
+    """Decides whether colours depend on the viewing direction, using the surface of an unfinished fit.
 
     Args:
-        trainer: trainer of the fit. mode: "on" needs no evidence.
+        trainer: trainer of the fit.
+        mode: "auto" decides by evidence; "on" always decides for view-dependent colours.
 
     Attributes:
-        on: the decision, after the trial. out_of_time: whether there was no time for the trial.
-        evidence: share of the residual that direction explains in addition to constant colours; None if there was no
-            trial.
+        on: whether to use view-dependent colours; false before the trial.
+        out_of_time: whether the trial was skipped for lack of time.
+        evidence: fraction of the residual that view-dependent colours explain beyond constant colours; None without
+            a trial.
     """
 
     def __init__(self, trainer: StaticTrainer, mode: Mode) -> None:
@@ -106,7 +109,7 @@ class GlossTrial:
         self.evidence: Evidence | None = None
 
     def run_when_due(self, now: FitStep) -> bool:
-        """Runs the trial when it is due and returns whether gloss is needed; the fit is not changed."""
+        """Runs the trial if it is due, and returns whether gloss is needed; does not change the fit."""
         if not now.reaches(max(1, round(TRIAL * self._trainer.settings.iterations))):
             return False
         few = len(self._trainer.views) < MIN_VIEWS or self._trainer.settings.iterations < MIN_ITERATIONS
@@ -121,7 +124,7 @@ class GlossTrial:
         return self.on
 
     def _remaining_error(self, gloss: GlossShading | None) -> float:
-        """Returns the mean squared image error after fitting only colours, and a gloss if given, for a few passes."""
+        """Returns the mean squared image error after fitting colours, and gloss if given, for a few passes."""
         trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
         rates[COLOUR] = RATE
         parameters, cameras = trainer.fit.table.parameters.copy(), len(trainer.views)
@@ -160,10 +163,11 @@ class GlossTrial:
 
 
 class GlossyFit:
-    """The fit of frame 0 with the surface and environment of a previous fit.
+    """Fits frame 0 with the surface normals and environment of a previous fit.
 
     Args:
-        trainer: that has not started. before: trainer of the previous fit.
+        trainer: new trainer.
+        before: trainer of the previous fit.
     """
 
     def __init__(self, trainer: StaticTrainer, before: StaticTrainer) -> None:
@@ -175,7 +179,7 @@ class GlossyFit:
         trainer.fit.set_gloss(GlossShading.fresh(self._with_first_normals(None), means, environment))
 
     def _with_first_normals(self, gloss: Array | None) -> Array:
-        """Returns [N, 3] gloss with normals of the first surface; for None, with its strengths too."""
+        """Returns the [N, 3] gloss with the normals of the first surface, and its strengths too if gloss is None."""
         near = self._tree.query(self._trainer.fit.table.parameters[:, MEAN], 6)[1]
         normals = self._normals[near].mean(axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -188,14 +192,17 @@ class GlossyFit:
         return self._trainer.train(progress, self._after)
 
     def _after(self, now: FitStep) -> bool:
-        shading, share = self._trainer.fit.table.gloss, now.ended / self._trainer.settings.iterations
+        share = now.ended / self._trainer.settings.iterations
+        learns = share > LEARN_NORMALS_FROM
+        if not now.passes(SMOOTH_EVERY if learns else 100):
+            return False
+        table = self._trainer.fit.table
+        shading = table.gloss
         assert isinstance(shading, GlossShading)
-        if share <= LEARN_NORMALS_FROM and now.passes(100):
+        if learns:
+            shading.smooth(table.parameters[:, MEAN])
+        else:
             shading.gloss[:] = self._with_first_normals(shading.gloss)
             shading.changed_from[:] = shading.gloss
-        elif share > LEARN_NORMALS_FROM and now.passes(SMOOTH_EVERY):
-            shading.smooth(self._trainer.fit.table.parameters[:, MEAN])
-        else:
-            return False
         self._trainer.fit.set_gloss(shading)
         return False

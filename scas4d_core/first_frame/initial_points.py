@@ -1,4 +1,4 @@
-"""Initial points: a point cloud from the images of frame 0 and calibrated cameras, by several methods."""
+"""Computes the initial point cloud from the images of frame 0 and calibrated cameras, using several methods."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ from scas4d_core.posed_pictures import (
 )
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with a stage, the completed steps and the total steps."""
+"""Called with the name of a stage, and its completed and total number of steps."""
 
 MAX_POINTS = 60_000
 """Maximum number of points; if there are more, the spacing is increased."""
 MIN_VIEWS = 3
-"""Minimum number of cameras that must agree on a point: two always meet somewhere on an epipolar line."""
+"""Number of cameras that must agree on a point; two cameras can agree by chance anywhere along an epipolar line."""
 CELLS = 32
 """Number of cells along the longer side of an image, for measuring coverage."""
 ENOUGH_COVERAGE = COVERS_LITTLE
-"""Share of cells with a point, in most images, at which a cloud is sufficient and no other method is tried. Captures of
-at least eighteen cameras have 0.99 to 1; sparse rigs of four to seven have 0 to 0.4 without other methods."""
+"""Coverage (see ``image_coverage``) at which a cloud is sufficient and no further methods are tried. Captures with
+eighteen cameras or more reach 0.99 to 1; sparse rigs of four to seven reach 0 to 0.4 without further methods."""
 LITTLE_COVERAGE = 0.05
-"""Coverage up to which unconfirmed points are better than none."""
+"""Coverage up to which unconfirmed points are added, because they are better than none."""
 
 
 @dataclass(eq=False)
 class InitialCloud(InitialPoints):
-    """Initial points, and the method that found them.
+    """Initial points, and the methods that found them.
 
     Attributes:
-        method: one or more of these, joined by " + ". "agreement": at least three cameras agree. "backdrop":
-            silhouettes in front of a plain backdrop. "pairs": two cameras agree. "plane": a floor or table on which
-            images agree. "surroundings": the images, far behind the scene. "volume": the volume that cameras share; no
-            point is confirmed.
-        coverage: share of image cells with a point that cameras agree on, median over the cameras.
+        method: methods used, joined by " + ": "agreement" (at least three cameras agree), "backdrop" (silhouettes in
+            front of a plain backdrop), "pairs" (two cameras agree), "plane" (a floor or table on which images agree),
+            "surroundings" (images placed far behind the scene), "volume" (unconfirmed points in the volume that the
+            cameras share).
+        coverage: fraction of image cells that contain a point on which cameras agree, median over the cameras.
         stage: region that the surroundings enclose; None without surroundings.
     """
 
@@ -77,26 +77,27 @@ def initial_points(
     seed: int = 0,
     limit: TimeLimit | None = None,
 ) -> InitialCloud:
-    """Finds points on the surfaces that the images of one frame show.
+    """Finds points on the surfaces that are visible in the images of one frame.
 
     Triangulated features bound the scene and support walls and floors. PatchMatch stereo adds textured surfaces; its
     points are kept if at least ``MIN_VIEWS`` cameras agree and few see through them. The visual hull (of the masks, or
-    of silhouettes in front of a plain background) and fitted surfaces add the rest. These may cover too little of the
-    images, as with a few widely spaced cameras. In this case, further methods are tried in turn. They use silhouettes
-    in front of a backdrop that does not fill the image borders, points on which two cameras agree, and a plane on which
-    images agree. Finally, the images themselves are placed far behind the scene. If almost nothing is found, points
-    fill the volume that the cameras share.
+    of silhouettes in front of a plain background) and fitted surfaces add the rest.
+
+    With few, widely spaced cameras, these points may cover too little of the images. Further methods are then tried in
+    turn: silhouettes in front of a backdrop that does not fill the image borders, points on which two cameras agree,
+    and a plane on which images agree. Finally, the images themselves are placed far behind the scene. If almost nothing
+    is found, points are sampled in the volume that the cameras share.
 
     Args:
         rig: calibrated cameras, in the user's world.
-        images: [H, W, 3] uint8 by camera name; cameras without an image are ignored.
-        masks: [H, W] uint8 by camera name, 1 = foreground; may be empty.
+        images: maps each camera name to its image, [H, W, 3] uint8; cameras without an image are ignored.
+        masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground; may be empty.
         progress: called with (stage, done, total).
         max_points: maximum number of points.
         stereo: whether to use dense stereo in textured regions.
         stereo_iterations: rounds of propagation and refinement.
-        seed: seed of every random choice; the same seed gives the same points.
-        limit: time limit of frame 0; if time is short, the search is coarser (``limit.shortened``).
+        seed: random seed; the same seed gives the same points.
+        limit: time limit of frame 0; if time is short, the search is coarser, as recorded in ``limit.shortened``.
 
     Returns:
         Points in the user's units; ``foreground`` is None if there are no masks.
@@ -140,7 +141,7 @@ def initial_points(
     confirmed = 0.0 if points is None else points.coverage
     if points is None or confirmed <= LITTLE_COVERAGE:
         points = merge_points(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
-    if before is views and not first.backdrop:  # otherwise the backdrop's colour is the background
+    if before is views and not first.backdrop:  # otherwise the background is the colour of the backdrop
         points = merge_points(points, surroundings(before, distances), "surroundings", before, 0.0)
         points = replace(points, stage=Stage.of(before, distances))
     return replace(points, coverage=confirmed)
@@ -153,7 +154,7 @@ def _add_points(
     views: Sequence[PosedPicture],
     spacing: float,
 ) -> InitialCloud | None:
-    """Returns the previous points merged with those of a method; unchanged if it finds none."""
+    """Merges the points that a method finds into the previous points; returns those unchanged if it finds none."""
     try:
         return merge_points(found, search(), method, views, spacing)
     except InitialPointsError:
@@ -161,7 +162,7 @@ def _add_points(
 
 
 def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSearch]]:
-    """Returns the methods for points that cameras agree on, the most reliable first."""
+    """Returns the methods that search for points on which cameras agree, most reliable first."""
     ways = [("agreement", first)]
     if not masked and not first.backdrop:
         colour = backdrop([view.image for view in first.labelled])
@@ -176,7 +177,7 @@ def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSe
 def merge_points(
     found: InitialCloud | None, cloud: InitialPoints, method: str, views: Sequence[PosedPicture], spacing: float
 ) -> InitialCloud:
-    """Returns the previous points and those of a cloud that are farther than ``spacing`` (world units) from them."""
+    """Adds to the previous points those of ``cloud`` that are more than ``spacing`` (in world units) away from them."""
     if found is None:
         both = InitialCloud(cloud.positions, cloud.colours, cloud.foreground, method)
     else:
@@ -185,7 +186,7 @@ def merge_points(
         both = InitialCloud(
             np.concatenate([found.positions, cloud.positions[new]]),
             np.concatenate([found.colours, cloud.colours[new]]),
-            # Silhouettes found by one method label only its points, so the combined cloud has no labels.
+            # Silhouettes of one method label only its own points, so the combined cloud has no labels.
             None if any(label is None for label in labels) else np.concatenate(labels),  # type: ignore[arg-type]
             f"{found.method} + {method}",
         )
@@ -193,10 +194,11 @@ def merge_points(
 
 
 def image_coverage(views: Sequence[PosedPicture], cloud: InitialPoints) -> float:
-    """Returns the share of image (or mask) cells that contain a point, median over the views.
+    """Returns the fraction of image (or mask) cells that contain a point, median over the views.
 
     Args:
-        views: views of the cameras. cloud: points in the same world.
+        views: views of the cameras.
+        cloud: points, in the world of the cameras.
     """
     shares = []
     for view in views:

@@ -1,4 +1,4 @@
-"""Surface normals of a state from its rendered depth, for reflections (``engines.cpu.gloss``)."""
+"""Estimates the surface normals of a state from its rendered depth, for reflections (``engines.cpu.gloss``)."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from scas4d_core.gaussians import Gaussians
 Array = NDArray[np.float32]
 
 BLUR = 1.5
-"""Standard deviation, in pixels, of the depth smoothing before differentiation."""
+"""Standard deviation, in pixels, of the blur that is applied to depth before differentiation."""
 STEEPEST = 0.2
 """Minimum cosine between normal and viewing ray for a pixel's normal to count."""
 REACH, NEAR = 0.03, 64
-"""Radius relative to the extent, and number of neighbours over which normals are averaged."""
+"""Radius (relative to the extent) and number of neighbours over which normals are averaged."""
 SKIN = 1 / 3
-"""Exponent applied to opacities: a surface is a haze in front of opaque Gaussians, and the depth of the haze is needed.
+"""Exponent applied to opacities. A surface is a haze in front of opaque Gaussians, and its depth is that of the haze.
 On `gloss`, the rendered depth was 15 mm behind the surface. Median normal errors on vase and ring were 8 and 6 degrees
-with rendered depth, and 4 and 4 with this exponent. With twice the neighbours at 1.5 times the radius they were 3 and
-4."""
+with the rendered depth, and 4 and 4 degrees with this exponent. With twice the neighbours at 1.5 times the radius, they
+were 3 and 4 degrees."""
 OPAQUE = 0.99
 SOLID = 0.5
 """Minimum alpha of a pixel that shows a surface."""
@@ -34,13 +34,15 @@ TINY = 1e-9
 
 
 def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: Renderer) -> Array:
-    """Returns [N, 3] unit normals that point outwards, towards the cameras.
+    """Returns the [N, 3] unit normals of the Gaussians, pointing outwards, towards the cameras.
 
-    Each pixel's normal follows from the depth gradient and is distributed to the Gaussians by their share of the pixel.
+    Each pixel's normal is computed from the depth gradient and distributed to the Gaussians by their blending weights.
     The normals are then averaged over neighbours.
 
     Args:
-        views: training views; depth is rendered from their cameras.
+        state: Gaussians of the surface.
+        views: training views, from whose cameras depth is rendered.
+        renderer: renderer of the state.
     """
     means, count = state.means, len(state)
     haze = state.replace(opacities=np.minimum(state.opacities**SKIN, OPAQUE).astype(np.float32))
@@ -75,7 +77,7 @@ def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: R
 def _pixel_normals(
     depth: NDArray[Any], solid: NDArray[np.bool_], lens: Array, reach: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Returns [H, W, 3] normals in camera axes and their weights [H, W]."""
+    """Returns the [H, W, 3] normals of the pixels in camera axes, and their [H, W] weights."""
     height, width = depth.shape
     smooth = gaussian_filter(depth, BLUR) / np.maximum(gaussian_filter(solid.astype(np.float64), BLUR), 1e-3)
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

@@ -20,8 +20,9 @@ class FirstCloud:
     """Origin of the initial point cloud.
 
     Attributes:
-        method: "given", or as in ``initial_points.InitialCloud``. points: number of points.
-        coverage: share of the images covered by points that cameras agree on; None for a given cloud.
+        method: "given" for a cloud from the user, else the methods as in ``initial_points.InitialCloud``.
+        points: number of points.
+        coverage: fraction of the images covered by points on which cameras agree; None for a given cloud.
     """
 
     method: str
@@ -34,14 +35,16 @@ class StaticResult:
     """Result of the fit of frame 0.
 
     Attributes:
-        gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera; empty without exposure terms.
-        losses: training loss of every iteration. psnr: dB, of the view rendered in each iteration.
-        cameras: by name, fit of each camera's image in its last iteration.
-        evidence: found for effects, by name.
+        gaussians: fitted Gaussians Θ_0.
+        exposures: [3, 2] gain and offset of each training camera, keyed by name; empty without exposure terms.
+        losses: training loss of each iteration.
+        psnr: PSNR of the view rendered in each iteration, in dB.
+        cameras: fit of each camera's image in its last iteration, keyed by camera name.
+        evidence: evidence for each effect, keyed by effect name; None without a trial.
         cloud: origin of the initial points; None if unknown.
-        planned: (iteration, total iterations) for each change of plan.
+        planned: (iteration, total iterations) at each change of plan.
         ran_short_of_time: whether any iteration advanced the schedule by more than one.
-        shortened: steps that had too little time, in words.
+        shortened: descriptions of the steps that had too little time.
     """
 
     gaussians: Gaussians

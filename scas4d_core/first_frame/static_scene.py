@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.choose import fit_engine_of, renderer_of
+from scas4d_core.engines.choose import Device, fit_engine_of, renderer_of
 from scas4d_core.engines.fit import (
     COLOUR,
     COLUMNS,
@@ -37,42 +37,44 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 INITIAL_SHARE = 0.6
-"""Maximum share of the budget for the initial points; a larger cloud is subsampled at random."""
+"""Maximum fraction of the budget for the initial points; a larger cloud is subsampled at random."""
 DENSIFY_FROM = 200
-"""First iteration with densification; before, gradients are noise."""
+"""First iteration with densification; earlier gradients are too noisy."""
 DENSIFY_EVERY = 100
-"""Iterations between densifications (3DGS)."""
+"""Number of iterations between densifications (3DGS)."""
 DENSIFY_UNTIL = 0.6
-"""Share of the iterations after which no Gaussians are added, so that the existing ones can converge."""
+"""Fraction of the iterations after which no Gaussians are added, so that the existing ones can converge."""
 DENSIFY_GRADIENT = 1e-6
-"""Minimum mean screen-space gradient (per half image, as in 3DGS) of a Gaussian that is densified. The budget limits
-their number; those with the largest gradients come first."""
+"""Minimum mean screen-space gradient (per half image, as in 3DGS) for densifying a Gaussian. The budget limits the
+number of densified Gaussians; those with the largest gradients come first."""
 PRUNE_OPACITY = 0.01
-"""Opacity below which Gaussians are removed during densification."""
+"""Opacity below which densification removes a Gaussian."""
 MIN_VIEWS = 2
-"""Minimum number of training cameras that see a Gaussian; others are removed."""
+"""Number of training cameras that must see a Gaussian; otherwise it is removed."""
 SEEN_PIXELS = 0.05
 """Blending weight, in pixels, above which a camera counts as seeing a Gaussian."""
 RATE_POSITION, RATE_POSITION_END = 1.6e-4, 1.6e-6
 """Adam learning rates of means at the start and end, per metre of scene radius, with exponential decay (3DGS)."""
 RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION, RATE_EXPOSURE = 2.5e-3, 5e-2, 5e-3, 2e-3, 1e-3
-"""Adam learning rates of colours, opacity logits, log scales, quaternions (as in 3DGS, with doubled rotation), and of
-the cameras' gain and offset."""
+"""Adam learning rates of colours, opacity logits, log scales and quaternions (as in 3DGS, but twice the rate for
+rotations), and of the cameras' gain and offset."""
 WEIGHT_MASK = 3.0
 """Weight of the mask loss if there are masks; in frame 0 it only trains the labels."""
 SPLIT_SHRINK = 1.6
-"""Factor by which the halves of a split Gaussian are smaller (3DGS)."""
+"""Factor by which the two halves are smaller than the Gaussian that is split (3DGS)."""
 STOP_ROUNDS = 5
-"""Number of passes over all views that the stopping rule compares with the previous ones; fewer are dominated by noise.
-"""
+"""Number of passes over all views that the stopping rule compares with as many passes before; fewer are too noisy."""
 
 
 class StaticTrainer:
     """Fits Gaussians to the views of frame 0, with density control.
 
     Attributes:
-        fit: the fitting loop with its parameters. schedule: of the fit. exposures: of the views, learnt in place.
-        budget: maximum number of Gaussians. cameras: by name, fit of each camera's last image.
+        fit: training loop and its parameters.
+        schedule: iteration schedule of the fit.
+        exposures: exposures of the views, learnt in place.
+        budget: maximum number of Gaussians.
+        cameras: fit of each camera's image in its last iteration, keyed by camera name.
     """
 
     def __init__(
@@ -84,7 +86,7 @@ class StaticTrainer:
         settings: StaticSettings,
         limit: TimeLimit | None = None,
         stage: Stage | None = None,
-        device: str = "cpu",
+        device: Device = "cpu",
     ) -> None:
         self.settings, self.views, self.stage = settings, views, stage
         self.budget = budget(views, scene, settings)
@@ -105,10 +107,11 @@ class StaticTrainer:
         progress: Callable[[FitProgress], None] | None = None,
         should_stop: Callable[[FitStep], bool] | None = None,
     ) -> list[float]:
-        """Runs all iterations, or fewer because of the stopping rule or the time limit; returns their losses.
+        """Runs all iterations, or fewer due to the stopping rule or the time limit, and returns their losses.
 
         Args:
-            progress: called after each iteration. should_stop: called after each iteration; true ends the fit.
+            progress: called after each iteration.
+            should_stop: called after each iteration; the fit ends if it returns true.
         """
         schedule = self.schedule
 
@@ -123,7 +126,7 @@ class StaticTrainer:
         return self.fit.losses
 
     def _after(self, now: FitStep, last: FitLoss) -> None:
-        """Runs density control, removal and exposure checks when they are due, and records the results."""
+        """Records the camera's fit; runs density control, removal and the exposure check when they are due."""
         settings, schedule, until = self.settings, self.schedule, self._until
         if last.colour_shift is not None:
             self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)
@@ -144,14 +147,12 @@ class StaticTrainer:
         return round(self._start + (self.budget - self._start) * min(1.0, share + 0.1))
 
     def _expected(self, at: float) -> float:
-        """Returns the expected number of Gaussians at a point of the schedule; past points predict another, similar
-        fit.
-        """
+        """Returns the expected number of Gaussians at a point of the schedule; past points refer to a similar fit."""
         aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
         return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
     def _has_converged(self) -> bool:
-        """Returns true if passes over all views no longer lower the loss; one more pass follows."""
+        """Returns true if passes over all views no longer reduce the loss; one final pass follows."""
         losses, window = self.fit.losses, STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
             return False
@@ -159,8 +160,8 @@ class StaticTrainer:
         return bool(before - now < self.settings.stop_gain * before)
 
     def scalars(self, now: FitStep) -> FitScalars:
-        """Returns the rates of an iteration; in the last ones, each camera's colour shift is also measured."""
-        # A shortened fit may end within a pass, but two passes include every view.
+        """Returns the learning rates of an iteration; the last iterations also measure each camera's colour shift."""
+        # A shortened fit may end in the middle of a pass, but two passes include every view.
         rounds = 1 if self.schedule.stride == 1 else 2 * self.schedule.stride
         ending = now.begun >= self._last - len(self.views) * rounds
         return FitScalars(self._rates(now.begun), 1 - 0.9 * now.begun / self.settings.iterations, ending)
@@ -178,10 +179,10 @@ class StaticTrainer:
         return rates
 
     def control_density(self, target: int) -> None:
-        """Removes nearly transparent Gaussians; clones or splits those with the largest screen-space gradients.
+        """Removes nearly transparent Gaussians, and clones or splits those with the largest screen-space gradients.
 
         Args:
-            target: number of Gaussians to reach.
+            target: target number of Gaussians.
         """
         parameters, statistics = self.fit.table.parameters, self.fit.table.statistics
         assert statistics is not None
@@ -203,8 +204,8 @@ class StaticTrainer:
     def remove_unseen(self) -> None:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
 
-        A Gaussian that no camera sees is unconstrained and becomes visible when the scene moves. One that a single
-        camera sees is a floater that explains only this camera's image and degrades all others.
+        A Gaussian that no camera sees is unconstrained and may become visible when the scene moves. A Gaussian that
+        only one camera sees is a floater, which explains the image of this camera but degrades all other views.
         """
         counts = np.zeros(len(self.fit), np.int64)
         state = self.gaussians()
@@ -212,7 +213,7 @@ class StaticTrainer:
             everywhere = np.ones((1, view.camera.height, view.camera.width), np.float32)
             counts += self.fit.renderer.gather(state, view.camera, everywhere)[:, 0] > SEEN_PIXELS
         needed = np.full(len(counts), min(MIN_VIEWS, len(self.views)))
-        if self.stage is not None:  # points of the surroundings do not hide anything from other cameras
+        if self.stage is not None:  # the surroundings do not occlude anything for other cameras
             needed[~self.stage.holds(state.means)] = 1
         keep = counts >= needed
         if keep.any():
@@ -220,7 +221,7 @@ class StaticTrainer:
             self.fit.replace_rows(np.flatnonzero(keep), np.zeros((0, COLUMNS), np.float32), none)
 
     def _half(self, half: Array, factors: Array) -> Array:
-        """Returns parameter rows with smaller scales, each displaced by a sample from its Gaussian."""
+        """Returns the parameter rows with smaller scales, each displaced by a sample from its Gaussian."""
         offset = self.random.standard_normal((len(half), 3)).astype(np.float32)
         half = half.copy()
         half[:, MEAN] += np.einsum("nij,nj->ni", factors, offset)
@@ -256,15 +257,16 @@ def first_trainer(
     settings: StaticSettings,
     limit: TimeLimit | None = None,
     stage: Stage | None = None,
-    device: str = "cpu",
+    device: Device = "cpu",
 ) -> StaticTrainer:
-    """Returns the trainer of ``fit_static_scene`` before its first iteration; arguments and errors are the same.
+    """Creates the trainer of ``fit_static_scene``, which takes the same arguments and raises the same errors.
 
-    ``stage``: region in the internal world; outside of it, points may be seen by a single camera. None without
-    surroundings.
+    Args:
+        stage: region in the internal world outside of which a Gaussian needs only a single camera that sees it; None
+            without surroundings.
     """
     if len(positions) == 0:
-        raise ValueError("the first cloud has no points; give points, masks, or more overlapping cameras")
+        raise ValueError("the initial cloud has no points; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
     most = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, most, rng)

@@ -1,4 +1,4 @@
-"""The time limit of frame 0: remaining seconds for each step, and steps that had too little time."""
+"""The time limit of frame 0: keeps track of the remaining time and of the steps that had too little of it."""
 
 from __future__ import annotations
 
@@ -7,28 +7,29 @@ from math import inf
 from time import perf_counter
 
 FEATURES = 0.15
-"""Share of the time by which features should be found."""
+"""Fraction of the time limit by which features should be extracted."""
 MATCHES = 0.2
-"""Share of the time by which features should be matched."""
+"""Fraction of the time limit by which features should be matched."""
 STEREO = 0.35
-"""Share of the time by which stereo should end, each time that it is tried. Without a limit, the initial points of
-basketball (27 cameras at 640x360) take a third of its frame 0. Those of rigs of four to seven cameras take less than a
-fifth."""
+"""Fraction of the time limit by which stereo should end, each time it is tried. Without a limit, computing the initial
+points takes a third of frame 0 on basketball (27 cameras at 640x360). On rigs of four to seven cameras, it takes less
+than a fifth."""
 AFTER_S = 2.5
-"""Seconds reserved for the steps after the fit: clusters, neighbours and the commit took 1 to 2 with 50,000 to 90,000
-Gaussians."""
+"""Seconds reserved for the steps after the fit: clustering, the neighbour graph and the commit took 1 to 2 seconds for
+50,000 to 90,000 Gaussians."""
 AFTER_SHARE = 0.1
-"""Maximum share of the time that is reserved for them."""
+"""Maximum fraction of the time limit that is reserved for these steps."""
 
 
 class TimeLimit:
-    """Limits the duration of frame 0 by selecting cheaper alternatives according to the measured pace.
+    """Limits the duration of frame 0 by choosing cheaper alternatives based on the measured pace.
 
     Args:
-        seconds: limit of frame 0 from now on; None for no limit. clock: returns seconds.
+        seconds: time limit of frame 0 in seconds, counted from now; None for no limit.
+        clock: returns the current time in seconds.
 
     Attributes:
-        shortened: steps that had too little time, in words.
+        shortened: descriptions of the steps that had too little time.
 
     >>> now = [0.0]
     >>> limit = TimeLimit(100.0, clock=lambda: now[0])
@@ -49,7 +50,10 @@ class TimeLimit:
         return self.seconds is not None
 
     def seconds_left(self, share: float = 1.0) -> float:
-        """Returns the seconds until a share of the time has passed, negative afterwards; infinity without a limit."""
+        """Returns the seconds until the given share of the time limit has passed.
+
+        The value is negative afterwards, and infinite without a limit.
+        """
         return inf if self.seconds is None else self._began + share * self.seconds - self.clock()
 
     @property
@@ -58,11 +62,11 @@ class TimeLimit:
         return inf if self.seconds is None else self.seconds_left() - min(AFTER_S, AFTER_SHARE * self.seconds)
 
     def choose(self, share: float, costs: Sequence[float]) -> int:
-        """Returns the index of the first alternative that ends before a share of the time has passed; if none, their
-        number.
+        """Returns the index of the first alternative that is fast enough, or the number of alternatives if none is.
 
         Args:
-            costs: predicted seconds of each alternative, the best first.
+            share: fraction of the time limit by which the alternative must end.
+            costs: predicted duration of each alternative in seconds, best alternative first.
         """
         left = self.seconds_left(share)
         return next((index for index, cost in enumerate(costs) if cost <= left), len(costs))

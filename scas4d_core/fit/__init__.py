@@ -1,1 +1,1 @@
-"""Fits Gaussians to the images of one frame: those of frame 0 and those added later."""
+"""Fits Gaussians to the images of a single frame, both for frame 0 and for Gaussians added later."""

@@ -1,4 +1,4 @@
-"""Camera gains and offsets that are learnt with frame 0 and discarded if the cameras are alike."""
+"""Gain and offset of each camera, learnt with frame 0 and discarded if the cameras hardly differ."""
 
 from __future__ import annotations
 
@@ -13,18 +13,23 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 Array = NDArray[np.float32]
 
 TRIAL, SPREAD = 0.3, 0.015
-"""Share of the iterations after which exposures are assessed, and standard deviation of the gains over cameras below
-which they are discarded. After 900 iterations it was 0.004 and 0.007 for equal cameras, and 0.033 for a real rig."""
+"""Fraction of the iterations after which exposures are assessed, and standard deviation of the gains across cameras
+below which they are discarded. After 900 iterations, the standard deviation was 0.004 and 0.007 for identical cameras
+and 0.033 for a real rig."""
 
 
 class Exposures:
-    """Learns the exposures of the views of frame 0, in place.
+    """Learns the exposure of each view of frame 0, in place.
 
     Args:
-        views: views of the frame. rate: Adam learning rate of gain and offset. beta1, beta2: Adam decays.
+        views: views of the frame; their exposures are updated.
+        on: whether to learn exposures.
+        rate: Adam learning rate of gain and offset.
+        beta1: Adam decay rate of the first moment.
+        beta2: Adam decay rate of the second moment.
 
     Attributes:
-        on: whether exposures are still learnt.
+        on: whether exposures are still being learnt.
     """
 
     def __init__(self, views: Sequence[TrainingView], on: bool, rate: float, beta1: np.float32, beta2: np.float32):
@@ -33,10 +38,12 @@ class Exposures:
         self._moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
 
     def step(self, view: TrainingView, gradient: Array, steps: int) -> None:
-        """Applies an Adam step to a camera's gain and offset, then recentres their means over cameras to 1 and 0.
+        """Applies an Adam step to a camera's gain and offset, then recentres their means over all cameras to 1 and 0.
 
         Args:
-            gradient: [C, 2] of the loss; that of the label is ignored. steps: number of steps including this one.
+            view: view of the camera.
+            gradient: [C, 2] gradient of the loss with respect to gain and offset; the label channel is ignored.
+            steps: number of Adam steps so far, including this one.
         """
         if not self.on:
             return
@@ -50,7 +57,7 @@ class Exposures:
             other.exposure[:3] -= centre
 
     def assess(self) -> None:
-        """Discards gains and offsets that hardly differ between cameras."""
+        """Resets gains and offsets, and stops learning them, if they hardly differ between cameras."""
         gains = np.array([view.exposure[:3, 0] for view in self._views])
         if gains.std(axis=0).mean() < SPREAD:
             self.on = False
@@ -58,5 +65,5 @@ class Exposures:
                 view.exposure[:] = (1, 0)
 
     def by_camera(self) -> dict[str, Array]:
-        """Returns the [3, 2] exposure of each camera; empty if exposures are not learnt."""
+        """Returns the [3, 2] exposure of each camera, keyed by name; empty if exposures are not learnt."""
         return {view.name: view.exposure[:3].copy() for view in self._views} if self.on else {}

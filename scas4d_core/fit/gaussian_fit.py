@@ -1,7 +1,7 @@
-"""The loop that fits Gaussians to images outside of updates: frame 0, new objects and their refinement.
+"""The training loop that fits Gaussians to images outside of updates: for frame 0, new objects and their refinement.
 
-Arguments of ``GaussianFit.run`` define the differences: the order of views, the rates of each iteration, the schedule,
-and actions after an iteration.
+These cases differ only in the arguments of ``GaussianFit.run``: the order of views, the learning rates, the schedule,
+and the callback after each iteration.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 
 BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
-"""Default Adam decays, as in 3DGS."""
+"""Default Adam decay rates, as in 3DGS."""
 
 
 @dataclass(frozen=True)
 class FitStep:
-    """One iteration, from ``begun`` to ``ended`` in iterations of the full schedule.
+    """One iteration, which advances the full schedule from iteration ``begun`` to ``ended``.
 
     >>> step = FitStep(99.0, 101.5)
     >>> step.reaches(100), step.reaches(102), step.passes(100), step.passes(70)
@@ -39,7 +39,7 @@ class FitStep:
     ended: float
 
     def reaches(self, moment: float) -> bool:
-        """Returns true if this iteration reaches the given point of the schedule."""
+        """Returns true if this iteration reaches a given point of the schedule."""
         return self.begun < moment <= self.ended
 
     def passes(self, every: float) -> bool:
@@ -48,12 +48,12 @@ class FitStep:
 
 
 def each_once(done: int) -> FitStep:
-    """Returns the step for iteration ``done``, counted from 0, of a schedule that runs every iteration."""
+    """Returns the step of iteration ``done``, counted from 0, for a schedule that skips no iteration."""
     return FitStep(done, done + 1)
 
 
 def never(now: FitStep, last: FitLoss) -> bool:
-    """Never ends a fit early."""
+    """Returns false, so that the fit does not end early."""
     return False
 
 
@@ -61,16 +61,21 @@ class GaussianFit:
     """Fits the rows of a parameter table to views.
 
     Args:
-        engine: used by this fit only. views: to fit.
-        parameters: [N, 15], with the columns of ``engines.fit``; changed in place.
-        fixed: for each view, fixed Gaussians that are rendered with the fitted ones; empty for none.
-        gloss: for view-dependent colours, learnt as well; None for constant colours.
-        exposures: exposures of the views, learnt as well; None for fixed exposures.
-        betas: Adam decays. statistics: whether to collect ``table.statistics`` for density control.
+        engine: fit engine, which no other fit may use.
+        views: views to fit.
+        parameters: [N, 15] parameter table with the columns of ``engines.fit``; changed in place.
+        fixed: for each view, fixed Gaussians that are rendered together with the fitted ones; empty for none.
+        gloss: gloss of view-dependent colours, which is also learnt; colours are constant if None.
+        exposures: exposures of the views, which are also learnt; exposures are fixed if None.
+        betas: Adam decay rates.
+        statistics: whether to collect ``table.statistics`` for density control.
 
     Attributes:
-        views, exposures: as given. renderer: of the engine.
-        losses, psnr: of each iteration so far; PSNR in dB of the rendered view.
+        views: fitted views.
+        exposures: exposures of the views, or None.
+        renderer: renderer of the engine.
+        losses: loss of each iteration so far.
+        psnr: PSNR of the rendered view in each iteration so far, in dB.
 
     >>> from scas4d_core.captures import open_capture
     >>> from scas4d_core.engines.choose import fit_engine_of, renderer_of
@@ -134,9 +139,10 @@ class GaussianFit:
         """Runs iterations until the order of views is exhausted, or until ``begin`` or ``end`` ends the fit.
 
         Args:
-            order: view index of each iteration. scalars: returns the rates of an iteration.
-            begin: called before an iteration with its number in this run; None ends the fit.
-            end: called after an iteration with its loss; true ends the fit.
+            order: view index of each iteration.
+            scalars: returns the learning rates and options of an iteration.
+            begin: called before each iteration with its number in this run; the fit ends if it returns None.
+            end: called after each iteration with its loss; the fit ends if it returns true.
         """
         for done, view in enumerate(order):
             now = begin(done)
@@ -151,14 +157,16 @@ class GaussianFit:
                 return
 
     def set_gloss(self, gloss: FitGloss) -> None:
-        """Continues with a different gloss for the same Gaussians."""
+        """Replaces the gloss of the current Gaussians for the rest of the fit."""
         self._engine.load_table(replace(self.table, gloss=gloss))
 
     def replace_rows(self, rows: NDArray[np.int64], added: Array, parents: NDArray[np.int64]) -> None:
         """Keeps some rows with their moments and appends new rows with zero moments; statistics are reset.
 
         Args:
-            added: [A, 15] parameters. parents: [A] source rows, whose gloss is inherited.
+            rows: indices of the rows to keep.
+            added: [A, 15] parameters of the new rows.
+            parents: [A] source row of each new row, from which it inherits its gloss.
         """
         table, fresh = self.table, np.zeros_like(added)
         gloss = None if table.gloss is None else table.gloss.select_rows(rows, parents)

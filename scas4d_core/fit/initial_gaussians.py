@@ -14,15 +14,16 @@ Array = NDArray[np.float32]
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
-"""Parameters of the Gaussian budget if ``StaticSettings.max_gaussians`` is not set; ``detail`` scales it. Detail is on
-objects, but an image that is mostly background needs nearly as many Gaussians as a full one. Above the largest budget,
-an update takes seconds."""
+"""Gaussians per pixel, additional Gaussians per covered pixel, and the largest budget. They apply if
+``StaticSettings.max_gaussians`` is not set; ``detail`` scales the result. Objects contain most of the detail, but an
+image that is mostly background needs nearly as many Gaussians as a full one. Above the largest budget, an update takes
+seconds."""
 PLAIN = 2 / 255
-"""Maximum colour difference from the background colour of a background pixel."""
+"""Maximum difference between a background pixel and the background colour."""
 
 
 def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSettings) -> int:
-    """Returns the maximum number of Gaussians, from the setting or from the size and content of the images."""
+    """Returns the maximum number of Gaussians: as configured, or based on the size and content of the images."""
     if settings.max_gaussians is not None:
         return settings.max_gaussians
     background = np.array(scene.background_rgb, np.float32)[:, None, None]
@@ -42,12 +43,16 @@ def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
 def initial_parameters(
     positions: NDArray[np.float64], colours: Array, foreground: Array | None, limit: int, rng: np.random.Generator
 ) -> Array:
-    """Returns one row per point: isotropic Gaussians whose width is the RMS distance to the three nearest neighbours.
+    """Returns one parameter row per point, for isotropic Gaussians.
+
+    The width of each Gaussian is the RMS distance to the three nearest points.
 
     Args:
-        positions: [P, 3] metres in the internal world. colours: [P, 3] in 0…1. foreground: [P] label or None.
+        positions: [P, 3] positions in metres, in the internal world.
+        colours: [P, 3] colours in 0…1.
+        foreground: [P] foreground label of each point in 0…1, or None.
         limit: maximum number of Gaussians; a larger cloud is subsampled at random.
-        rng: for the subsampling.
+        rng: random generator for the subsampling.
     """
     if len(positions) > limit:
         keep = np.sort(rng.choice(len(positions), limit, replace=False))

@@ -1,1 +1,1 @@
-"""Numba kernels of the CPU engine: plain functions on arrays, each tested against PyTorch."""
+"""Numba kernels of the CPU engine: plain functions on arrays, tested against PyTorch."""

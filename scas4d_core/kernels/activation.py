@@ -1,7 +1,7 @@
-"""Activation of the parameters of frame 0 to the rasterizer's inputs, and its backward pass.
+"""Activation functions that convert fit parameters to rasterizer inputs, and their backward pass.
 
-F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A zero quaternion is treated as no rotation:
-``guards.QUATERNION_FLOOR``. The tests contain a reference in PyTorch.
+F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A zero quaternion is treated as the identity; see
+``guards.QUATERNION_FLOOR``. The reference implementation in PyTorch is part of the tests.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SHORTEST = np.float32(QUATERNION_FLOOR)
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
 COUNTED_GUARDS = ("quaternion_floor", "exponent")
-"""Guards that ``activate`` counts."""
+"""Names of the guards that ``activate`` counts."""
 
 
 def activate(
@@ -34,10 +34,17 @@ def activate(
     opacities: NDArray[np.float32],
     features: NDArray[np.float32],
 ) -> NDArray[np.int64]:
-    """Fills means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15].
+    """Computes the rasterizer inputs from the parameters of a fit.
+
+    Args:
+        parameters: [N, 15] parameters.
+        means: [N, 3] output, in metres.
+        factors: [N, 3, 3] output, covariance factors.
+        opacities: [N] output.
+        features: [N, 4] output, RGB and label.
 
     Returns:
-        [2] number of Gaussians for which each guard in ``COUNTED_GUARDS`` was triggered.
+        [2] number of Gaussians that triggered each guard in ``COUNTED_GUARDS``.
     """
     guard_counts = np.zeros((-(-len(parameters) // CHUNK), len(COUNTED_GUARDS)), np.int64)
     activate_rows(parameters, means, factors, opacities, features, guard_counts)
@@ -47,7 +54,7 @@ def activate(
 
 @inline
 def direction(p):
-    """Returns the unit quaternion of a parameter row and its inverse norm; identity and 0 for a zero quaternion."""
+    """Returns the unit quaternion of a parameter row and its inverse norm, or the identity and 0 if it is zero."""
     square = p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]
     directed = square > SHORTEST
     norm = ONE / np.float32(np.sqrt(square)) if directed else ZERO
@@ -60,7 +67,7 @@ def direction(p):
 
 @parallel_kernel
 def activate_rows(parameters, means, factors, opacities, features, guard_counts):
-    """Runs ``activate`` in parallel tasks; fills ``guard_counts`` [tasks, 2]."""
+    """Implements ``activate`` with parallel tasks, which fill ``guard_counts`` [tasks, 2]."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         aimless = clamped = 0
@@ -86,7 +93,7 @@ def activate_rows(parameters, means, factors, opacities, features, guard_counts)
 
 @parallel_kernel
 def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):
-    """Fills dL/dparameters [N, 15] from the gradients of the rasterizer's inputs."""
+    """Computes dL/dparameters [N, 15] from the gradients of the rasterizer inputs."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):

@@ -1,6 +1,7 @@
-"""Adam step (Kingma and Ba 2015) for a parameter table with one rate per column. Reference: ``torch.optim.Adam``.
+"""Adam step (Kingma and Ba 2015) for a parameter table, with a learning rate per column.
 
-Values that are not finite, or would become so, are clamped and counted: ``guards.GRADIENT_CEILING``,
+Reference implementation: ``torch.optim.Adam``. Gradients that are not finite, or so large or small that the moments
+would overflow or become subnormal, are clamped and counted; see ``guards.GRADIENT_CEILING`` and
 ``guards.MOMENT_FLOOR``.
 """
 
@@ -21,10 +22,10 @@ SMALLEST = np.float32(MOMENT_FLOOR)
 LARGEST = np.float32(GRADIENT_CEILING)
 
 COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
-"""Guards that ``adam`` counts."""
+"""Names of the guards that ``adam`` counts."""
 
 EVERY_ROW = np.ones(1, np.float32)
-"""``by_row`` if all rows have the same rates."""
+"""Value of ``by_row`` if all rows have the same learning rates."""
 
 ROWS = 1024
 
@@ -40,16 +41,19 @@ def adam(
     beta2: Any,
     step: int,
 ) -> NDArray[np.int64]:
-    """Updates ``parameters`` [n, columns] in place.
+    """Takes one Adam step.
 
     Args:
-        gradients: [n, columns], C-contiguous; guarded values are overwritten with their bounds.
-        first, second: [n, columns] moments, updated in place. rates: [columns] learning rates.
-        by_row: [n] factor on the rates of each row, or ``EVERY_ROW``.
-        beta1, beta2: decay rates (float32). step: 1 for the first update.
+        parameters: [n, columns] parameters, updated in place.
+        gradients: [n, columns] gradients, C-contiguous. Values that trigger a guard are overwritten.
+        first, second: [n, columns] first and second moments, updated in place.
+        rates: [columns] learning rates.
+        by_row: [n] learning rate factor of each row, or ``EVERY_ROW``.
+        beta1, beta2: decay rates, float32.
+        step: number of this step, starting with 1.
 
     Returns:
-        [2] number of gradient values for which each guard in ``COUNTED_GUARDS`` was triggered.
+        [2] number of gradient values that triggered each guard in ``COUNTED_GUARDS``.
     """
     guard_counts = np.zeros((-(-len(parameters) // ROWS), len(COUNTED_GUARDS)), np.int64)
     adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)
@@ -59,8 +63,8 @@ def adam(
 
 @kernel
 def guard_gradients(gradients, first, last, guard_counts):
-    """Clamps values from flat index ``first`` up to, but not including, ``last``; adds to ``guard_counts`` [2]."""
-    # A single sum reveals whether any value needs a guard, because NaN and infinity propagate.
+    """Clamps gradients in the flat index range [first, last), and counts clamped values in ``guard_counts`` [2]."""
+    # A single sum shows whether any value must be clamped, because NaN and infinity propagate.
     total, least = lanes.fill(ZERO), lanes.fill(ONE)
     for place in range(first, last, lanes.COUNT):
         size = lanes.magnitude(lanes.load_first(gradients, place, last - place))
@@ -75,7 +79,7 @@ def guard_gradients(gradients, first, last, guard_counts):
         size = lanes.magnitude(given)
         tiny = (size > ZERO) & (size <= SMALLEST)
         fits = size <= LARGEST
-        # NaN compares neither above nor below 0, so it becomes 0.
+        # NaN is neither greater nor less than 0, so it becomes 0.
         bound = lanes.choose(given > ZERO, most, lanes.choose(given < ZERO, -most, lanes.fill(ZERO)))
         taken = lanes.choose(fits, lanes.choose(tiny, lanes.fill(ZERO), given), bound)
         lanes.store_first(gradients, place, last - place, taken)
@@ -87,7 +91,7 @@ def guard_gradients(gradients, first, last, guard_counts):
 
 @parallel_kernel
 def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts):
-    """Runs ``adam`` in parallel tasks; adds to ``guard_counts`` [tasks, 2]."""
+    """Implements ``adam`` with parallel tasks, which add to ``guard_counts`` [tasks, 2]."""
     rows, columns = parameters.shape
     correction1 = ONE - np.float32(beta1**step)
     correction2 = ONE - np.float32(beta2**step)

@@ -1,7 +1,7 @@
-"""Front-to-back blending of tiles, forward and backward pass. Reference: ``engines.torch.rasterizer``.
+"""Front-to-back blending of tiles, and its backward pass. Reference implementation: ``engines.torch.rasterizer``.
 
-A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. For each Gaussian, the blocks that intersect its
-support (``tiles.cover``) are visited in the order of their bits.
+A tile consists of 8×8 blocks of 4×4 pixels, and a block is processed as one ``Lanes``. For each Gaussian, the blocks
+that intersect its support (``tiles.cover``) are visited in bit order.
 """
 
 from __future__ import annotations
@@ -15,38 +15,38 @@ from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
 from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, LOG_OPACITY, MEAN_X, MEAN_Y, TILE
 
-# Columns of a pair's gradient record: sums over the tile's pixels of dL/dpower times the monomials of the offset
-# (dx, dy), followed by the features.
+# Columns of the gradient record of a Gaussian–tile pair: sums over the tile's pixels of dL/dpower times monomials of
+# the offset (dx, dy), followed by the feature gradients.
 SUM_1, SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY, FEATURES = range(7)
 
 GROUP = 4
-"""Channels are blended in unrolled groups of four."""
+"""Number of channels per group. Loops over the channels of a group are unrolled."""
 
 BLOCK = lanes.ACROSS
 BLOCKS = (TILE // BLOCK) ** 2
 BLOCK_X = np.array([BLOCK * (block >> 3) for block in range(BLOCKS)], np.float32)
 BLOCK_Y = np.array([BLOCK * (block & 7) for block in range(BLOCKS)], np.float32)
 AHEAD = 4
-"""Prefetch distance in entries; the data of Gaussians is scattered in memory."""
+"""Prefetch distance in entries, because the data of Gaussians is scattered in memory."""
 
 HALF_LOG2_E = np.float32(0.5 * 1.4426950408889634)
-"""Factor for powers of 2: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
+"""Factor that converts exponents to base 2: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
 
 
 def record_columns(channels: int) -> int:
-    """Returns the number of columns of a gradient record, a multiple of ``Lanes``."""
+    """Returns the number of columns of a gradient record, rounded up to a multiple of ``Lanes``."""
     return -(-(FEATURES + channels) // lanes.COUNT) * lanes.COUNT
 
 
 @inline
 def without_lowest_block(cover):
-    """Clears the lowest block of a cover."""
+    """Returns a block mask with the lowest block cleared."""
     return cover & (cover - np.uint64(1))
 
 
 @inline
 def fetch_ahead(entry, end, items, splats, features):
-    """Prefetches the data of a later entry."""
+    """Prefetches the data of the entry ``AHEAD`` positions later."""
     i = items[min(entry + AHEAD, end - 1)]
     lanes.prefetch_row(splats, i)
     lanes.prefetch_row(features, i)
@@ -54,7 +54,10 @@ def fetch_ahead(entry, end, items, splats, features):
 
 @kernel
 def copy_blocks(plane, y_first, x_first, state, start, step, inward):
-    """Copies blocks between a tile of a plane and the block state, from ``start`` with ``step`` per block."""
+    """Copies blocks from a tile of a plane to the block state if ``inward``, otherwise back.
+
+    The first block is at index ``start`` of the state, and consecutive blocks are ``step`` apart.
+    """
     for column in range(TILE // BLOCK):
         for row in range(TILE // BLOCK):
             place = start + step * (column * (TILE // BLOCK) + row)
@@ -89,7 +92,7 @@ def blend_task(
     faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
     tiles_x = (size[0] + TILE - 1) // TILE
-    # Per block: transmittance, negative if the pixel is finished; colours.
+    # State of a block: transmittance (negative for finished pixels) and features.
     step = lanes.COUNT * (1 + channels)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -125,8 +128,8 @@ def blend_task(
                 after = before - weight
                 drawn = (power >= faintest) & (after >= stop)
                 if not lanes.any_of(drawn):
-                    # Nothing visible, but pixels may end here. The backward pass skips a visit that changes nothing.
-                    # A finished block is not visited again.
+                    # Nothing is visible, but this Gaussian may finish some pixels. If not, the backward pass can skip
+                    # the block. Blocks in which all pixels are finished are not visited again.
                     bit = np.uint64(1) << np.uint64(block)
                     ended = (power >= faintest) & (before > ZERO)
                     if lanes.any_of(ended):
@@ -187,18 +190,24 @@ def blend(
     image,
     transmittance,
 ):
-    """Blends tiles front to back.
+    """Blends the Gaussians of each tile front to back.
 
     Args:
-        splats: [N, 16]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
-        groups: a tuple of length C/4, which is known at compile time.
-        covers: [entries] uint64, the blocks of the tile that the entry's support intersects; reduced to those where it
-            was blended.
-        wanted: [tiles] uint64, the blocks of each tile to render; all others are filled with the background.
-        tile_order: int64, the tiles to render, distributed to ``tasks`` in this order; others are unchanged.
-        size: (width, height) in pixels. background: [C]. limits: [6], the fields of ``Limits``.
-        image: out [C, rows, stride] float32, padded to whole tiles. transmittance: out [rows, stride] remaining
-            transmittance.
+        splats: [N, 16] projected Gaussians; see ``projection``.
+        features: [N, C] float32 features; C must be a multiple of 4.
+        groups: tuple of length C/4, which makes the number of channels known at compile time.
+        starts: [tiles + 1] start of each tile's list in ``items``.
+        items: [entries] Gaussian of each entry.
+        covers: [entries] uint64 block mask of each entry, see ``tiles.cover``. Blocks in which the Gaussian has no
+            effect are cleared.
+        wanted: [tiles] uint64 mask of the blocks to render; all others are filled with the background.
+        tile_order: int64 tiles to render, distributed to tasks in this order. All other tiles stay unchanged.
+        tasks: number of parallel tasks.
+        size: image size (width, height) in pixels.
+        background: [C] background features.
+        limits: [6] rasterizer constants, in the order of the ``Limits`` fields.
+        image: [C, rows, stride] float32 output, padded to whole tiles.
+        transmittance: [rows, stride] output, remaining transmittance.
     """
     for task in prange(tasks):
         blend_task(
@@ -241,13 +250,13 @@ def blend_backward_task(
     g_alpha,
     records,
 ):
-    """Backpropagates through the tiles of one task of ``blend_backward``."""
+    """Processes the tiles of one task of ``blend_backward``."""
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
     columns = records.shape[1]
     tiles_x = (size[0] + TILE - 1) // TILE
-    # Per block: transmittance, negative if the pixel is finished; contribution of later entries; incoming gradients.
+    # State of a block: transmittance (negative for finished pixels), contribution of later entries, image gradients.
     step = lanes.COUNT * (2 + channels)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -393,16 +402,21 @@ def blend_backward(
     g_alpha,
     records,
 ):
-    """Computes the gradients of every entry, a pair of Gaussian and tile.
+    """Computes the gradients of every entry, i.e. of every Gaussian–tile pair.
 
-    It runs front to back like the forward pass. The later entries only matter through the product of their colour with
-    the incoming gradient. Per pixel, this is one number: the total minus the contribution of the entries so far.
+    Like the forward pass, it runs front to back. Later entries only matter through the product of their blended
+    features and the image gradient. For each pixel, this is a single number: the total minus the contribution of all
+    entries so far.
 
     Args:
-        slots: [entries] pair of each entry. covers: [entries] as returned by ``blend``.
-        learnt: [N] uint8, 0 for Gaussians that need no gradient; their records are not written.
-        g_image: [C, rows, stride] dL/dimage. g_alpha: [rows, stride] dL/dalpha, alpha = 1 - transmittance.
-        records: out [pairs, multiple of ``Lanes``] float32, columns above.
+        splats, features, groups, starts, items, tile_order, tasks, size, limits: see ``blend``.
+        slots: [entries] pair of each entry, i.e. its row in ``records``.
+        covers: [entries] block masks, as updated by ``blend``.
+        learnt: [N] uint8 mask; if 0, the Gaussian needs no gradient and its records are not written.
+        image, transmittance: outputs of ``blend``.
+        g_image: [C, rows, stride] dL/dimage.
+        g_alpha: [rows, stride] dL/dalpha, where alpha = 1 - transmittance.
+        records: [pairs, multiple of ``Lanes``] float32 output; see the column constants above.
     """
     for task in prange(tasks):
         blend_backward_task(

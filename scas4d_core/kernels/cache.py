@@ -1,13 +1,13 @@
-"""Cache of compiled kernels, with one folder per version of the kernel sources.
+"""On-disk cache of compiled kernels, with one folder per version of the kernel sources.
 
-Numba keeps a compiled function until its own source file changes. A kernel also contains inlined functions from other
-files, which Numba does not track, so it would keep outdated code after an edit there. The folder is therefore named
-after a digest of all kernel files and of the guards, whose values are compiled in. Folders of older versions are
+Numba recompiles a cached function only when its own source file changes. Kernels also inline functions from other
+files, which Numba does not track, so they could be outdated after such a file is edited. The cache folder is therefore
+named after a digest of all kernel files and of the guards, whose values are compiled in. Folders of older versions are
 deleted.
 
-Several processes may fill the same folder. Numba replaces files atomically. However, two processes that save different
-signatures of one function at the same time could assign the same number, and one would load wrong code. Saving is
-therefore protected by a lock.
+Several processes may write to the same folder. Numba replaces files atomically. However, two processes that save
+different signatures of a function at the same time could choose the same file number. One of them would then load the
+wrong code, so a lock protects saving.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ except ImportError:  # not available on this system
 
 PREFIX = "kernels-"
 KEPT = 3
-"""Number of versions to keep, since several checkouts may share a cache."""
+"""Number of versions to keep, because several checkouts may share a cache."""
 
 
 GUARDS = Path(__file__).parent.parent / "guards.py"
 
 
 def digest(folder: Path = Path(__file__).parent) -> str:
-    """Returns a digest of the Python files in and below a folder (names and contents) and of the guards."""
+    """Returns a digest of all Python files below a folder (names and contents) and of the guards."""
     hasher = hashlib.sha256()
     for path in [*sorted(folder.rglob("*.py")), GUARDS]:
         name = os.path.relpath(path, folder)
@@ -46,7 +46,7 @@ def digest(folder: Path = Path(__file__).parent) -> str:
 
 
 def base() -> Path:
-    """Returns the folder of all versions: NUMBA_CACHE_DIR, or scas4d/numba in the user's cache folder."""
+    """Returns the folder that contains all versions: NUMBA_CACHE_DIR, or scas4d/numba in the user's cache folder."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         path = Path(given)
@@ -55,14 +55,14 @@ def base() -> Path:
 
 
 def use(folder: Path) -> None:
-    """Makes Numba use this version's cache folder; if it cannot be created, Numba's default applies."""
+    """Makes Numba use this version's cache folder in ``folder``. If it cannot be created, Numba's default applies."""
     mine = folder / (PREFIX + digest())
     try:
         mine.mkdir(parents=True, exist_ok=True)
         os.utime(mine)
     except OSError:
         return
-    # Also set the environment, which Numba re-reads when it changes and child processes inherit.
+    # Also set the environment variable, because Numba re-reads it when it changes and child processes inherit it.
     os.environ["NUMBA_CACHE_DIR"] = str(mine)
     numba.config.CACHE_DIR = str(mine)  # type: ignore[attr-defined]
     remove_old(folder)
@@ -78,12 +78,13 @@ def remove_old(folder: Path, kept: int = KEPT) -> None:
 
 @contextlib.contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Holds a file lock, creating the file if needed; yields whether the lock was acquired.
+    """Context manager that acquires a file lock, and yields whether the lock was acquired.
 
     If file locks are not supported or the file cannot be created, every caller gets the lock.
 
     Args:
-        wait: whether to wait until the lock is free; otherwise yields False if it is taken.
+        path: lock file, created if needed.
+        wait: whether to wait until the lock is available. If false and the lock is taken, yields False.
     """
     with contextlib.ExitStack() as stack:
         if fcntl is not None:
@@ -99,7 +100,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
 
 
 class _OneAtATime(IndexDataCacheFile):
-    """Cache index and data of one function, saved by one process at a time."""
+    """Cache files of one function, which only one process at a time may save."""
 
     def save(self, key: Any, data: Any) -> None:
         with locked(Path(self._cache_path) / "saving.lock"):
@@ -107,9 +108,9 @@ class _OneAtATime(IndexDataCacheFile):
 
 
 def shared(dispatcher: Any) -> Any:
-    """Makes the cache of a compiled function safe for concurrent saving; returns the function."""
+    """Makes concurrent saving to the cache of a compiled function safe, and returns the function."""
     cache = dispatcher._cache
-    if isinstance(cache, FunctionCache):  # the function is cached
+    if isinstance(cache, FunctionCache):  # caching is enabled
         file = cache._cache_file
         cache._cache_file = _OneAtATime(file._cache_path, cache._impl.filename_base, file._source_stamp)
     return dispatcher

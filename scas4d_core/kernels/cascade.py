@@ -1,15 +1,16 @@
 """Cascade of cluster maps and its backward pass (paper, single-layer deformation function and nesting).
 
-Reference: ``deformation.cascade``. Every step processes sixteen Gaussians of one cluster (``Lanes``), so cluster values
-are scalars and Gaussian values are vectors; ``deform`` combines the steps. A layer passes on a point x, the Gaussian's
-factor F (nine entries, row-major; the map's Jacobian is applied to it directly) and its rotation Q.
+Each step processes sixteen Gaussians of one cluster, so values of the cluster are scalars and values of Gaussians are
+vectors (``Lanes``). ``deform`` combines the steps. Each layer transforms a point x, the Gaussian's factor F (nine
+entries, row-major; the map's Jacobian is applied to it directly) and its rotation Q. Reference implementation:
+``deformation.cascade``.
 
-Cluster map, y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
-centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ)
-with e = y, or e = y + Rᵀ(p + t). With separate covariance, factors stay unchanged.
+Cluster map, with y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
+centred x' = p + t + f R y, published x' = f (R y + p + t). Both have J = R (f I + f' e cᵀ),
+with e = y (centred) or e = y + Rᵀ(p + t) (published). With separate covariance, factors stay unchanged.
 
-Points are updated by their displacement: x' = w + (f − 1) u with w = x + t + (R − I) y, u = R y or u = w. All terms
-except x are 0 if the parameters are 0, so the identity preserves every bit on every processor.
+Points are updated by adding a displacement: x' = w + (f − 1) u with w = x + t + (R − I) y, and u = R y (centred) or
+u = w (published). All terms except x are 0 if the parameters are 0, so the identity is bit-exact on every processor.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import LOG2_E, ONE, TWO, ZERO, inline, kernel
 
-# Columns of a cluster's table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21, s 22,
-# diagonal of R − I 23–25.
+# Number of columns of a cluster table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21,
+# s 22, diagonal of R − I 23–25.
 TABLE = 26
-# Columns of a cluster's parameters: r 0–2, t 3–5, c 6–8, s 9.
+# Number of columns of the cluster parameters: r 0–2, t 3–5, c 6–8, s 9.
 PARAMETERS = 10
-# A block's contribution to its cluster's gradient: rotation matrix 0–8, quaternion 9–12, t 13–15; c 16–18, s 19.
+# Number of columns of a block's contribution to the gradient of its cluster: rotation matrix 0–8, quaternion 9–12,
+# t 13–15, c 16–18, s 19.
 RECORD = 2 * lanes.COUNT
 
 LEAST = np.float32(HALF_TURN)
@@ -33,12 +35,12 @@ FEWEST = int(EMPTY_CLUSTER)
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
 COUNTED_GUARDS = ("exponent", "half_turn", "folded")
-"""Guards that ``apply_cluster_map`` counts."""
+"""Names of the guards that ``apply_cluster_map`` counts."""
 
 
 @inline
 def rotation_entries(w, x, y, z):
-    """Converts a unit quaternion to the nine entries of its matrix, row by row."""
+    """Converts a unit quaternion to the nine entries of its rotation matrix, in row-major order."""
     return (
         ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
         TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
@@ -48,7 +50,7 @@ def rotation_entries(w, x, y, z):
 
 @inline
 def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
-    """Converts dL/dmatrix (nine entries, row by row) to dL/dquaternion, for the formula of ``rotation_entries``."""
+    """Converts dL/dmatrix (nine entries, row-major) to dL/dquaternion; the backward pass of ``rotation_entries``."""
     gw = TWO * (-z * g1 + y * g2 + z * g3 - x * g5 - y * g6 + x * g7)
     gx = TWO * (y * g1 + z * g2 + y * g3 - TWO * x * g4 - w * g5 + z * g6 + w * g7 - TWO * x * g8)
     gy = TWO * (-TWO * y * g0 + x * g1 + w * g2 + x * g3 + z * g5 - w * g6 + z * g7 - TWO * y * g8)
@@ -58,7 +60,7 @@ def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
 
 @inline
 def product(aw, ax, ay, az, bw, bx, by, bz):
-    """Returns the quaternion product a∘b, i.e. rotation b followed by rotation a."""
+    """Returns the Hamilton product a∘b of quaternions, i.e. rotation b followed by rotation a."""
     return (
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -69,12 +71,15 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
 
 @kernel
 def cluster_table(parameters, sums, first, last, count, table):
-    """Fills the table of a cluster: rotation, pivot and the parameters needed for its points.
+    """Computes the table of a cluster: rotation, pivot, and the parameters needed to transform points.
 
     Args:
-        parameters: [10]. sums: [blocks, 3] sums of each block's points after the coarser layers. The cluster has the
-            blocks from ``first`` up to, but not including, ``last``, with ``count`` points.
-        table: out [26].
+        parameters: [10] parameters of the cluster.
+        sums: [blocks, 3] sum of the points in each block, after the coarser layers.
+        first: first block of the cluster.
+        last: last block of the cluster, plus 1.
+        count: number of points in the cluster.
+        table: [26] output.
     """
     px = py = pz = np.float64(0.0)
     for block in range(first, last):
@@ -97,7 +102,7 @@ def cluster_table(parameters, sums, first, last, count, table):
 
 @inline
 def scaling_terms(table, about_origin, x, y, z):
-    """Returns f, y, u and −2z of points, where u is the vector scaled by f: R y or R y + p + t."""
+    """Returns f, y, u and −2z for points, where u = R y or u = R y + p + t is the vector that f scales."""
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
         table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7], table[8]
     )  # fmt: skip
@@ -112,7 +117,7 @@ def scaling_terms(table, about_origin, x, y, z):
 
 @inline
 def move_through_layer(table, about_origin, x, y, z):
-    """Moves points through a layer."""
+    """Returns points after a layer."""
     f, yx, yy, yz, ux, uy, uz, _ = scaling_terms(table, about_origin, x, y, z)
     more = f - ONE
     return (
@@ -127,8 +132,8 @@ def polar(table, about_origin, f, yx, yy, yz):
     """Computes the polar rotation of f I + f' e cᵀ in the plane of e and c; the common factor f is omitted.
 
     Returns:
-        The quaternion a (4); for the backward pass e (3), e·c, c × e (3), cosine, sine (3), their norm rho, the
-        quaternion's scale, and rho + cosine.
+        The quaternion a (4 values). For the backward pass, also e (3), e·c, c × e (3), cosine, sine (3), their norm
+        rho, the scale of the quaternion, and rho + cosine.
     """
     cx, cy, cz = table[19], table[20], table[21]
     mx, my, mz = table[13] + table[16], table[14] + table[17], table[15] + table[18]
@@ -152,15 +157,17 @@ def polar(table, about_origin, f, yx, yy, yz):
 
 @kernel
 def apply_cluster_map(table, about_origin, separate, points, place, v, present, lane, guard_counts):
-    """Moves factors and rotations of a block through a layer, in place.
+    """Applies a layer to the factors and rotations of a block, in place.
 
     Args:
-        table: [26] of its cluster. separate: None: J is applied to the factors; otherwise it is not.
-        points: x, y, z of the block from flat index ``place``, before the layer.
-        v: [13, 16] factors 0–8 and rotations 9–12.
-        present: flat array; from ``lane``, 0 for Gaussians that are not counted, else 1.
-        guard_counts: [3 or more] int64, accumulated number of Gaussians for which each guard in ``COUNTED_GUARDS`` was
-            triggered; None: not counted.
+        table: [26] table of the block's cluster.
+        about_origin: 0 for the centred cluster map, 1 for the published one.
+        separate: if None, J is applied to the factors; otherwise, factors stay unchanged.
+        points: points before the layer; x, y and z of the block start at flat index ``place``.
+        v: [13, 16] factors 0–8 and rotations 9–12, updated in place.
+        present: mask, starting at flat index ``lane``: 0 for Gaussians that are not counted, otherwise 1.
+        guard_counts: [3 or more] int64 counts, to which the number of Gaussians that triggered each guard in
+            ``COUNTED_GUARDS`` is added. If None, they are not counted.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
@@ -190,7 +197,7 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
     lanes.store(v, 12 * lanes.COUNT, oz)
     if guard_counts is not None:  # resolved at compile time
         clamped = lanes.magnitude(exponent) > LARGEST
-        # det J = f³ (1 + (2 − f) e·c), and the cosine is its second factor plus 1. Half turns are folds too.
+        # det J = f³ (1 + (2 − f) e·c), and the cosine is the second factor plus 1. Half turns are folds too.
         folded = a[11] <= ONE
         if lanes.any_of(clamped):
             guard_counts[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
@@ -206,9 +213,10 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
 
     Args:
         table, about_origin, separate, points, place: see ``apply_cluster_map``.
-        v: factors and rotations before the layer, from flat index ``entering``.
-        g: [16, 16] gradients, in place: point 0–2, factor 3–11, rotation 12–15; of the outputs, then of the inputs.
-        records: out from flat index ``record``, the block's contribution to its cluster's gradient.
+        v: factors and rotations before the layer, starting at flat index ``entering``.
+        g: [16, 16] gradients of points 0–2, factors 3–11 and rotations 12–15. Output gradients are replaced by input
+            gradients.
+        records: output, starting at flat index ``record``: the block's contribution to the gradient of its cluster.
     """
     n = lanes.COUNT
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
@@ -234,7 +242,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
             g1 = lanes.load(g, n * (6 + column))
             g2 = lanes.load(g, n * (9 + column))
             along = j0 * cx + j1 * cy + j2 * cz
-            # Gradients of f and of the factor's columns, rotated back by R.
+            # Gradients of f and of the factor's columns, rotated by the inverse of R.
             h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
             g_f += h0 * j0 + h1 * j1 + h2 * j2
             outer = ux * g0 + uy * g1 + uz * g2
@@ -260,7 +268,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
             lanes.store(g, n * (3 + column), f * h0 + g_along * cx)
             lanes.store(g, n * (6 + column), f * h1 + g_along * cy)
             lanes.store(g, n * (9 + column), f * h2 + g_along * cz)
-    # The rotations: Q' = (q(r) ∘ polar) ∘ Q.
+    # Rotations: Q' = (q(r) ∘ polar) ∘ Q.
     aw, ax, ay, az, ex, ey, ez, dot, nx, ny, nz, cosine, sx, sy, sz, rho, scale, half = polar(
         table, about_origin, f, yx, yy, yz
     )
@@ -281,7 +289,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
     unit = aw * bw + ax * bx + ay * by + az * bz
     g_h = (bw - aw * unit) * scale
     gsx, gsy, gsz = (bx - ax * unit) * scale, (by - ay * unit) * scale, (bz - az * unit) * scale
-    # A value at the floor is a constant.
+    # Clamped values are treated as constants.
     g_h = lanes.choose(half < LEAST, nothing, g_h)
     shrink = g_h / lanes.maximum(lanes.fill(LEAST), rho)
     g_cosine = g_h + cosine * shrink
@@ -295,7 +303,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
     gex = g_dot * cx + kny * cz - knz * cy
     gey = g_dot * cy + knz * cx - knx * cz
     gez = g_dot * cz + knx * cy - kny * cx
-    # The factor, then y.
+    # Gradients of f and y.
     g_z = (g_f + g_slope * (TWO - TWO * f)) * slope
     gcx += g_dot * ex + ey * knz - ez * kny + g_z * yx
     gcy += g_dot * ey + ez * knx - ex * knz + g_z * yy
@@ -322,10 +330,15 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
 
 @kernel
 def cluster_gradient(records, layer, first, last, table, gradient):
-    """Sums the records of a cluster's blocks, in order, to dL/dparameters [10].
+    """Computes dL/dparameters of a cluster by summing the records of its blocks in order.
 
     Args:
-        records: [blocks, layers, 32]; blocks from ``first`` up to, but not including, ``last`` in ``layer`` are summed.
+        records: [blocks, layers, 32] contributions of all blocks, from ``apply_cluster_map_backward``.
+        layer: layer of the cluster.
+        first: first block of the cluster.
+        last: last block of the cluster, plus 1.
+        table: [26] table of the cluster.
+        gradient: [10] output.
     """
     sums = np.empty(RECORD, np.float32)
     low = high = lanes.fill(ZERO)
@@ -340,7 +353,7 @@ def cluster_gradient(records, layer, first, last, table, gradient):
         w, x, y, z, sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]
     )
     gw, gx, gy, gz = gw + sums[9], gx + sums[10], gy + sums[11], gz + sums[12]
-    # Gradient of r in the quaternion (1, r) w.
+    # Gradient of r, where the quaternion is (1, r) w.
     along = w * gw + x * gx + y * gy + z * gz
     gradient[0], gradient[1], gradient[2] = (gx - x * along) * w, (gy - y * along) * w, (gz - z * along) * w
     for k in range(7):

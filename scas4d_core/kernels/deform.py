@@ -1,10 +1,11 @@
-"""Deformation D_t of all moving Gaussians and its backward pass; combines ``cascade`` and ``deltas``.
+"""Deformation D_t of all moving Gaussians and its backward pass, which combine ``cascade`` and ``deltas``.
 
-Reference: ``deformation``. Gaussians are processed in blocks of sixteen that belong to one finest cluster, and hence to
-one cluster in every layer. If the size of a cluster is not a multiple of sixteen, its last block repeats its last
-Gaussian. Only points are stored between layers (pivots are their means); the backward pass recomputes factors and
+Gaussians are processed in blocks of sixteen that belong to one cluster of the finest layer, and hence to one cluster
+in every layer. If the size of a cluster is not a multiple of sixteen, its last block repeats its last Gaussian.
+
+Only points are stored between layers, because pivots are their means. The backward pass recomputes factors and
 rotations, which is cheaper than reading them from memory. Frozen layers are applied once (``freeze_layer``), and
-later passes start after them.
+later passes skip them. Reference implementation: ``engines.torch.deformation``.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from scas4d_core.kernels.deltas import apply_gaussian_deltas, apply_gaussian_del
 from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 BLOCKS = 16
-"""Blocks per task."""
+"""Number of blocks per task."""
 
 CARRIED = 13 * lanes.COUNT
-"""Number of values of a block's factors and rotations."""
+"""Number of values in the factors and rotations of a block."""
 
 
 @kernel
 def prefetch(block, rows, one, two):
-    """Prefetches the rows of a block's Gaussians in two arrays, which are scattered in memory."""
+    """Prefetches the Gaussians of a block from two arrays, because their rows are scattered in memory."""
     block = min(block, rows.shape[0] - 1)
     for lane in range(lanes.COUNT):
         lanes.prefetch_row(one, rows[block, lane])
@@ -41,7 +42,7 @@ def prefetch(block, rows, one, two):
 
 @kernel
 def move_points(block, table, about_origin, points, layer, out, place):
-    """Moves the points of a block from ``points[layer]`` through a layer to ``out``, from flat index ``place``."""
+    """Applies a layer to the points of a block in ``points[layer]``, and stores them in ``out`` at index ``place``."""
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
     x, y, z = move_through_layer(
         table, about_origin, lanes.load(points, first), lanes.load(points, first + lanes.COUNT),
@@ -54,7 +55,7 @@ def move_points(block, table, about_origin, points, layer, out, place):
 
 @kernel
 def sum_block(block, points, layer, present, sums):
-    """Sums a block's points before a layer into ``sums[layer, block]``."""
+    """Stores the sum of a block's points before a layer in ``sums[layer, block]``."""
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
     weight = lanes.load(present, block * lanes.COUNT)
     for k in range(3):
@@ -63,7 +64,7 @@ def sum_block(block, points, layer, present, sums):
 
 @parallel_kernel
 def block_sums(points, present, sums):
-    """Sums the points before the first layer, ``sums[0]`` of ``deform``."""
+    """Computes the sums of points before the first layer, which are ``sums[0]`` of ``deform``."""
     for block in prange(points.shape[1]):
         sum_block(np.int64(block), points, np.int64(0), present, sums)
 
@@ -72,11 +73,14 @@ def block_sums(points, present, sums):
 def freeze_layer(
     layer, parameters, offsets, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
 ):  # fmt: skip
-    """Freezes a layer: applies it to its inputs, so that ``entering`` becomes the input of the next layer.
+    """Freezes a layer by applying it to its inputs, so that ``entering`` becomes the input of the next layer.
+
+    It also fills points and sums of the next layer, and the tables of this layer's clusters. See ``deform`` for the
+    other arguments.
 
     Args:
-        layer: any except the last. entering: [B, 13 · 16], updated in place. See ``deform`` for the others. Points and
-            sums of the next layer, and tables of this layer's clusters are filled.
+        layer: layer to freeze; must not be the last layer.
+        entering: [B, 13 · 16] factors and rotations, updated in place.
     """
     blocks = clusters.shape[0]
     for j in prange(offsets[layer], offsets[layer + 1]):
@@ -94,7 +98,7 @@ def freeze_layer(
 
 @inline
 def copy_row(rows, row, out, place):
-    """Copies the row of a block to flat index ``place`` of another array."""
+    """Copies the factors and rotations of a block to flat index ``place`` in another array."""
     for k in range(0, CARRIED, lanes.COUNT):
         lanes.store(out, place + k, lanes.load(rows, row * CARRIED + k))
 
@@ -104,24 +108,31 @@ def deform(
     first, parameters, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
     points, sums, tables, means, factors, state, guard_counts,
 ):  # fmt: skip
-    """Moves M of N Gaussians, in B blocks, through L layers of K clusters in total.
+    """Deforms M of N Gaussians, grouped into B blocks, with L layers that have K clusters in total.
 
     Args:
-        first: the first layer that is not frozen; points, sums and tables of earlier layers are reused.
-        parameters: [K, 10], layer by layer, coarse to fine. offsets: [L + 1] int64, the first cluster of each layer.
-        ranges: [K, 3] int64: first block, last block + 1, and number of Gaussians of each cluster.
-        clusters: [B, L] int64, the clusters of each block.
-        entries, rows: [B, 16] int64, index of each Gaussian among the M and among the N.
-        present: [B, 16] float32, 0 for repeated Gaussians, else 1.
-        entering: [B, 13 · 16] factors 0–8 and rotations 9–12 before layer ``first``; for frame t−1, its factors and
-            the identity. deltas: [M, 9] Δp, Δr, Δs.
-        about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors;
-            otherwise it is not.
-        points: [max(L, 1), B, 3, 16] before each layer; given for ``first``, filled for later layers.
-        sums: [max(L, 1), B, 3] of the points, likewise. tables: out [K, 26].
-        means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out: means and rotations, see ``deltas``.
-        guard_counts: out [tasks of ``BLOCKS`` blocks, 3] int64, number of times that the guards in
-            ``cascade.COUNTED_GUARDS`` were triggered.
+        first: first layer that is not frozen. Points, sums and tables of earlier layers are reused.
+        parameters: [K, 10] parameters of all clusters, ordered by layer from coarse to fine.
+        offsets: [L + 1] int64 first cluster of each layer.
+        ranges: [K, 3] int64 first block, last block + 1, and number of Gaussians of each cluster.
+        clusters: [B, L] int64 cluster of each block in each layer.
+        entries: [B, 16] int64 indices of the Gaussians among the M moving ones.
+        rows: [B, 16] int64 indices of the Gaussians among all N.
+        present: [B, 16] float32 mask: 0 for repeated Gaussians, otherwise 1.
+        entering: [B, 13 · 16] factors 0–8 and rotations 9–12 before layer ``first``. Without frozen layers, these are
+            the factors of frame t−1 and the identity.
+        deltas: [M, 9] per-Gaussian deltas Δp, Δr, Δs.
+        about_origin: 0 for the centred cluster map, 1 for the published one.
+        separate: if None, J is applied to the factors; otherwise, it is not.
+        points: [max(L, 1), B, 3, 16] points before each layer. They are read for layer ``first`` and filled for later
+            layers.
+        sums: [max(L, 1), B, 3] sums of the points in each block, read and filled like ``points``.
+        tables: [K, 26] output, tables of the clusters.
+        means: [N, 3] output, written at ``rows``.
+        factors: [N, 3, 3] output, written at ``rows``.
+        state: [M, 16] output; means and rotations are written. See ``deltas`` for the columns.
+        guard_counts: [tasks of ``BLOCKS`` blocks, 3] int64 output, number of times that each guard in
+            ``cascade.COUNTED_GUARDS`` was triggered.
     """
     blocks, layers = clusters.shape
     tasks = (blocks + BLOCKS - 1) // BLOCKS
@@ -179,12 +190,17 @@ def deform_backward(
     """Backpropagates through ``deform``, and adds the gradient of the scale loss.
 
     Args:
-        first … tables: as returned by ``deform``; frozen layers get no gradient.
-        scale_weight: weight of the scale loss divided by 3M, the number of averaged values; 0 disables it.
-        bounds: [M, 3] metres, maximum length of each axis.
-        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, for means and rotations, see ``deltas``.
-        records: scratch [B, L, 32]. gradients: out [K, 10]. g_deltas: out [M, 9].
-        losses: out [B], metres of excess axis length, summed over each block.
+        first … tables: see ``deform``; its outputs are required. Frozen layers get no gradient.
+        scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If 0, the loss has no
+            gradient.
+        bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
+        g_means: [N, 3] gradients of the means.
+        g_factors: [N, 3, 3] gradients of the factors.
+        g_tied: [M, 8] additional gradients of means and rotations; see ``deltas`` for the columns.
+        records: [B, L, 32] scratch buffer.
+        gradients: [K, 10] output, gradients of the cluster parameters.
+        g_deltas: [M, 9] output, gradients of the deltas.
+        losses: [B] output, total length in metres by which axes exceed their bounds, for each block.
     """
     blocks, layers = clusters.shape
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):

@@ -1,7 +1,7 @@
-"""Per-Gaussian deltas after the cascade (Δp, ΔR, Δs), and the scale loss. Reference: ``deformation.deform``.
+"""Per-Gaussian deltas (Δp, ΔR, Δs), which are applied after the cascade, and the scale loss.
 
 F_t = R(Δr) J F_{t−1} diag(exp Δs); x_t = x + Δp; turn = q(Δr) ∘ Q, with w ≥ 0. As in ``cascade``, sixteen Gaussians
-are processed at a time.
+are processed at a time. Reference implementation: ``deformation.deform``.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from scas4d_core.kernels.jit import LOG2_E, ONE, ZERO, inline, kernel
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
 COLUMNS = 9
-"""Columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
+"""Number of columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
 
-# Columns of a Gaussian's state for the neighbour terms: current mean 0–2, rotation since frame t−1 3–6, mean at frame
-# t−1 7–9. A row is a cache line.
+# Columns of the Gaussian state used by the neighbour terms: current mean 0–2, rotation since frame t−1 3–6, mean in
+# frame t−1 7–9. Each row is one cache line.
 STATE = 16
 MEAN, TURN, PREVIOUS = 0, 3, 7
 TIED = 8
-"""Number of columns of the state's gradients: mean 0–2, rotation 3–6, one unused."""
+"""Number of columns of the state gradients: mean 0–2, rotation 3–6, and one unused column."""
 
 
 @inline
 def gaussian_delta_rotation(deltas, entries, place):
-    """Returns the unit quaternion (1, Δr)/|(1, Δr)|."""
+    """Returns the rotation ΔR as a unit quaternion (1, Δr)/|(1, Δr)|."""
     a = lanes.gather_column(deltas, entries, place, COLUMNS, 3)
     b = lanes.gather_column(deltas, entries, place, COLUMNS, 4)
     c = lanes.gather_column(deltas, entries, place, COLUMNS, 5)
@@ -41,12 +41,17 @@ def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, mean
     """Computes and stores sixteen deformed Gaussians.
 
     Args:
-        deltas: [M, 9]. entries, rows: flat int64; from ``place``, indices of the Gaussians among the M moving and among
-            all N.
-        present: flat; from ``place``, 0 for Gaussians that are not counted, else 1.
-        v: [13, 16] factors 0–8 and rotations 9–12 from the cascade. points: [3, 16] from the cascade.
-        means [N, 3], factors [N, 3, 3]: out at those rows. state: [M, 16], out: means and rotations.
-        guard_counts: [1 or more] int64, accumulated number of Gaussians for which a stretch exponent was clamped.
+        deltas: [M, 9] per-Gaussian deltas.
+        entries: int64 indices of the Gaussians among the M moving ones, starting at flat index ``place``.
+        rows: int64 indices of the Gaussians among all N, starting at flat index ``place``.
+        place: flat index of the first Gaussian in ``entries``, ``rows`` and ``present``.
+        present: mask, starting at flat index ``place``: 0 for Gaussians that are not counted, otherwise 1.
+        v: [13, 16] factors 0–8 and rotations 9–12 from the cascade.
+        points: [3, 16] points from the cascade.
+        means: [N, 3] output, written at ``rows``.
+        factors: [N, 3, 3] output, written at ``rows``.
+        state: [M, 16] output; only means and rotations are written.
+        guard_counts: [1 or more] int64 counts, to which the number of Gaussians with a clamped Δs is added.
     """
     n = lanes.COUNT
     for k in range(3):
@@ -85,15 +90,21 @@ def apply_gaussian_deltas_backward(
     """Backpropagates through ``apply_gaussian_deltas``, and adds the gradient of the scale loss.
 
     Args:
-        present: flat; from ``place``, 0 for repeated Gaussians, else 1.
-        v: factors and rotations from the cascade, from flat index ``leaving``.
-        scale_weight: weight of the scale loss divided by 3M, the number of averaged values; 0 disables it.
-        bounds: [M, 3] metres, maximum length of each axis.
-        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, additional gradients of means and rotations.
-        g: out [16, 16], gradients of point 0–2, factor 3–11, rotation 12–15. g_deltas: out [M, 9].
+        deltas, entries, rows, place: see ``apply_gaussian_deltas``.
+        present: mask, starting at flat index ``place``: 0 for repeated Gaussians, otherwise 1.
+        v: factors and rotations from the cascade, starting at flat index ``leaving``.
+        leaving: flat index of the first value in ``v``.
+        scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If 0, the loss has no
+            gradient.
+        bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
+        g_means: [N, 3] gradients of the means.
+        g_factors: [N, 3, 3] gradients of the factors.
+        g_tied: [M, 8] additional gradients of means and rotations, from the neighbour terms.
+        g: [16, 16] output, gradients of points 0–2, factors 3–11 and rotations 12–15 after the cascade.
+        g_deltas: [M, 9] output, gradients of the deltas.
 
     Returns:
-        Sum of the excess lengths of the axes, in metres.
+        Total length in metres by which axes exceed their bounds.
     """
     n = lanes.COUNT
     nothing = lanes.fill(ZERO)
@@ -124,7 +135,7 @@ def apply_gaussian_deltas_backward(
         g6 += h2 * e0
         g7 += h2 * e1
         g8 += h2 * e2
-        # Scale loss on the axis length, which ΔR does not change.
+        # Scale loss of the axis length, which does not depend on ΔR.
         length = lanes.square_root(e0 * e0 + e1 * e1 + e2 * e2)
         bound = lanes.gather_column(bounds, entries, place, 3, column)
         over = length - bound

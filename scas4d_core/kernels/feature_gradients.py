@@ -1,9 +1,8 @@
-"""Gradients of the features alone, used if positions and shapes need no gradient.
+"""Backward pass for features only, used if positions and shapes need no gradient.
 
-Reference: ``engines.torch.rasterizer``.
-
-A feature's gradient is the sum of the incoming gradient, weighted with the Gaussian's blending weights. The weights are
-recomputed front to back as in ``blend``. Later entries are not needed. Results are bit-identical to ``blend_backward``.
+The gradient of a feature is the image gradient, summed over pixels with the Gaussian's blending weights. As in
+``blend``, the weights are recomputed front to back; later entries in a tile do not affect them. Results are
+bit-identical to ``blend_backward``. Reference implementation: ``engines.torch.rasterizer``.
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ from scas4d_core.kernels.projection import (
 def blend_features_task(
     task, splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records
 ):
-    """Sums the weighted gradients of the tiles of one task of ``blend_features``."""
+    """Processes the tiles of one task of ``blend_features``."""
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     tiles_x = (size[0] + TILE - 1) // TILE
-    # Per block: transmittance, negative if the pixel is finished; incoming gradients.
+    # State of a block: transmittance (negative for finished pixels) and image gradients.
     step = lanes.COUNT * (1 + GROUP)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -99,11 +98,12 @@ def blend_features_task(
 
 @parallel_kernel
 def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records):
-    """Sums the incoming gradients of every entry (a pair of Gaussian and tile) with its blending weights.
+    """Sums the image gradient over the pixels of every entry (a Gaussian–tile pair), weighted by blending weights.
 
     Args:
         splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits: see ``blend.blend_backward``.
-        g_image: [4, rows, stride] dL/dimage. records: out [pairs, 16] float32, four sums, then 0.
+        g_image: [4, rows, stride] dL/dimage.
+        records: [pairs, 16] float32 output, four sums followed by zeros.
     """
     for task in prange(tasks):
         blend_features_task(
@@ -117,9 +117,11 @@ def sum_features(counts, firsts, records, g_features, guard_counts):
     """Sums the records of each Gaussian's pairs, in the same order as ``projection.project_backward``.
 
     Args:
-        counts, firsts: [N] number of pairs of each Gaussian, and its first pair. records: from ``blend_features``.
-        g_features: out [N, 4], 0 for Gaussians without pairs or with overflowing sums.
-        guard_counts: out [tasks of ``CHUNK``, 1] int64, number of Gaussians with overflowing sums.
+        counts: [N] number of pairs of each Gaussian.
+        firsts: [N] first pair of each Gaussian.
+        records: [pairs, 16] records from ``blend_features``.
+        g_features: [N, 4] output; 0 for Gaussians without pairs or with overflowing sums.
+        guard_counts: [tasks of ``CHUNK``, 1] int64 output, number of Gaussians with overflowing sums.
     """
     count = g_features.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):

@@ -1,11 +1,12 @@
-"""Image loss 0.8 L1 + 0.2 (1 − SSIM) of planes [C, H, W], and its gradient. Reference: ``losses.image_loss``.
+"""Image loss 0.8 L1 + 0.2 (1 − SSIM) of images [C, H, W], and its gradient.
 
-SSIM follows 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The
-window is separable: one pass filters along rows, another one across rows. Both process sixteen pixels at a time.
+SSIM is defined as in 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03².
+Because the window is separable, images are filtered in two passes, along rows and across rows. Both process sixteen
+pixels at a time.
 
-Large parts of many images are black in the target and in the rendering. A window that is 0 in both has an SSIM of 1 and
-no gradient, so only columns near other pixels are computed. If only a part of the image is requested (``near``), blocks
-of sixteen columns far from it are skipped as well.
+In many images, large areas are black in both target and rendering. A window that is 0 in both has an SSIM of 1 and no
+gradient, so only columns near non-black pixels are computed. If only part of the image is requested (``near``), groups
+of sixteen columns far from that part are skipped too. Reference implementation: ``losses.image_loss``.
 """
 
 from __future__ import annotations
@@ -32,25 +33,25 @@ SSIM_SHARE = np.float32(0.2)
 
 
 PAD = lanes.COUNT
-"""Number of zeros on either side of a row that is filtered along itself."""
+"""Number of zeros with which rows are padded on either side before they are filtered."""
 
 
 BAND = 16
-"""Rows per task."""
+"""Number of image rows per task."""
 
 WINDOWS, LOSS, SPREAD, GRADIENT = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
-"""Flags of the quantities to compute for sixteen columns of a row: windowed quantities, loss, its gradients filtered
-along the row, and those filtered across rows, which are the gradient of the picture."""
+"""Flags that select the quantities to compute for sixteen columns of a row: windowed quantities, loss, loss gradients
+filtered along the row, and finally these gradients filtered across rows, which yields the image gradient."""
 EVERYWHERE = np.full((1, 1), WINDOWS | LOSS | SPREAD | GRADIENT)
 LOSSES = WINDOWS | LOSS
-"""All flags that are needed without gradients."""
+"""Flags required to compute the loss without gradients."""
 
 
 def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Returns the flags [H, columns] that are needed for the gradient of some pixels and the losses that they affect.
+    """Returns the flags [H, columns] required to compute the gradient of some pixels, and all losses they affect.
 
     Args:
-        shown: [H, W] mask of these pixels.
+        shown: [H, W] mask of the pixels.
 
     >>> shown = np.zeros((20, 48), bool)
     >>> shown[10, 20] = True
@@ -59,7 +60,7 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """
     height, width = shown.shape
     columns = stride(width) // lanes.COUNT
-    bytes_of_rows = np.zeros((height, (columns + 2) * lanes.COUNT), np.uint8)  # with 16 extra columns on either side
+    bytes_of_rows = np.zeros((height, (columns + 2) * lanes.COUNT), np.uint8)  # padded by 16 columns on either side
     bytes_of_rows[:, lanes.COUNT : lanes.COUNT + width] = shown
     eights = bytes_of_rows.view("<u8").reshape(height, columns + 2, 2)
     inside = (eights[:, 1:-1, 0] | eights[:, 1:-1, 1]) != 0
@@ -74,13 +75,13 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 
 def stride(width: int) -> int:
-    """Returns the row length of scratch buffers, the width rounded up to a multiple of ``Lanes``."""
+    """Returns the row length of scratch buffers: the width, rounded up to a multiple of ``Lanes``."""
     return -(-width // lanes.COUNT) * lanes.COUNT
 
 
 @inline
 def filter_along_row(row, place):
-    """Filters sixteen values along a row, from flat index ``place``."""
+    """Filters sixteen values along a row, starting at flat index ``place``."""
     return (
         T0 * (lanes.load(row, place - 5) + lanes.load(row, place + 5))
         + T1 * (lanes.load(row, place - 4) + lanes.load(row, place + 4))
@@ -93,7 +94,7 @@ def filter_along_row(row, place):
 
 @inline
 def filter_across_rows(scratch, place, pitch):
-    """Filters sixteen values across the eleven rows from flat index ``place``, ``pitch`` apart."""
+    """Filters sixteen values across eleven rows that start at flat index ``place`` and are ``pitch`` apart."""
     return (
         T0 * (lanes.load(scratch, place) + lanes.load(scratch, place + 10 * pitch))
         + T1 * (lanes.load(scratch, place + pitch) + lanes.load(scratch, place + 9 * pitch))
@@ -106,24 +107,28 @@ def filter_across_rows(scratch, place, pitch):
 
 @inline
 def apply_exposure(value, gain, offset):
-    """Returns the value that a camera records: gain times the rendered value, plus offset."""
+    """Returns the pixel value that a camera records: rendered value times gain, plus offset."""
     return gain * value + offset
 
 
 @inline
 def is_needed(what, wanted, y, x):
-    """Returns whether a quantity is needed in the sixteen columns from x."""
+    """Returns whether ``what`` is requested for the sixteen columns that start at x."""
     return (wanted[0, 0] if wanted.shape[0] == 1 else wanted[y, x // lanes.COUNT]) & what != 0
 
 
 @kernel
 def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what, wanted):
-    """Filters padded rows along themselves into a row of the scratch buffer.
+    """Filters one padded row per quantity, and stores the results in the scratch buffer.
 
     Args:
-        rows: [quantities or more, pitch + 2 PAD]. kind, channel, y: index of the first quantity in ``scratch``.
-        span: range of columns to filter, multiples of ``Lanes``. cleared: surrounding range of columns to set to 0.
-        what, wanted: arguments of ``is_needed``; elsewhere, the scratch buffer is unchanged.
+        rows: [quantities or more, pitch + 2 PAD] rows to filter.
+        quantities: number of rows to filter.
+        scratch: output buffer; see ``image_loss``.
+        kind, channel, y: index of the first output row in ``scratch``.
+        span: range of columns to filter, multiples of ``Lanes``.
+        cleared: range of columns to set to 0 outside ``span``.
+        what, wanted: arguments of ``is_needed``; columns that are not requested stay unchanged.
     """
     _, channels, height, pitch = scratch.shape
     for k in range(quantities):
@@ -139,17 +144,17 @@ def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what
 
 @inline
 def start_of(planes, channel, y):
-    """Returns the flat index of a row."""
+    """Returns the flat index at which a row starts."""
     return (channel * planes.shape[1] + y) * planes.shape[2]
 
 
 @kernel
 def span_of(image, gain, offset, target, channel, y, pitch, spans):
-    """Finds the columns of a row that are not black in both pictures, rounded to multiples of ``Lanes``.
+    """Finds the column ranges near pixels of a row that are not black in both images.
 
     Args:
-        spans: out [4]: column range (first, last + 1) of the windows with such pixels, then that of the pixels in these
-            windows; (pitch, 0) if there are none.
+        spans: [4] output: column range (first, last + 1) of the windows that contain such pixels, followed by the range
+            of all pixels in these windows. Both are rounded to multiples of ``Lanes``, and (pitch, 0) if empty.
     """
     width = target.shape[2]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -172,7 +177,7 @@ def span_of(image, gain, offset, target, channel, y, pitch, spans):
 
 @inline
 def union_of_spans(spans, which, y, reach):
-    """Returns the smallest column range that contains the spans of the rows around row y."""
+    """Returns the smallest column range that contains the spans of all rows within ``reach`` of row y."""
     first, last = spans[y, which], spans[y, which + 1]
     for other in range(max(0, y - reach), min(spans.shape[0], y + reach + 1)):
         first = min(first, spans[other, which])
@@ -182,11 +187,12 @@ def union_of_spans(spans, which, y, reach):
 
 @parallel_kernel
 def target_moments(target, scratch, means, squares):
-    """Fills the windowed means of a target and of its square; needed once per frame and view.
+    """Computes the windowed means of a target and of its square, which is required once per frame and view.
 
     Args:
-        target: [C, H, W]. scratch: [2 or more, C, H + 10, stride(W)], with 0 in its first and last 5 rows.
-        means, squares: out [C, H, W].
+        target: [C, H, W] target image.
+        scratch: [2 or more, C, H + 10, stride(W)] scratch buffer whose first and last 5 rows are 0.
+        means, squares: [C, H, W] outputs.
     """
     channels, height, width = target.shape
     pitch = scratch.shape[3]
@@ -212,7 +218,7 @@ def target_moments(target, scratch, means, squares):
 
 @kernel
 def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted):
-    """Runs the first pass of ``image_loss`` on a row: computes the windowed quantities, filtered along the row."""
+    """Runs the first pass of ``image_loss`` on a row: computes windowed quantities, filtered along the row."""
     width, pitch = target.shape[2], scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -239,7 +245,7 @@ def loss_of_row(
     image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses, channel, y,
     wanted,
 ):  # fmt: skip
-    """Runs the second pass: computes the loss of a row, and its gradients filtered along the row."""
+    """Runs the second pass on a row: computes its loss, and the loss gradients filtered along the row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
@@ -281,7 +287,7 @@ def loss_of_row(
 
 @kernel
 def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted):
-    """Runs the third pass: computes the gradient of a row."""
+    """Runs the third pass on a row: computes its gradient."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     share = weights[channel] / np.float32(pixels)
@@ -321,17 +327,21 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
 def image_loss(
     image, exposure, target, target_means, target_squares, weights, pixels, scratch, wanted, g_image, losses, g_exposure
 ):
-    """Computes the loss of a rendered picture, or of a part of one, and its gradient.
+    """Computes the loss and gradient of a rendered image, or of part of one.
 
     Args:
-        image: [>= C, >= H, >= W] rendered planes. exposure: [C, 2] gain and offset of the camera per channel.
-        target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
-        pixels: number of pixels over which the mean is taken; H W for a full picture.
-        scratch: [6, C, H + 10, stride(W)], first and last 5 rows 0: three windowed quantities, their gradients.
-        wanted: see ``near``, ``EVERYWHERE``.
-        g_image: out [>= C, >= H, >= W] dL/dimage, undefined where it is not requested.
-        losses: out [C, H, 2], loss contribution and sum of squared differences of each row.
-        g_exposure: out [C, H, 2], contribution of each row to the gradient of gain and offset.
+        image: [>= C, >= H, >= W] rendered image.
+        exposure: [C, 2] gain and offset of the camera for each channel.
+        target: [C, H, W] target image.
+        target_means, target_squares: [C, H, W] results of ``target_moments``.
+        weights: [C] weight of each channel's mean loss.
+        pixels: number of pixels over which losses are averaged; H W for a full image.
+        scratch: [6, C, H + 10, stride(W)] buffer for three windowed quantities and their gradients. The first and last
+            5 rows must be 0.
+        wanted: flags of the requested quantities; see ``near`` and ``EVERYWHERE``.
+        g_image: [>= C, >= H, >= W] output, dL/dimage; undefined where it is not requested.
+        losses: [C, H, 2] output, loss contribution and sum of squared differences of each row.
+        g_exposure: [C, H, 2] output, contribution of each row to the gradients of gain and offset.
     """
     channels, height, _ = target.shape
     pitch = scratch.shape[3]

@@ -1,4 +1,4 @@
-"""Kernel compilers: their common options, and a float32 exponential."""
+"""Decorators that compile kernels with common options, and a float32 exponential function."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from scas4d_core.kernels import cache
 
 cache.use(cache.base())
 
-# LLVM unrolls short loops before it vectorizes. Unrolled rows of 16 pixels stay scalar (measured: blending is 3 times
-# slower). Loops over channels (at most 8) may still be unrolled.
+# LLVM unrolls short loops before vectorization. Unrolled rows of 16 pixels remain scalar, which makes blending 3 times
+# slower (measured). Loops over channels (at most 8) may still be unrolled.
 llvm.set_option("scas4d", "-unroll-full-max-count=8")
-# Overlap checks hoisted out of the row loop compare whole arrays, detect an overlap, and take the scalar path.
+# Overlap checks that are hoisted out of the row loop compare whole arrays. They detect an overlap and take the scalar
+# path.
 llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 
-# No fast math: every operation is rounded according to IEEE 754, in the order written, so that kernels give the same
-# bits on every processor. An estimated reciprocal (`arcp`, `afn`) depends on the manufacturer, a fused multiply-add
-# (`contract`) on the instruction set, and a reordered sum (`reassoc`) on the register width.
-# Long sums are written with explicit lanes instead. The cost is about 1 % (docs/tried.md).
+# No fast math: every operation is rounded according to IEEE 754, in source order, so that results are bit-identical on
+# all processors. Approximate reciprocals (`arcp`, `afn`) depend on the manufacturer, fused multiply-adds (`contract`)
+# on the instruction set, and reordered sums (`reassoc`) on the register width.
+# Long sums use explicit lanes instead. The cost is about 1 % (docs/tried.md).
 STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
 
 def _compiler(**more: Any) -> Any:
-    """Returns a decorator like Numba's whose cache can be filled by several processes."""
+    """Returns a decorator like ``numba.njit`` whose cache may be written by several processes concurrently."""
     options = {**STRICT, **more, "cache": True, "no_cfunc_wrapper": True}  # C callbacks are not needed
     decorate: Any = njit(**options)
     return lambda function: cache.shared(decorate(function))
 
 
 kernel: Any = _compiler()
-"""Compiles a single-threaded function, or one that is called from a kernel."""
+"""Compiles a single-threaded kernel, or a function that kernels call."""
 
 parallel_kernel: Any = _compiler(parallel=True)
-"""Compiles a function with parallel ``prange`` tasks. Tasks write disjoint data, so thread counts do not matter."""
+"""Compiles a kernel with parallel ``prange`` tasks. Tasks write disjoint data, so results do not depend on threads."""
 
 inline: Any = _compiler(inline="always")
-"""Compiles a small helper that is inlined into kernels."""
+"""Compiles a small helper function that is inlined into kernels."""
 
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
@@ -54,7 +55,7 @@ MOST = np.float32(EXPONENT)
 
 
 def threads() -> int:
-    """Returns the number of threads of kernels (``NUMBA_NUM_THREADS`` or the available cores)."""
+    """Returns the number of threads that kernels use: ``NUMBA_NUM_THREADS``, or all available cores."""
     return int(numba.get_num_threads())
 
 
@@ -70,7 +71,7 @@ def _float_of_bits(typing_context: Any, bits: Any) -> Any:
 
 @inline
 def exp(x):
-    """Returns the float32 exponential, relative error 2e-7, clamped to ±87; unlike libm's, it vectorizes in loops."""
+    """Returns the exponential of x clamped to ±87, with a relative error of 2e-7. Unlike libm's, it vectorizes."""
     v = min(max(x * LOG2_E, -MOST), MOST)
     whole = np.floor(v + HALF)
     r = v - whole

@@ -1,8 +1,8 @@
-"""Explicit SIMD for kernels: sixteen float32 in one value.
+"""Explicit SIMD for kernels, with sixteen float32 values in one variable.
 
-``Lanes`` is LLVM's ``<16 x float>``: one AVX-512 register, two of AVX2, four of NEON. Kernels add, subtract, multiply,
-divide and compare it like a number (float32 operands are broadcast), and load and store it at a flat index of a
-contiguous array. Results do not depend on the compiler's loop vectorizer.
+``Lanes`` corresponds to LLVM's ``<16 x float>``: one AVX-512, two AVX2 or four NEON registers. Kernels can add,
+subtract, multiply, divide and compare ``Lanes`` like numbers, with float32 operands broadcast. They can also load and
+store ``Lanes`` at a flat index of a contiguous array. Results do not depend on the compiler's loop vectorizer.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, models, regist
 from scas4d_core.kernels.jit import LOG2_E, MOST, inline
 
 COUNT = 16
-"""Number of lanes of a value."""
+"""Number of lanes of a ``Lanes`` value."""
 
 emitted: Any = intrinsic
-"""Decorator of kernel functions that emit their own instructions."""
+"""Decorator for functions that emit LLVM instructions into kernels."""
 
 _FLOAT, _BYTE = ir.FloatType(), ir.IntType(8)
 _INT, _BIT, _LONG = ir.IntType(32), ir.IntType(1), ir.IntType(64)
@@ -31,14 +31,14 @@ _FLOATS, _INTS, _BITS = (ir.VectorType(kind, COUNT) for kind in (_FLOAT, _INT, _
 
 
 class LanesType(types.Type):
-    """Type of sixteen float32."""
+    """Numba type of sixteen float32 values."""
 
     def __init__(self) -> None:
         super().__init__(name="lanes")
 
 
 class LaneMaskType(types.Type):
-    """Type of sixteen booleans."""
+    """Numba type of sixteen booleans."""
 
     def __init__(self) -> None:
         super().__init__(name="lane_mask")
@@ -82,7 +82,7 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
 
 
 def _operator(function: Any, result: Any, method: str, *how: str) -> None:
-    """Registers an operator for two ``Lanes``, or one and a float32; the builder's ``method`` emits the instruction."""
+    """Registers an operator for two ``Lanes``, or a ``Lanes`` and a float32, emitted by ``method`` of the builder."""
 
     class Template(AbstractTemplate):
         key = function
@@ -148,7 +148,7 @@ def _lower_and(context: Any, builder: Any, signature: Any, arguments: Any) -> An
 
 @emitted
 def choose(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
-    """Selects ``yes`` in lanes where the mask is set, ``no`` elsewhere."""
+    """Selects ``yes`` in lanes where the mask is set, and ``no`` in all others."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(*arguments)
@@ -208,19 +208,19 @@ def _fixed(values: Any) -> Any:
 
 
 ACROSS = 4
-"""Columns and rows of a block, whose pixels form one ``Lanes`` in row-major order."""
+"""Side length of a block in pixels. The pixels of a block form one ``Lanes`` in row-major order."""
 
 block_columns = emitted(_fixed([k % ACROSS for k in range(COUNT)]))
 block_rows = emitted(_fixed([k // ACROSS for k in range(COUNT)]))
 
 _eight_columns = emitted(_fixed([ACROSS * (k % 8) for k in range(COUNT)]))
 ends = emitted(_fixed([-1.0] * 8 + [1.0] * 8))
-"""-1 for the first eight lanes, 1 for the others."""
+"""Returns -1 in the first eight lanes and 1 in the others."""
 
 
 @inline
 def ramp(start):
-    """Returns eight values ``start``, ``start`` + 4, …, twice."""
+    """Returns the eight values ``start``, ``start`` + 4, …, repeated twice."""
     return _eight_columns() + start
 
 
@@ -236,7 +236,7 @@ def fill(typing_context: Any, value: Any) -> Any:
 
 def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
     if not (isinstance(array_type, types.Array) and array_type.dtype == types.float32 and array_type.layout == "C"):
-        raise TypeError(f"Lanes are read from and written to C-contiguous float32 arrays; this is {array_type}")
+        raise TypeError(f"Lanes can only be loaded from and stored to C-contiguous float32 arrays, not {array_type}")
     return cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
 
 
@@ -252,7 +252,7 @@ def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any,
 
 @emitted
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """Loads sixteen values of a float32 array from a flat index; no alignment needed, bounds are not checked."""
+    """Loads sixteen values of a float32 array from a flat index, without alignment requirements or bounds checks."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments)
@@ -284,7 +284,7 @@ def _first(builder: Any, count: Any) -> Any:
 
 @emitted
 def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
-    """Loads only the first ``count`` values (16 or more: all); the others are 0 and not read."""
+    """Loads only the first ``count`` values, or all if it is 16 or more; the others are not read and set to 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -296,7 +296,7 @@ def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
 
 @emitted
 def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
-    """Stores only the first ``count`` lanes (16 or more: all)."""
+    """Stores only the first ``count`` lanes, or all if it is 16 or more."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -309,7 +309,7 @@ def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: 
 
 @emitted
 def only_first(typing_context: Any, value: Any, count: Any) -> Any:
-    """Returns the first ``count`` lanes (16 or more: all), and 0 in the others."""
+    """Keeps only the first ``count`` lanes, or all if it is 16 or more, and sets the others to 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(_first(builder, arguments[1]), arguments[0], _constant([0] * COUNT))
@@ -319,19 +319,19 @@ def only_first(typing_context: Any, value: Any, count: Any) -> Any:
 
 @inline
 def count_of(mask):
-    """Returns the number of lanes in which a mask is set."""
+    """Returns the number of lanes in which the mask is set."""
     return np.int64(sum_of(choose(mask, fill(np.float32(1.0)), fill(np.float32(0.0)))))
 
 
 @inline
 def aligned(array):
-    """Returns the first flat index of a float32 array that is aligned to 64 bytes, the size of a ``Lanes``."""
+    """Returns the first flat index in a float32 array that is aligned to 64 bytes, the size of a ``Lanes``."""
     return -(array.ctypes.data // 4) & (COUNT - 1)
 
 
 @emitted
 def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
-    """Loads sixteen values with a stride from a flat index of a float32 array, such as a column of sixteen rows."""
+    """Loads sixteen strided values from a flat index of a float32 array, for example a column of sixteen rows."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = ir.Constant(_FLOATS, ir.Undefined)
@@ -344,7 +344,7 @@ def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
 
 @emitted
 def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Stores the lanes with a stride from a flat index."""
+    """Stores the lanes at a flat index with a stride."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments[:3])):
@@ -358,7 +358,7 @@ def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> l
     """Returns pointers to ``array[rows[place + lane], column]`` for each lane."""
     (array_type, rows_type), (array, rows, place, columns, column) = types_of, values
     if not (isinstance(rows_type, types.Array) and rows_type.dtype == types.int64 and rows_type.layout == "C"):
-        raise TypeError(f"rows are a C-contiguous int64 array; this is {rows_type}")
+        raise TypeError(f"rows must be a C-contiguous int64 array, not {rows_type}")
     data = _data(context, builder, array_type, array)
     first = builder.gep(cgutils.create_struct_proxy(rows_type)(context, builder, value=rows).data, [place])
     rows_of = [builder.load(builder.gep(first, [_LONG(k)])) for k in range(COUNT)]
@@ -367,7 +367,7 @@ def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> l
 
 @emitted
 def gather_column(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any) -> Any:
-    """Loads a column of sixteen rows of a float32 array [n, columns], with row indices ``rows[place:]`` (int64)."""
+    """Loads a column of sixteen rows of a float32 array [n, columns]. The row indices are ``rows[place:]`` (int64)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = ir.Constant(_FLOATS, ir.Undefined)
@@ -382,7 +382,7 @@ def gather_column(typing_context: Any, array: Any, rows: Any, place: Any, column
 def scatter_column(
     typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any
 ) -> Any:
-    """Stores the lanes to a column of the rows that ``gather_column`` reads; for duplicate rows, the last lane wins."""
+    """Stores the lanes to the elements that ``gather_column`` would load; for duplicate rows, the last lane wins."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments[:5])):
@@ -394,7 +394,7 @@ def scatter_column(
 
 @emitted
 def gather_rows(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
-    """Loads sixteen rows of a float32 array [n, 16], with row indices ``rows[place:]`` (int64)."""
+    """Loads sixteen rows of a float32 array [n, 16]. The row indices are ``rows[place:]`` (int64)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT), _LONG(0)]
@@ -407,7 +407,7 @@ def gather_rows(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
 
 @emitted
 def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any) -> Any:
-    """Adds eight ``Lanes``, the columns of sixteen rows, to the given rows of a float32 array [n, 8], one by one."""
+    """Adds sixteen rows, given as eight column ``Lanes``, to rows of a float32 array [n, 8], one row at a time."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT // 2), _LONG(0)]
@@ -418,9 +418,9 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
         def shuffled(a: Any, b: Any, picked: list[int]) -> Any:
             return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(picked)), picked))
 
-        # Interleave pairs of columns, then fours, then eights: the columns of each row become adjacent.
+        # Interleave groups of two, four and finally eight columns, so that the columns of each row become adjacent.
         width = 1
-        groups = [[value] for value in values]  # each: vectors with rows 0–15 of ``width`` columns in order
+        groups = [[value] for value in values]  # each group contains rows 0–15 of ``width`` columns, in order
         while len(groups) > 1:
             merged = []
             for left, right in zip(groups[::2], groups[1::2], strict=True):
@@ -445,7 +445,7 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
 
 @emitted
 def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
-    """Prefetches a row of a two-dimensional float32 array into the L1 cache; the row may be out of bounds."""
+    """Prefetches a row of a 2D float32 array into the L1 cache. The row may be out of bounds."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         struct = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0])
@@ -459,7 +459,7 @@ def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
 
 @emitted
 def _times_power_of_two(typing_context: Any, value: Any, whole: Any) -> Any:
-    """Returns ``value`` · 2^``whole``, computed on the exponent bits."""
+    """Returns ``value`` · 2^``whole``, computed by integer addition to the exponent bits."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         steps = builder.shl(builder.fptosi(arguments[1], _INTS), ir.Constant(_INTS, [23] * COUNT))
@@ -470,7 +470,7 @@ def _times_power_of_two(typing_context: Any, value: Any, whole: Any) -> Any:
 
 @inline
 def exp2(x):
-    """Returns 2^x for x in [-126, 126] with relative error 3e-7, using a polynomial on [-1/2, 1/2]."""
+    """Returns 2^x for x in [-126, 126] with a relative error of 3e-7, using a polynomial on [-1/2, 1/2]."""
     whole = nearest(x)
     part = x - whole
     y = part * np.float32(1.3276470119986325e-3) + np.float32(9.675541319518366e-3)
@@ -483,7 +483,7 @@ def exp2(x):
 
 @inline
 def exp(x):
-    """Returns the float32 exponential with relative error 2e-7, clamped to ±87; NaN is preserved."""
+    """Returns the exponential of x clamped to ±87, with a relative error of 2e-7. NaN is preserved."""
     v = minimum(fill(MOST), maximum(fill(-MOST), x * LOG2_E))
     whole = nearest(v)
     r = v - whole
@@ -498,7 +498,7 @@ def exp(x):
 
 @emitted
 def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
-    """Splits positive numbers into x = m 2^e with m in [1/√2, √2)."""
+    """Decomposes positive numbers x = m 2^e with m in [1/√2, √2) into e and m."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def all_of(value: int) -> Any:
@@ -514,7 +514,7 @@ def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
 
 @inline
 def log2(x):
-    """Returns log2 of positive normal numbers, with absolute error 2e-7 near 1 and relative error 2e-7 elsewhere."""
+    """Returns log2 of positive normal numbers, with an error of 2e-7: absolute near 1, relative elsewhere."""
     exponent, mantissa = _exponent_and_mantissa(x)
     t = (mantissa - np.float32(1.0)) / (mantissa + np.float32(1.0))
     square = t * t
@@ -526,10 +526,10 @@ def log2(x):
 
 @emitted
 def column_bits(typing_context: Any, ends: Any) -> Any:
-    """Converts row ranges to blocks: an int64 with a byte per column of blocks and a bit per row of blocks.
+    """Converts ranges of pixel rows to a 64-bit block mask, with a byte per block column and a bit per block row.
 
-    Column k (of 8) contains the rows from lane k to lane k + 8, which are integers; none if the first exceeds the last.
-    Rows must be above -1 and below 32.
+    Block column k (of 8) covers the pixel rows from the value of lane k to the value of lane k + 8, which are integers.
+    If the first row exceeds the last, the column is empty. Rows outside 0…31 are ignored.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -555,7 +555,7 @@ def column_bits(typing_context: Any, ends: Any) -> Any:
 
 @emitted
 def lowest_bit(typing_context: Any, bits: Any) -> Any:
-    """Returns the index of the lowest set bit; the argument must not be 0."""
+    """Returns the index of the lowest set bit. The argument must not be 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], _BIT(1))
@@ -579,11 +579,11 @@ def sum_of(typing_context: Any, value: Any) -> Any:
 
 @emitted
 def sums_of(typing_context: Any, values: Any) -> Any:
-    """Returns the lane sums of up to sixteen ``Lanes`` in a tuple, in order; unused lanes are 0."""
+    """Returns one ``Lanes`` with the lane sums of up to sixteen ``Lanes`` in a tuple; unused lanes are 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [builder.extract_value(arguments[0], k) for k in range(len(values))]
-        # Add the interleaved halves of two values to get one; after four steps, each lane is the sum of one value.
+        # Each step combines pairs of values by adding their halves. After four steps, each lane contains one sum.
         length = COUNT
         while length > 1:
             half = length // 2
@@ -607,14 +607,14 @@ def sums_of(typing_context: Any, values: Any) -> Any:
 
 @emitted
 def transposed(typing_context: Any, values: Any) -> Any:
-    """Transposes sixteen ``Lanes`` in a tuple."""
+    """Transposes a 16×16 matrix, given as a tuple of sixteen ``Lanes``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = [builder.extract_value(arguments[0], k) for k in range(COUNT)]
         length = COUNT
         while length > 1:
             half = length // 2
-            # Swap the off-diagonal quarters of each square of ``length`` rows and columns.
+            # Swap the off-diagonal quadrants of each submatrix with ``length`` rows and columns.
             low = [k if k % length < half else COUNT + k - half for k in range(COUNT)]
             high = [k + half if k % length < half else COUNT + k for k in range(COUNT)]
             for k in range(COUNT):

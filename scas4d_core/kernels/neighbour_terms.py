@@ -1,10 +1,10 @@
 """Rigidity, isometry and rotation losses over sampled neighbourhoods, with gradients.
 
-References: ``losses.rigidity_loss``, ``losses.isometry_loss``, ``losses.rotation_loss``.
+Reference implementations: ``losses.rigidity_loss``, ``losses.isometry_loss``, ``losses.rotation_loss``.
 
-Sixteen sampled Gaussians are processed at a time, each with its k-th neighbour. A pair contributes to the gradients of
-both Gaussians. A fixed number of tasks with separate accumulators, summed in a fixed order, avoids atomics and makes
-the result independent of the number of threads.
+Sixteen sampled Gaussians are processed at a time, each with its k-th neighbour. Every pair contributes to the gradients
+of both Gaussians. A fixed number of tasks write to separate accumulators, which are then summed in a fixed order. This
+avoids atomics and makes the result independent of the number of threads.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
 
 TASKS = 4
 UNDER_ROOT = np.float32(ROOT_FLOOR)
-"""Added under each square root."""
+"""Value added under each square root, so that its derivative stays finite."""
 
 CHUNK = 4096
-"""Number of values that a task sums."""
+"""Number of values that each task sums."""
 
 
 @kernel
 def state_of(state, who):
-    """Returns the state columns of sixteen Gaussians."""
+    """Loads the state of sixteen Gaussians, one ``Lanes`` per column."""
     return lanes.transposed(lanes.gather_rows(state, who, 0))
 
 
 @kernel
 def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, turning, own, losses):
-    """Sums the losses [3] of one task's sampled Gaussians, and adds their gradients to ``own`` [M, 8]."""
+    """Computes the losses [3] summed over the samples of one task, and adds their gradients to ``own`` [M, 8]."""
     count = neighbours.shape[1]
     who, other = np.empty(lanes.COUNT, np.int64), np.empty(lanes.COUNT, np.int64)
     present = np.empty(lanes.COUNT, np.float32)
@@ -59,7 +59,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             weight = lanes.load(present, 0) * lanes.gather_column(weights, who, 0, count, k)
             counts = weight > ZERO
             ox, oy, oz = there[0] - mx, there[1] - my, there[2] - mz
-            # Rigidity: the neighbour's offset, rotated back, should equal that of frame t−1.
+            # Rigidity: the neighbour's offset, rotated back, should equal its offset in frame t−1.
             ex = r0 * ox + r3 * oy + r6 * oz - (there[7] - px)
             ey = r1 * ox + r4 * oy + r7 * oz - (there[8] - py)
             ez = r2 * ox + r5 * oy + r8 * oz - (there[9] - pz)
@@ -79,7 +79,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             g6 += oz * ex
             g7 += oz * ey
             g8 += oz * ez
-            # Isometry: the distance should equal that of frame 0.
+            # Isometry: the distance should equal the distance in frame 0.
             distance = lanes.square_root(ox * ox + oy * oy + oz * oz + UNDER_ROOT)
             stretch = distance - lanes.gather_column(distances, who, 0, count, k)
             length = lanes.square_root(weight * stretch * stretch + UNDER_ROOT)
@@ -88,7 +88,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             gx += pull * ox
             gy += pull * oy
             gz += pull * oz
-            # Rotation: both Gaussians should have rotated equally.
+            # Rotation: both Gaussians should have the same rotation.
             dw, dx, dy, dz = there[3] - w, there[4] - x, there[5] - y, there[6] - z
             length = lanes.square_root(weight * (dw * dw + dx * dx + dy * dy + dz * dz) + UNDER_ROOT)
             rotation += lanes.choose(counts, length, nothing)
@@ -112,14 +112,17 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
 
 @parallel_kernel
 def neighbour_terms(state, sample, neighbours, weights, distances, strengths, accumulators, losses):
-    """Computes the weighted sum of the three losses over the sampled Gaussians, and its gradient (Dynamic3DGaussians).
+    """Computes the three losses (Dynamic3DGaussians) over the sampled Gaussians, and the gradient of the weighted sum.
 
     Args:
-        state: [M, 16], columns as in ``deltas``. sample: [S] int64 rows whose neighbours are compared.
-        neighbours [M, k] int32, weights [M, k] (0: no neighbour), distances [M, k] metres at frame 0.
-        strengths: [3] float32, weights of rigidity, isometry and rotation divided by the number of pairs S k.
-        accumulators: out [4, M, 8]; the first one contains the gradients, columns as in ``deltas``.
-        losses: out [4, 3], unweighted sums over the pairs of each task.
+        state: [M, 16] state of the moving Gaussians; see ``deltas`` for the columns.
+        sample: [S] int64 rows of the sampled Gaussians.
+        neighbours: [M, k] int32 rows of the neighbours of each Gaussian.
+        weights: [M, k] weights of the pairs; 0 if there is no neighbour.
+        distances: [M, k] distances of the pairs in frame 0, in metres.
+        strengths: [3] float32 weights of rigidity, isometry and rotation, divided by the number of pairs S k.
+        accumulators: [4, M, 8] output; the first accumulator contains the gradients. See ``deltas`` for the columns.
+        losses: [4, 3] output, unweighted sums over the pairs of each task.
     """
     size = (sample.shape[0] + TASKS - 1) // TASKS
     for task in prange(TASKS):

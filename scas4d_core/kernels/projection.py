@@ -1,10 +1,11 @@
-"""EWA projection of Gaussians into a camera, and its backward pass. Reference: ``engines.torch.rasterizer``.
+"""EWA projection of Gaussians to the image plane of a camera, and its backward pass.
 
-A camera is given as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
+A camera is represented by ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
 (fx, fy, cx, cy, width, height) in pixels, with pixel centres at +0.5.
 
-Gaussians with invalid values are not rendered, because they would corrupt the pixels of others. Gradients that overflow
-are dropped. Both are counted (``guards``).
+Gaussians with invalid values are not rendered, because they would corrupt every pixel that they cover. Overflowing
+gradients are discarded. Both events are counted; see ``guards``. Reference implementation:
+``engines.torch.rasterizer``.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
 TILE = 32
-"""Side of a tile in pixels: 8×8 blocks of 4×4 pixels, one bit each in 64; its state fits into the L1 cache."""
+"""Side length of a tile in pixels. Its 8×8 blocks of 4×4 pixels fit into a 64-bit mask, and its state fits into the L1
+cache."""
 
 CHUNK = 256
-"""Gaussians per task, a compromise between overhead and load balance."""
+"""Number of Gaussians per task, a compromise between overhead and load balance."""
 
 AHEAD = 16
-"""Prefetch distance in Gaussians, whose records are scattered in memory."""
+"""Prefetch distance in Gaussians, because their records are scattered in memory."""
 
 FARTHEST = np.float32(NOT_FINITE)
 BRIGHTEST = np.float32(FEATURE_CEILING)
@@ -33,13 +35,13 @@ WIDEST = np.float32(FOOTPRINT_CEILING)
 STEEPEST = np.float32(GRADIENT_NOT_FINITE)
 
 COUNTED_GUARDS = ("not_finite", "footprint_ceiling")
-"""Guards that ``project`` counts."""
+"""Names of the guards that ``project`` counts."""
 COUNTED_GUARDS_BACKWARD = ("gradient_not_finite",)
-"""Guards that ``project_backward`` counts."""
+"""Names of the guards that ``project_backward`` counts."""
 
-# Columns of ``splats`` [N, 16], the Gaussian data that later kernels read. REACH is the support's squared Mahalanobis
-# radius. In a column dx right of the centre, the support spans the rows SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²))
-# below it. It is lowest at dx = LOWEST_X and highest at -LOWEST_X.
+# Columns of ``splats`` [N, 16], the per-Gaussian data for later kernels. REACH is the squared Mahalanobis radius of the
+# support. At a horizontal offset dx from the centre, the support extends over the vertical offsets (positive downwards)
+# SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²)). Its lowest point is at dx = LOWEST_X, the highest at -LOWEST_X.
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, REACH, DEPTH = range(8)
 LOG_OPACITY, SLOPE, SPREAD, THIN, LOWEST_X = range(8, 13)
 SPLAT_COLUMNS = 16
@@ -47,7 +49,7 @@ SPLAT_COLUMNS = 16
 
 @inline
 def tangents(u, v, lens, margin):
-    """Returns x/z and y/z clamped for the Jacobian, and masks of values within the bounds."""
+    """Clamps x/z and y/z for the Jacobian; returns the clamped values, and masks of the values within the bounds."""
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     margin_x = margin * HALF * width / fx
     margin_y = margin * HALF * height / fy
@@ -61,13 +63,13 @@ def tangents(u, v, lens, margin):
 
 @inline
 def rotate_coordinate(pose, row, x, y, z):
-    """Returns one coordinate of vectors rotated into the camera's axes."""
+    """Rotates vectors into the camera's axes and returns coordinate ``row`` of the result."""
     return x * pose[row, 0] + y * pose[row, 1] + z * pose[row, 2]
 
 
 @inline
 def sound_features(features, first):
-    """Returns 1 for each of sixteen Gaussians from row ``first`` with finite, not too large features, else 0."""
+    """Returns, for sixteen Gaussians starting at row ``first``, 1 if all features are within bounds, otherwise 0."""
     columns = features.shape[1]
     sound = lanes.fill(ONE)
     total = lanes.fill(ZERO)
@@ -82,11 +84,12 @@ def sound_features(features, first):
 
 @kernel
 def project_group(first, means, factors, opacities, features, pose, lens, limits, splats, place, boxes, guard_counts):
-    """Projects sixteen Gaussians from row ``first``; see ``project``.
+    """Projects sixteen Gaussians, starting at row ``first``; see ``project``.
 
     Args:
-        splats: out, from row ``place``. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and their number.
-        guard_counts: [2], accumulated.
+        splats: output, starting at row ``place``.
+        boxes: [5 · 16] output, tile ranges x0, y0, x1, y1 of each Gaussian and number of tiles.
+        guard_counts: [2] counts, accumulated.
     """
     alpha_floor, low_pass, near, margin = limits[0], limits[3], limits[4], limits[5]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -119,7 +122,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
         syy = syy + m1 * m1
         m00, m01, m02 = m01, m02, m0
         m10, m11, m12 = m11, m12, m1
-    # |m0 x m1|^2 + low_pass (...) - low_pass^2 avoids the cancellation of sxx syy - sxy^2 for needle-shaped Gaussians.
+    # |m0 x m1|^2 + low_pass (...) - low_pass^2 avoids cancellation in sxx syy - sxy^2 for needle-shaped Gaussians.
     n0 = m01 * m12 - m02 * m11
     n1 = m02 * m10 - m00 * m12
     n2 = m00 * m11 - m01 * m10
@@ -140,7 +143,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
     reach = lanes.maximum(reach, zero)
     half_x = lanes.square_root(reach * sxx)
     half_y = lanes.square_root(reach * syy)
-    # Pixel centres are at +0.5: the first covered column has its centre at or right of mx - half_x.
+    # Pixel centres are at +0.5: the centre of the first covered column is at or to the right of mx - half_x.
     left, right = mx - half_x - HALF, mx + half_x + HALF
     top, bottom = my - half_y - HALF, my + half_y + HALF
     visible = visible & (right > ZERO) & (left < width) & (bottom > ZERO) & (top < height)
@@ -169,7 +172,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
 
 @kernel
 def padded_1(rows, first):
-    """Returns up to sixteen values of an array from ``first``, padded with 0 to sixteen."""
+    """Returns sixteen values of an array, starting at ``first``, padded with zeros at the end of the array."""
     result = np.zeros(lanes.COUNT, np.float32)
     for k in range(min(lanes.COUNT, rows.shape[0] - first)):
         result[k] = rows[first + k]
@@ -178,7 +181,7 @@ def padded_1(rows, first):
 
 @kernel
 def padded_2(rows, first):
-    """Returns up to sixteen rows of an array from ``first``, padded with 0 to sixteen."""
+    """Returns sixteen rows of an array, starting at ``first``, padded with zeros at the end of the array."""
     result = np.zeros((lanes.COUNT, rows.shape[1]), np.float32)
     for k in range(min(lanes.COUNT, rows.shape[0] - first)):
         for column in range(rows.shape[1]):
@@ -188,7 +191,7 @@ def padded_2(rows, first):
 
 @kernel
 def padded_3(rows, first):
-    """Returns up to sixteen 3×3 matrices of an array from ``first``, padded with 0 to sixteen."""
+    """Returns sixteen 3×3 matrices of an array, starting at ``first``, padded with zeros at the end of the array."""
     result = np.zeros((lanes.COUNT, 3, 3), np.float32)
     for k in range(min(lanes.COUNT, rows.shape[0] - first)):
         for i in range(3):
@@ -224,14 +227,18 @@ def project(means, factors, opacities, features, pose, lens, limits, splats, rec
     """Projects N Gaussians, sixteen at a time.
 
     Args:
-        means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
-        features: [N, C] float32, only checked for valid values.
-        pose, lens: the camera. limits: [6] float32, the fields of ``Limits`` in order.
-        splats: out [N + 15 or more, 16] float32, columns above.
-        rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty if culled.
-        counts: out [N] int32, number of tiles in the box.
-        guard_counts: out [tasks of ``CHUNK``, 2] int64, number of Gaussians for which each guard in ``COUNTED_GUARDS``
-            was triggered.
+        means: [N, 3] float32 means in world coordinates.
+        factors: [N, 3, 3] float32 covariance factors F, with Σ = F Fᵀ.
+        opacities: [N] float32 opacities.
+        features: [N, C] float32 features, which are only checked for invalid values.
+        pose, lens: camera; see the module docstring.
+        limits: [6] float32 rasterizer constants, in the order of the ``Limits`` fields.
+        splats: [N + 15 or more, 16] float32 output; see the column constants above.
+        rects: [N, 4] int32 output, bounding box of each support in tiles: x0, y0, x1, y1 (exclusive). It is empty if
+            the Gaussian is culled.
+        counts: [N] int32 output, number of tiles in each bounding box.
+        guard_counts: [tasks of ``CHUNK``, 2] int64 output, number of Gaussians that triggered each guard in
+            ``COUNTED_GUARDS``.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_task(
@@ -244,13 +251,14 @@ def project_backward_group(
     first, place, means, factors, pose, lens, limits, splats, sums, columns, depth_channel, g_means, g_factors,
     g_opacities, g_screen,
 ):  # fmt: skip
-    """Backpropagates the gradients of sixteen Gaussians from the picture to the world; see ``project_backward``.
+    """Backpropagates the gradients of sixteen Gaussians from the image to the world; see ``project_backward``.
 
     Args:
-        first: row of the Gaussians in ``means`` and ``factors``. place: their row in ``splats``.
-        sums: [16, columns], each Gaussian's record summed over its pairs, followed by 1 if it has pairs, else 0. That
-            flag is set to 0 if the gradient of the Gaussian overflows.
-        g_means, g_factors, g_opacities, g_screen: out, from row ``first``.
+        first: row of the first Gaussian in ``means`` and ``factors``.
+        place: row of the first Gaussian in ``splats``.
+        sums: [16, columns] record of each Gaussian summed over its pairs, followed by a flag: 1 if it has pairs,
+            otherwise 0. If the gradient of the Gaussian overflows, the flag is cleared.
+        g_means, g_factors, g_opacities, g_screen: outputs, starting at row ``first``.
 
     Returns:
         Whether a gradient overflowed.
@@ -306,7 +314,7 @@ def project_backward_group(
             g = ga0 * pose[0, j] + ga1 * pose[1, j] + ga2 * pose[2, j]
             size = size + lanes.magnitude(g)
             lanes.scatter(g_factors, 9 * first + 3 * j + k, 9, lanes.choose(seen, g, zero))
-    # Clamped tangents are treated as constants; the projected centre always gets a gradient.
+    # Clamped tangents are treated as constants, but the projected mean always gets a gradient.
     g_u = lanes.choose(free_u, g_u, zero) * inverse
     g_v = lanes.choose(free_v, g_v, zero) * inverse
     gx = fx * inverse * g_x + g_u
@@ -338,7 +346,7 @@ def project_backward_group(
 
 @kernel
 def clear_steep_gradients(sums, counts, first, some, used):
-    """Clears sums and flags of those of sixteen Gaussians whose pairs sum to more than ``STEEPEST``."""
+    """Clears the sums and flags of all Gaussians whose summed gradients exceed ``STEEPEST`` or are NaN."""
     for k in range(some):
         steep = ZERO
         for column in range(used):
@@ -425,16 +433,23 @@ def project_backward(
     g_screen,
     guard_counts,
 ):
-    """Sums each Gaussian's pairs (in a fixed order) and backpropagates them to the world, sixteen at a time.
+    """Sums the gradients of each Gaussian's pairs, in a fixed order, and backpropagates them to the world.
+
+    Sixteen Gaussians are processed at a time. The gradients of culled Gaussians are 0.
 
     Args:
-        records: [pairs, multiple of ``Lanes``] from ``blend_backward``. counts, firsts: [N] number of pairs of each
-            Gaussian, and its first pair.
-        depth_channel: the feature channel that contains the depth of the centre, or -1.
-        g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C], g_screen [N, 2]: out, float32; 0 if
-            culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control uses.
-        guard_counts: out [tasks of ``CHUNK``, 1] int64, number of Gaussians for which the guard in
-            ``COUNTED_GUARDS_BACKWARD`` was triggered.
+        means, factors, pose, lens, limits, splats: see ``project``.
+        counts: [N] number of pairs of each Gaussian.
+        firsts: [N] first pair of each Gaussian.
+        records: [pairs, multiple of ``Lanes``] gradient records from ``blend_backward``.
+        depth_channel: feature channel that contains the depth of the mean, or -1.
+        g_means: [N, 3] float32 output.
+        g_factors: [N, 3, 3] float32 output.
+        g_opacities: [N] float32 output.
+        g_features: [N, C] float32 output.
+        g_screen: [N, 2] float32 output, gradient of the projected mean per pixel, which density control uses.
+        guard_counts: [tasks of ``CHUNK``, 1] int64 output, number of Gaussians that triggered the guard in
+            ``COUNTED_GUARDS_BACKWARD``.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_backward_task(

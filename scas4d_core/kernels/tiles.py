@@ -1,4 +1,4 @@
-"""Depth sorting and tile lists: one global sort, so that lists filled in this order are sorted by construction."""
+"""Depth sorting and tile lists. Gaussians are sorted once globally, so tile lists filled in this order are sorted."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ RADIX_BITS = 12
 DIGITS = 1 << RADIX_BITS
 
 BLOCK = lanes.ACROSS
-"""Side of a block in pixels."""
+"""Side length of a block in pixels."""
 
 SOME = 4096
-"""Rows per task."""
+"""Number of rows per task."""
 
 AHEAD = 8
-"""Prefetch distance in Gaussians, which are scattered in memory when in depth order."""
+"""Prefetch distance in Gaussians, because depth order scatters memory accesses."""
 
 
 @inline
 def cover(splat, tile_x, tile_y):
-    """Returns the blocks of a tile that the support (an ellipse) intersects: bit 8 x + y for block column x and row y.
+    """Returns the mask of a tile's blocks that a Gaussian's support (an ellipse) intersects.
 
-    Culling by the cover is exact: in each column of blocks, it spans the support's extreme rows.
+    Bit 8 x + y represents the block in column x and row y. The mask is exact, because the topmost and bottommost rows
+    of the support are computed for each column of blocks.
     """
     left = lanes.ramp(np.float32(tile_x * TILE) + HALF - splat[MEAN_X])
-    # Eight lanes for the upper ends of the block columns, eight for the lower ends.
+    # Eight lanes contain the upper ends of the support in the block columns, the other eight the lower ends.
     down = lanes.ends()
-    # Rounding must not cull pixels that the blending kernels would render.
+    # The margin ensures that rounding never culls pixels that the blending kernels would render.
     reach = splat[REACH] * WIDER + SLACK
     dx = lanes.minimum(lanes.maximum(down * splat[LOWEST_X], left), left + np.float32(lanes.ACROSS - 1))
     room = reach - dx * dx * splat[THIN]
     dy = dx * splat[SLOPE] + down * lanes.square_root(lanes.maximum(room * splat[SPREAD], lanes.fill(ZERO)))
-    # Rows whose centres are inside: from the ceiling of the upper end to the floor of the lower end.
+    # Rows whose centres are inside the support: from the ceiling of the upper end to the floor of the lower end.
     row = down * lanes.floor(down * (dy + (splat[MEAN_Y] - HALF - np.float32(tile_y * TILE))))
     row = lanes.choose(room >= ZERO, row, down * np.float32(-1e4))
     row = lanes.minimum(lanes.maximum(row, lanes.fill(np.float32(-1.0))), lanes.fill(np.float32(TILE)))
@@ -58,18 +59,21 @@ def cover(splat, tile_x, tile_y):
 
 @kernel
 def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
-    """Sorts the visible Gaussians by depth, nearest first; equal depths keep the row order.
+    """Sorts the visible Gaussians by depth, nearest first. Gaussians with equal depths stay in row order.
 
-    Depths are positive, so their float32 bits sort as integers. A stable radix sort runs 12-bit passes on the
-    difference from the nearest depth; two passes suffice if the farthest depth is within four times the nearest.
+    Because depths are positive, their float32 bit patterns can be sorted as integers. A stable radix sort with 12 bits
+    per pass is applied to differences from the nearest depth. Two passes suffice if the farthest depth is at most four
+    times the nearest.
 
     Args:
-        splats: [N, 16]; counts: [N] number of tiles of each, 0 if culled.
-        keys, keys_too: scratch [N] uint32. order, order_too: [N] int32.
-        histogram: scratch [DIGITS] int64.
+        splats: [N, 16] projected Gaussians.
+        counts: [N] number of tiles of each Gaussian; 0 if culled.
+        keys, keys_too: [N] uint32 scratch buffers.
+        order, order_too: [N] int32 buffers, one of which receives the result.
+        histogram: [DIGITS] int64 scratch buffer.
 
     Returns:
-        The number of visible Gaussians, and the one of the two arrays that contains their order.
+        The number of visible Gaussians, and the buffer that contains their rows in depth order.
     """
     visible = 0
     for i in range(counts.shape[0]):
@@ -111,10 +115,10 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
 
 @kernel
 def share_pairs(order, visible, counts, begins):
-    """Computes the first pair of each task, ``begins`` [tasks] int64; tasks get equal shares of the order.
+    """Computes the first pair of each task, ``begins`` [tasks] int64. Each task gets an equal share of the Gaussians.
 
     Returns:
-        Upper bound of the number of Gaussian–tile pairs: the tiles of all boxes.
+        Upper bound on the number of Gaussian–tile pairs: the number of tiles in all bounding boxes.
     """
     tasks = begins.shape[0]
     total = 0
@@ -130,7 +134,7 @@ def cover_tiles_task(
     task, splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers,
     tile_counts,
 ):  # fmt: skip
-    """Lists the tiles of the Gaussians of one task of ``cover_tiles``."""
+    """Processes the Gaussians of one task of ``cover_tiles``."""
     tasks = begins.shape[0]
     for tile in range(tile_counts.shape[1]):
         tile_counts[task, tile] = 0
@@ -150,7 +154,7 @@ def cover_tiles_task(
                 blocks = cover(splats[i], tile_x, tile_y)
                 outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
                 blocks &= drawn[tile]
-                # Always written and only kept if reached, which avoids a branch that could be mispredicted.
+                # Pairs are always written but only kept if they intersect, which avoids branch mispredictions.
                 reached = np.int64(blocks != 0)
                 pairs[pair, 0] = i
                 pairs[pair, 1] = tile
@@ -166,19 +170,24 @@ def cover_tiles_task(
 def cover_tiles(
     splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers, tile_counts
 ):
-    """Lists the tiles that each Gaussian's support intersects, in depth order.
+    """Lists the Gaussian–tile pairs whose supports and tiles intersect, in depth order.
 
     Args:
-        drawn: [tiles] uint64, the blocks of each tile to render; other blocks are ignored.
-        learnt: [N] uint8, 1 for Gaussians that must stay within the rendered blocks.
-        begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, end of each task's pairs.
-        counts: in: tiles of each Gaussian's box; out: tiles reached. firsts: out [N] int64, first pair of each
-            Gaussian; its other pairs follow.
-        pairs: out [pairs, 2] int32, Gaussian and tile. covers: out [pairs] uint64, blocks of the tile, see ``cover``.
-        tile_counts: out [tasks, tiles] int32.
+        splats, rects: outputs of ``projection.project``.
+        order, visible: outputs of ``depth_order``.
+        tiles_x: number of tile columns.
+        drawn: [tiles] uint64 mask of the blocks to render; other blocks are ignored.
+        learnt: [N] uint8 mask of the Gaussians that must stay within the rendered blocks.
+        begins: [tasks] first pair of each task, from ``share_pairs``.
+        ends: [tasks] int64 output, end of each task's pairs.
+        counts: [N] number of tiles in each bounding box, replaced by the number of pairs of each Gaussian.
+        firsts: [N] int64 output, first pair of each Gaussian. Pairs of a Gaussian are contiguous.
+        pairs: [pairs, 2] int32 output, Gaussian and tile of each pair.
+        covers: [pairs] uint64 output, block mask of each pair; see ``cover``.
+        tile_counts: [tasks, tiles] int32 output, number of pairs in each tile.
 
     Returns:
-        Number of times that a learned Gaussian reached blocks that are not rendered.
+        Number of pairs in which a learned Gaussian extends beyond the rendered blocks.
     """
     tasks = begins.shape[0]
     left = np.zeros(tasks, np.int64)
@@ -198,8 +207,10 @@ def mark_blocks(splats, rects, chosen, tiles_x, marks):
     """Marks the blocks that the supports of Gaussians intersect.
 
     Args:
-        splats, rects: from ``projection.project``. chosen: [N] uint8, 0 for Gaussians that are ignored.
-        marks: [tiles] uint64, to which bits are added.
+        splats, rects: outputs of ``projection.project``.
+        chosen: [N] uint8 mask of the Gaussians to consider.
+        tiles_x: number of tile columns.
+        marks: [tiles] uint64 block masks, in which bits are set.
     """
     for i in range(rects.shape[0]):
         if chosen[i] == 0:
@@ -211,10 +222,13 @@ def mark_blocks(splats, rects, chosen, tiles_x, marks):
 
 @kernel
 def find_meeting(splats, rects, tiles_x, drawn, meets):
-    """Finds the Gaussians whose support intersects a block to render.
+    """Finds the Gaussians whose support intersects any of the blocks to render.
 
     Args:
-        drawn: [tiles] uint64. meets: out [N] bool.
+        splats, rects: outputs of ``projection.project``.
+        tiles_x: number of tile columns.
+        drawn: [tiles] uint64 mask of the blocks to render.
+        meets: [N] bool output.
     """
     for i in range(rects.shape[0]):
         meets[i] = False
@@ -227,10 +241,13 @@ def find_meeting(splats, rects, tiles_x, drawn, meets):
 
 @parallel_kernel
 def put_rows(rows, places, part, whole):
-    """Copies rows of one array to rows ``places`` of another.
+    """Copies rows from one array to another: ``whole[places] = part[rows]``.
 
     Args:
-        rows, places: [M] int64. part: [P, K], whole: out [W, K] float32.
+        rows: [M] int64 rows to read from ``part``.
+        places: [M] int64 rows to write in ``whole``.
+        part: [P, K] float32 input.
+        whole: [W, K] float32 output.
     """
     for task in prange((rows.shape[0] + SOME - 1) // SOME):
         for k in range(task * SOME, min(rows.shape[0], (task + 1) * SOME)):
@@ -240,20 +257,23 @@ def put_rows(rows, places, part, whole):
 
 @inline
 def is_marked(blocks, tiles_x, y, x):
-    """Returns whether the block of a pixel is marked."""
+    """Returns whether the block that contains a pixel is marked."""
     number = x % TILE // BLOCK * (TILE // BLOCK) + y % TILE // BLOCK
     return (blocks[y // TILE * tiles_x + x // TILE] >> np.uint64(number)) & np.uint64(1) != 0
 
 
 @kernel
 def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
-    """Composes a box of a picture from the rendered blocks and a known base picture.
+    """Composes a rectangular part of an image from rendered blocks and a base image.
 
     Args:
-        planes: [C, rows, stride] float32, the rendering. base: [C, H, W] float32, values of all other blocks.
-        blocks: [tiles] uint64. box: first row, last row + 1, first column, last column + 1.
-        part: out [C, h, w] float32, the box. shifts: out [C] float64, sums over the box of its difference from the
-            base.
+        planes: [C, rows, stride] float32 rendering, which is used in the given blocks.
+        base: [C, H, W] float32 base image, which is used everywhere else.
+        blocks: [tiles] uint64 mask of the rendered blocks.
+        tiles_x: number of tile columns.
+        box: first row, last row + 1, first column, last column + 1.
+        part: [C, h, w] float32 output, the image inside the box.
+        shifts: [C] float64 output, difference between ``part`` and the base image, summed over the box.
     """
     top, bottom, left, right = box
     for channel in range(part.shape[0]):
@@ -272,10 +292,12 @@ def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
 
 @kernel
 def write_blocks(part, blocks, tiles_x, box, planes):
-    """Copies the rendered blocks from a box to a picture, like ``compose_box``; other blocks are unchanged.
+    """Copies the given blocks from a box back to an image. All other blocks stay unchanged.
 
     Args:
-        part: [C, h, w] float32. planes: out [C, rows, stride] float32.
+        part: [C, h, w] float32 input, the image inside the box.
+        blocks, tiles_x, box: see ``compose_box``.
+        planes: [C, rows, stride] float32 output.
     """
     top, bottom, left, right = box
     for channel in range(part.shape[0]):
@@ -288,10 +310,15 @@ def write_blocks(part, blocks, tiles_x, box, planes):
 
 @kernel
 def tile_offsets(tile_counts, starts, cursors):
-    """Computes the start of each tile's list, ``starts`` [tiles + 1], and each task's part, ``cursors`` [tasks, tiles].
+    """Computes the offset of each tile's list, and of each task's part of it.
+
+    Args:
+        tile_counts: [tasks, tiles] number of pairs in each tile, from ``cover_tiles``.
+        starts: [tiles + 1] output, start of each tile's list.
+        cursors: [tasks, tiles] output, start of each task's part in each tile's list.
 
     Returns:
-        Number of entries of all lists.
+        Total number of entries in all lists.
     """
     total = 0
     for tile in range(tile_counts.shape[1]):
@@ -305,11 +332,14 @@ def tile_offsets(tile_counts, starts, cursors):
 
 @parallel_kernel
 def fill_tiles(begins, ends, pairs, covers, cursors, items, slots, entry_covers):
-    """Writes the tile lists in depth order; each task writes its share at the offsets from ``tile_offsets``.
+    """Writes the tile lists in depth order. Each task writes its part at the offsets from ``tile_offsets``.
 
     Args:
-        cursors: [tasks, tiles] int64, advanced. items, slots: out [entries] int32, the Gaussian and its pair.
-        entry_covers: out [entries] uint64.
+        begins, ends, pairs, covers: see ``cover_tiles``.
+        cursors: [tasks, tiles] int64 offsets, which are advanced.
+        items: [entries] int32 output, Gaussian of each entry.
+        slots: [entries] int32 output, pair of each entry.
+        entry_covers: [entries] uint64 output, block mask of each entry.
     """
     for task in prange(begins.shape[0]):
         for pair in range(begins[task], ends[task]):

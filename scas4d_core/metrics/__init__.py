@@ -1,4 +1,4 @@
-"""Metrics for images, tracks and parts compared with ground truth."""
+"""Metrics that compare images, tracks and parts with ground truth."""
 
 from scas4d_core.metrics.image import Score, flip, lpips, psnr, ssim
 from scas4d_core.metrics.parts import adjusted_rand_index

@@ -1,16 +1,16 @@
-"""Evaluation of a reconstruction on the test cameras and ground truth of a capture: images, tracks, parts and flicker.
+"""Evaluation of a reconstruction against the ground truth of a capture: images, tracks, parts and flicker.
 
-Definitions in addition to those in ``scas4d_core.metrics``:
+These definitions complement those in ``scas4d_core.metrics``:
 
-- A *moving* ground-truth point moves at some time more than 1 % of the extent away from its position at frame 0.
-- *Foreground* pixels are those of the test camera's mask. *Changed* pixels differ by more than 0.1 in some channel from
-  the ground-truth image of frame 0.
-- 3D tracks start from the ground-truth points at frame 0. 2D tracks start from the pixels of the moving points that a
-  test camera sees at frame 0, and use rendered depth. They count in frames in which the camera sees the point.
+- A ground-truth point is *moving* if its distance from its position in frame 0 ever exceeds 1 % of the extent.
+- *Foreground* pixels are inside the mask of the test camera. *Changed* pixels differ by more than 0.1 in at least one
+  channel from the ground-truth image of frame 0.
+- 3D tracks start at the ground-truth points in frame 0. 2D tracks start at the pixels of the moving points that are
+  visible in a test camera in frame 0, and use rendered depth. They are evaluated in frames where the point is visible.
 - Parts are rendered with as many labels as the scene has foreground parts, and compared at pixels whose true label is a
   part.
-- *Still* pixels of a test camera are not black, and their true values stay within 6 of 255 levels over the measured
-  frames. *Flicker* is the temporal standard deviation of the rendered values at these pixels, in levels.
+- *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
+  evaluated frames. *Flicker* is the temporal standard deviation of the rendered values at these pixels, in levels.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
 
     Committed = Reconstruction | CommittedScene
-    """A scene that has committed the measured frames."""
+    """A scene in which the evaluated frames are committed."""
 
 MOVING_SHARE = 0.01
-"""Distance, as a share of the extent, up to which a ground-truth point counts as static."""
+"""Distance from frame 0, as a fraction of the extent, up to which a ground-truth point is considered static."""
 CHANGED = 0.1
-"""Difference from frame 0 in 0…1, in some channel, above which a pixel has changed."""
+"""Difference from frame 0 in any channel, with values in 0…1, above which a pixel is considered changed."""
 STILL_LEVELS = 6
-"""Range in levels of 255, in every channel, of a still pixel; covers the noise of the ground-truth images."""
+"""Maximum range of a still pixel's values in each channel, in levels of 255. Allows for noise in the true images."""
 MIN_STILL = 500
-"""Minimum number of still pixels over all test cameras for a meaningful flicker."""
+"""Minimum number of still pixels over all test cameras for which flicker is reported."""
 
 Scores = dict[str, float | None]
 
@@ -49,13 +49,16 @@ Scores = dict[str, float | None]
 def measure_pictures(
     reconstruction: Committed, capture: Capture, index: int, *, with_lpips: bool = False
 ) -> tuple[Scores, dict[str, Scores]]:
-    """Returns the scores of one committed frame on the test cameras: their mean, and by camera.
+    """Computes the image scores of one frame on the test cameras.
 
     Args:
         reconstruction: reconstruction in which the frame is already committed.
-        capture: opened at the measured image scale, with masks.
+        capture: capture with masks, opened at the image scale to evaluate.
         index: frame index.
-        with_lpips: also computes LPIPS, which loads torch.
+        with_lpips: whether to compute LPIPS too, which requires torch.
+
+    Returns:
+        The mean scores over all test cameras, and the scores of each camera, keyed by camera name.
     """
     rig, truth, first = capture.test_rig, capture.test_frame(index), capture.test_frame(0)
     assert rig is not None
@@ -77,7 +80,16 @@ def measure_pictures(
 
 
 def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Returns 3D error, 2D error with and without oracle, and visibility accuracy; ``indices`` starts with frame 0."""
+    """Computes the track scores over the given frames: 3D and 2D errors, oracle error and visibility accuracy.
+
+    Args:
+        reconstruction: reconstruction in which the frames are already committed.
+        capture: capture with test cameras and ground-truth points.
+        indices: frame indices, starting with frame 0.
+
+    Returns:
+        The scores. They are empty if there are fewer than two frames, or if no point moves.
+    """
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
     assert rig is not None
@@ -125,7 +137,7 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
 
 
 def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Returns the adjusted Rand index of rendered part labels, pooled over frames and test cameras with labels."""
+    """Returns the adjusted Rand index of rendered part labels, pooled over frames and all test cameras with labels."""
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
     assert rig is not None
@@ -137,7 +149,7 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
     rendered, true = [], []
     for camera in cameras:
         for index in indices:
-            # image sizes differ between cameras
+            # Flattened, because image sizes differ between cameras.
             rendered.append(render_parts(reconstruction, camera, index, labels).ravel())
             true.append(truth.labels(camera.name, index).ravel())
     index_of_all = metrics.adjusted_rand_index(np.concatenate(rendered), np.concatenate(true))
@@ -145,12 +157,12 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
 
 
 def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Returns the mean temporal standard deviation of still pixels in levels of 255, and the number of still pixels."""
+    """Returns the flicker, in levels of 255, and the number of still pixels it is averaged over."""
     rig = capture.test_rig
     assert rig is not None
     deviations: list[NDArray[Any]] = []
     for camera in rig.cameras:
-        # One frame at a time, because a long capture does not fit into memory.
+        # Frames are loaded one at a time, because a long capture does not fit into memory.
         lowest = highest = capture.test_frame(indices[0]).images[camera.name]
         for index in indices[1:]:
             true = capture.test_frame(index).images[camera.name]
@@ -171,20 +183,20 @@ def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequen
 
 
 def render_parts(reconstruction: Committed, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Returns the [H, W] part labels of one view."""
+    """Returns the part labels [H, W] of one camera in one frame."""
     parts: NDArray[np.uint8] | None = reconstruction.render(camera, index, labels=labels).parts
     assert parts is not None  # labels were given
     return parts
 
 
 def moving_points(points: NDArray[np.float64], extent: float) -> NDArray[np.bool_]:
-    """Returns [P] true for points of [T, P, 3] that move more than 1 % of the extent from their first position."""
+    """Returns a mask [P] of the points [T, P, 3] that move more than 1 % of the extent from their first position."""
     moving: NDArray[np.bool_] = np.linalg.norm(points - points[:1], axis=-1).max(axis=0) > MOVING_SHARE * extent
     return moving
 
 
 def mean_scores(of: Iterable[Scores]) -> Scores:
-    """Returns the mean of every score over the entries that have it."""
+    """Averages each score over all entries in which it is available."""
     table = list(of)
     names = dict.fromkeys(name for scores in table for name in scores)
     return {name: _mean([scores.get(name) for scores in table]) for name in names}
@@ -196,7 +208,8 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """Returns None for non-finite values: JSON has no NaN, and infinity (identical pixels, all points lost) would spoil
-    a mean.
+    """Replaces non-finite values with None.
+
+    JSON does not support NaN, and a single infinity (identical pixels, all points lost) would make a mean infinite.
     """
     return value if math.isfinite(value) else None

@@ -1,6 +1,6 @@
-"""Image metrics compared with ground truth: PSNR, SSIM, FLIP and LPIPS.
+"""Metrics that compare images with ground truth: PSNR, SSIM, FLIP and LPIPS.
 
-Images are [H, W, 3]: floats in 0…1, or uint8 in 0…255. Rendered values outside 0…1 are clamped first, as on a display.
+Images are [H, W, 3] arrays, either floats in 0…1 or uint8 in 0…255. As on a display, floats are first clamped to 0…1.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
 LPIPS_BACKBONES = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
-"""Weight files of torchvision that the lpips package loads, as cached by torch.hub."""
+"""File names of the torchvision weights that the lpips package loads from the torch.hub cache."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """The value of a metric that may be unavailable.
+    """Result of a metric that may be unavailable.
 
     Attributes:
-        value: None if the metric could not be computed.
-        reason: fault and remedy; empty if there is a value.
+        value: value of the metric, or None if it could not be computed.
+        reason: why the value is missing and how to fix it; empty if there is a value.
     """
 
     value: float | None
@@ -42,15 +42,15 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
     """Returns the peak signal-to-noise ratio in dB: −10 log10 of the mean squared error over pixels and channels.
 
     Args:
-        image: [H, W, 3] rendered.
-        truth: [H, W, 3].
-        mask: [H, W]; only non-zero pixels count, such as those of the foreground.
+        image: [H, W, 3] rendered image.
+        truth: [H, W, 3] ground-truth image.
+        mask: [H, W] mask of the pixels to compare, for example the foreground. If None, all pixels are compared.
 
     Returns:
-        PSNR in dB; infinity for equal images; NaN for an empty mask.
+        PSNR in dB. It is infinite for equal images, and NaN for an empty mask.
 
     Raises:
-        ValueError: the shapes differ, or values are not finite.
+        ValueError: if the shapes differ, or if values are not finite.
 
     >>> truth = np.zeros((8, 8, 3))
     >>> round(psnr(truth + 0.1, truth), 6), psnr(truth, truth)
@@ -60,7 +60,7 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
     squared = (first - second) ** 2
     if mask is not None:
         if mask.shape != first.shape[:2]:
-            raise ValueError(f"mask has shape {mask.shape}; give {first.shape[:2]} as the pictures have")
+            raise ValueError(f"mask has shape {mask.shape}; expected {first.shape[:2]} like the images")
         squared = squared[np.asarray(mask) != 0]
     if squared.size == 0:
         return math.nan
@@ -69,20 +69,20 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
 
 
 def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
-    """Returns the structural similarity (Wang et al. 2004), mean over pixels and channels, as in 3D Gaussian Splatting.
+    """Returns the structural similarity (Wang et al. 2004), averaged over pixels and channels.
 
-    It uses an 11×11 Gaussian window with σ = 1.5 px, zero padding, C1 = 0.01², C2 = 0.03², biased variances and values
-    in 0…1.
+    As in 3D Gaussian Splatting, it uses an 11×11 Gaussian window with σ = 1.5 px, zero padding, C1 = 0.01²,
+    C2 = 0.03², biased variances and values in 0…1.
 
     Args:
-        image: [H, W, 3] rendered.
-        truth: [H, W, 3].
+        image: [H, W, 3] rendered image.
+        truth: [H, W, 3] ground-truth image.
 
     Returns:
-        At most 1, which means equal images.
+        SSIM; the maximum is 1, for equal images.
 
     Raises:
-        ValueError: the shapes differ, or values are not finite.
+        ValueError: if the shapes differ, or if values are not finite.
 
     >>> picture = np.random.default_rng(0).random((32, 32, 3))
     >>> ssim(picture, picture), round(ssim(1 - picture, picture), 2)
@@ -103,11 +103,14 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
     """Returns the mean LDR-ꟻLIP error (Andersson et al. 2020) at the recommended 67 pixels per degree; 0 means equal.
 
     Args:
-        image: [H, W, 3] rendered, sRGB.
-        truth: [H, W, 3], sRGB.
+        image: [H, W, 3] rendered image in sRGB.
+        truth: [H, W, 3] ground-truth image in sRGB.
+
+    Returns:
+        Score without a value if the flip_evaluator package is not installed.
 
     Raises:
-        ValueError: the shapes differ, or values are not finite.
+        ValueError: if the shapes differ, or if values are not finite.
 
     >>> picture = np.full((16, 16, 3), 0.5)
     >>> flip(picture, picture)
@@ -133,15 +136,15 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
     """Returns the learned perceptual distance LPIPS (Zhang et al. 2018); 0 means equal. Nothing is downloaded.
 
     Args:
-        image: [H, W, 3] rendered.
-        truth: [H, W, 3].
-        backbone: "vgg" (as 3D Gaussian Splatting reports) or "alex".
+        image: [H, W, 3] rendered image.
+        truth: [H, W, 3] ground-truth image.
+        backbone: "vgg", as reported for 3D Gaussian Splatting, or "alex".
 
     Returns:
-        A score without a value if the lpips package or its weights are not installed.
+        Score without a value if the lpips package or its weights are not installed.
 
     Raises:
-        ValueError: the shapes differ, values are not finite, or the backbone is unknown.
+        ValueError: if the shapes differ, if values are not finite, or if the backbone is unknown.
 
     >>> picture = np.full((64, 64, 3), 0.5)
     >>> score = lpips(picture, picture)
@@ -150,7 +153,7 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
     """
     first, second = _pair(image, truth)
     if backbone not in LPIPS_BACKBONES:
-        raise ValueError(f"lpips backbone {backbone!r} must be one of {', '.join(LPIPS_BACKBONES)}")
+        raise ValueError(f"unknown LPIPS backbone {backbone!r}; choose one of {', '.join(LPIPS_BACKBONES)}")
     try:
         torch = importlib.import_module("torch")
         importlib.import_module("torchvision")
@@ -159,7 +162,7 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
         return Score(None, f"{fault.name} is not installed: pip install lpips")
     weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_BACKBONES[backbone]
     if not weights.is_file():
-        return Score(None, f"the weights {weights} are missing and are never downloaded: put them there")
+        return Score(None, f"weights file {weights} not found; copy it there, because it is never downloaded")
     network = _lpips_network(backbone)
     with torch.no_grad():
         tensors = [torch.from_numpy(p.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1 for p in (first, second)]
@@ -182,18 +185,18 @@ def _window_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _pair(image: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if image.shape != truth.shape:
-        raise ValueError(f"the image has shape {image.shape}, the truth {truth.shape}; render at the size of the truth")
+        raise ValueError(f"image has shape {image.shape}, truth {truth.shape}; render at the ground-truth size")
     return _unit(image, "image"), _unit(truth, "truth")
 
 
 def _unit(picture: NDArray[Any], name: str) -> NDArray[np.float64]:
     if picture.ndim != 3 or picture.shape[2] != 3:
-        raise ValueError(f"{name} has shape {picture.shape}; give [H, W, 3]")
+        raise ValueError(f"{name} has shape {picture.shape}; expected [H, W, 3]")
     if picture.dtype == np.uint8:
         return picture / 255.0
     if picture.dtype.kind != "f":
-        raise ValueError(f"{name} is {picture.dtype}; give floats in 0…1, or uint8")
+        raise ValueError(f"{name} has dtype {picture.dtype}; expected floats in 0…1, or uint8")
     if not np.isfinite(picture).all():
-        raise ValueError(f"{name} holds NaN or infinity")
+        raise ValueError(f"{name} contains NaN or infinity")
     unit: NDArray[np.float64] = np.clip(picture.astype(np.float64), 0.0, 1.0)
     return unit

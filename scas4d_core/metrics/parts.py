@@ -1,4 +1,4 @@
-"""Comparison of part labels with ground truth."""
+"""Metric that compares part labels with ground truth."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ def adjusted_rand_index(
 ) -> float:
     """Returns the agreement of two partitions of the foreground pixels, corrected for chance (Hubert and Arabie 1985).
 
-    Stacked pixels of several frames and cameras are pooled, so a part must have the same label in all of them; the
-    label numbers do not matter. A foreground pixel without a rendered part counts with its value in ``labels``, as one
-    more part.
+    Pixels of several frames and cameras can be stacked and are pooled, so a part must have the same label in all of
+    them. The label values themselves do not matter. Foreground pixels without a rendered part are treated as another
+    part, with their value in ``labels``.
 
     Args:
-        labels: [...] integers, rendered.
-        truth: [...] integers of the same shape.
-        foreground: [...] bool, pixels that count; None for those with non-zero truth.
+        labels: [...] integer labels, rendered.
+        truth: [...] integer ground-truth labels, of the same shape.
+        foreground: [...] bool mask of the pixels to compare. If None, all pixels with a non-zero true label are used.
 
     Returns:
-        1 for the same partition, about 0 for random labels.
+        1 for identical partitions, and about 0 for random labels.
 
     Raises:
-        ValueError: the shapes differ, or no pixel is foreground.
+        ValueError: if the shapes differ, or if there are no foreground pixels.
 
     >>> truth = np.array([0, 1, 1, 2, 2])  # the first pixel is background
     >>> adjusted_rand_index(np.array([5, 7, 7, 4, 4]), truth)
     1.0
     """
     if labels.shape != truth.shape:
-        raise ValueError(f"labels have shape {labels.shape}, the truth {truth.shape}; render at the size of the truth")
+        raise ValueError(f"labels have shape {labels.shape}, truth {truth.shape}; render at the ground-truth size")
     counted = truth != 0 if foreground is None else np.asarray(foreground) != 0
     if counted.shape != truth.shape:
-        raise ValueError(f"foreground has shape {counted.shape}; give {truth.shape} like the labels")
+        raise ValueError(f"foreground has shape {counted.shape}; expected {truth.shape} like the labels")
     if not counted.any():
-        raise ValueError("no pixel is foreground: nothing to compare")
+        raise ValueError("there are no foreground pixels to compare")
     return float(adjusted_rand_score(truth[counted].ravel(), labels[counted].ravel()))

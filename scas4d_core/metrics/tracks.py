@@ -1,7 +1,7 @@
-"""Comparison of point tracks with ground truth.
+"""Metrics that compare point tracks with ground truth.
 
-A track without a finite position in a frame (behind the camera, or lost) has an error of one image diagonal in 2D and
-infinity in 3D. The query frame does not count, because its position is given.
+If a track has no finite position in a frame (behind the camera, or lost), its error is one image diagonal in 2D and
+infinity in 3D. The query frame is excluded, because its positions are given.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 ORACLE_RADIUS_PX = 10.0
-"""The paper's radius around the ground-truth point in the first frame (section "Point-Tracking"), in pixels."""
+"""Radius around the ground-truth point in the first frame, in pixels, from the paper (section "Point-Tracking")."""
 
 LOST_PERCENT = 2.0
-"""Median error of a part's points, in percent of the extent, above which the part counts as lost."""
+"""Median error of a part's points, in percent of the extent, above which the part is considered lost."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class TrackError:
     """Track errors in percent of the extent, pooled over points and frames.
 
     Attributes:
-        median: in %; infinity if at least half of the positions are lost.
-        percentile_90: in %; the smallest observed error that 90 % do not exceed.
-        count: number of positions.
+        median: median error in %; infinite if at least half of the positions are lost.
+        percentile_90: 90th percentile in %: the smallest observed error that 90 % of the errors do not exceed.
+        count: number of evaluated positions.
     """
 
     median: float
@@ -44,24 +44,25 @@ def median_trajectory_error(
     *,
     query: int = 0,
 ) -> float:
-    """Returns the 2D MTE without oracle: median pixel error per track, mean over tracks, in % of the diagonal.
+    """Returns the 2D median trajectory error (MTE) in % of the image diagonal.
 
-    The definition follows PointOdyssey (Zheng et al. 2023, ``median_l2``), as in Dynamic 3D Gaussians, without the
-    query frame. The paper (Point-Tracking) normalizes by the image diagonal.
+    It is the median pixel error of each track, averaged over tracks. As in Dynamic 3D Gaussians, the definition follows
+    PointOdyssey (Zheng et al. 2023, ``median_l2``), but excludes the query frame. As in the paper (Point-Tracking), it
+    is normalized by the image diagonal.
 
     Args:
-        tracks: [T, Q, 2] predicted pixels, NaN if lost.
-        truth: [T, Q, 2] pixels.
-        counted: [T, Q] bool: frames in which the point is visible in the camera and counts. Tracks that never count are
-            ignored.
-        diagonal: diagonal of the image, in pixels.
-        query: frame in which the points were given; it does not count.
+        tracks: [T, Q, 2] predicted positions in pixels, NaN if lost.
+        truth: [T, Q, 2] true positions in pixels.
+        counted: [T, Q] bool mask of the positions to evaluate, i.e. those visible in the camera. Tracks without such
+            positions are ignored.
+        diagonal: image diagonal in pixels.
+        query: frame in which the points were given, which is excluded.
 
     Returns:
-        Error in %; NaN if nothing counts.
+        Error in %, or NaN if there are no positions to evaluate.
 
     Raises:
-        ValueError: the shapes differ.
+        ValueError: if the shapes differ.
 
     >>> truth = np.zeros((3, 1, 2))
     >>> tracks = truth + [[[0, 0]], [[3, 4]], [[3, 4]]]
@@ -81,25 +82,25 @@ def oracle_tracks(
     radius: float = ORACLE_RADIUS_PX,
     query: int = 0,
 ) -> NDArray[np.float64]:
-    """Returns the paper's oracle tracks: of the candidates near a point in the query frame, the one with the best
-    track.
+    """Returns oracle tracks as defined in the paper, which follow the best candidate near each point.
 
-    The oracle uses the ground truth. Its error (`median_trajectory_error` of these tracks) is a bound for the centroids
-    and does not measure tracking. Report it together with the error without oracle.
+    Among the candidates near a point in the query frame, the oracle selects the one with the smallest error. Because it
+    uses the ground truth, its error (``median_trajectory_error`` of these tracks) is a bound for the centroids and not
+    a measure of tracking. Report it together with the error without oracle.
 
     Args:
-        candidates: [T, N, 2] pixels of all Gaussian centroids, NaN behind the camera.
-        truth: [T, Q, 2] pixels.
-        counted: [T, Q] bool: frames in which the truth counts.
-        radius: in pixels around the true point in the query frame. If it contains no candidate, the nearest is used
-            (the paper does not specify this case).
+        candidates: [T, N, 2] positions of all Gaussian centroids in pixels, NaN behind the camera.
+        truth: [T, Q, 2] true positions in pixels.
+        counted: [T, Q] bool mask of the positions to evaluate.
+        radius: radius around the true point in the query frame, in pixels. If it contains no candidate, the nearest one
+            is used; the paper does not specify this case.
         query: frame in which candidates are selected.
 
     Returns:
         [T, Q, 2] tracks of the selected candidates.
 
     Raises:
-        ValueError: the shapes do not match, or no candidate is in front of the camera.
+        ValueError: if the shapes do not match, or if no candidate is in front of the camera.
 
     >>> truth = np.zeros((2, 1, 2))
     >>> candidates = np.array([[[1, 0], [2, 0]], [[9, 0], [0, 0]]], float)  # [T, N, 2]
@@ -108,7 +109,7 @@ def oracle_tracks(
            [0., 0.]])
     """
     if candidates.ndim != 3 or candidates.shape[0] != truth.shape[0] or candidates.shape[2] != 2:
-        raise ValueError(f"candidates have shape {candidates.shape}; give [T={truth.shape[0]}, N, 2]")
+        raise ValueError(f"candidates have shape {candidates.shape}; expected [T={truth.shape[0]}, N, 2]")
     present = np.flatnonzero(np.isfinite(candidates[query]).all(axis=-1))
     if len(present) == 0:
         raise ValueError("no candidate is in front of the camera in the query frame")
@@ -133,14 +134,15 @@ def track_error_3d(
     """Returns the 3D track error in % of the extent, pooled over moving points and all frames except the query frame.
 
     Args:
-        tracks: [T, P, 3] predicted, in user units; not finite if lost.
-        truth: [T, P, 3], in user units.
-        moving: [P] bool, points that count: only moving ones, because static points would lower the median.
+        tracks: [T, P, 3] predicted positions in user units, not finite if lost.
+        truth: [T, P, 3] true positions in user units.
+        moving: [P] bool mask of the moving points. Only these are evaluated, because static points would lower the
+            median.
         extent: longest side of the foreground's bounding box, in user units.
-        query: frame in which the points were given; it does not count.
+        query: frame in which the points were given, which is excluded.
 
     Raises:
-        ValueError: the shapes differ, the extent is not positive, or no point moves.
+        ValueError: if the shapes differ, if the extent is not positive, or if no point moves.
 
     >>> truth = np.zeros((3, 4, 3))
     >>> track_error_3d(truth + [0, 0, 0.25], truth, moving=np.ones(4, bool), extent=2.0)
@@ -154,9 +156,9 @@ def track_error_3d(
     frames = np.arange(len(truth)) != query
     pooled = distances[np.ix_(frames, moving)].ravel()
     if pooled.size == 0:
-        raise ValueError("no point moves, or there is only the query frame, so there is nothing to measure")
+        raise ValueError("no point moves, or there is no frame other than the query frame; nothing to evaluate")
     pooled = np.where(np.isfinite(pooled), pooled, np.inf) * (100.0 / extent)
-    # Inverted CDF, because interpolation between two infinities gives NaN.
+    # Use the inverted CDF, because interpolating between two infinities yields NaN.
     ninety = np.quantile(pooled, 0.9, method="inverted_cdf")
     return TrackError(float(np.median(pooled)), float(ninety), int(pooled.size))
 
@@ -164,15 +166,17 @@ def track_error_3d(
 def lost_parts(
     tracks: NDArray[Any], truth: NDArray[Any], part_id: NDArray[Any], moving: NDArray[np.bool_], extent: float
 ) -> list[int]:
-    """Returns the ids of parts that are lost in the last frame: their median error exceeds ``LOST_PERCENT``.
+    """Returns the ids of all parts that are lost in the last frame, with a median error above ``LOST_PERCENT``.
 
     Args:
-        tracks: [T, P, 3] predicted, not finite if lost. truth: [T, P, 3]. Both in user units.
-        part_id: [P], part of each point. moving: [P] bool, points that count.
-        extent: extent in user units.
+        tracks: [T, P, 3] predicted positions in user units, not finite if lost.
+        truth: [T, P, 3] true positions in user units.
+        part_id: [P] part id of each point.
+        moving: [P] bool mask of the points to evaluate.
+        extent: extent of the scene in user units; see ``track_error_3d``.
 
     Raises:
-        ValueError: as in ``track_error_3d``.
+        ValueError: see ``track_error_3d``.
 
     >>> truth = np.zeros((2, 4, 3))
     >>> tracks = truth + np.array([0.1, 0.0, 0.5, 0.4])[:, None]
@@ -196,20 +200,22 @@ def error_by_confidence(
     query: int = 0,
     groups: int = 4,
 ) -> list[float]:
-    """Returns the median 3D error in % of the extent for equal groups of positions, most confident first.
+    """Returns the median 3D error, in % of the extent, of equally sized groups of positions, most confident first.
 
-    The errors increase if the confidence is meaningful. Positions count as in ``track_error_3d``.
+    If the confidence is meaningful, errors increase from group to group. The evaluated positions are those of
+    ``track_error_3d``.
 
     Args:
-        tracks: [T, P, 3] predicted. truth: [T, P, 3]. Both in user units.
-        confidence: [T, P].
-        moving: [P] bool, points that count.
-        extent: extent in user units.
-        query: frame in which the points were given; it does not count.
-        groups: number of groups; the least confident positions that do not fill the groups evenly are ignored.
+        tracks: [T, P, 3] predicted positions in user units.
+        truth: [T, P, 3] true positions in user units.
+        confidence: [T, P] confidence of each predicted position.
+        moving: [P] bool mask of the points to evaluate.
+        extent: extent of the scene in user units; see ``track_error_3d``.
+        query: frame in which the points were given, which is excluded.
+        groups: number of groups. If positions cannot be divided evenly, the least confident ones are ignored.
 
     Raises:
-        ValueError: as in ``track_error_3d``, or the confidence has a different shape.
+        ValueError: if the confidence has a different shape; see also ``track_error_3d``.
 
     >>> truth = np.zeros((2, 4, 3))
     >>> tracks = truth + np.array([1, 2, 3, 4])[:, None] * [1, 0, 0]
@@ -218,7 +224,7 @@ def error_by_confidence(
     [1.5, 3.5]
     """
     if confidence.shape != tracks.shape[:2]:
-        raise ValueError(f"confidence has shape {confidence.shape}; give [T, P] = {tracks.shape[:2]}")
+        raise ValueError(f"confidence has shape {confidence.shape}; expected [T, P] = {tracks.shape[:2]}")
     track_error_3d(tracks, truth, moving, extent, query=query)  # validates the arguments
     chosen = np.ix_(np.arange(len(truth)) != query, moving)
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)[chosen].ravel()
@@ -229,15 +235,15 @@ def error_by_confidence(
 
 
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
-    """Returns the share of correct visibility predictions, 0…1: the occlusion accuracy of TAP-Vid.
+    """Returns the fraction of correct visibility predictions in 0…1, the occlusion accuracy of TAP-Vid.
 
     Args:
-        predicted: [T, Q] bool.
-        truth: [T, Q] bool.
-        query: frame in which the points were given; it does not count.
+        predicted: [T, Q] bool predicted visibility.
+        truth: [T, Q] bool true visibility.
+        query: frame in which the points were given, which is excluded.
 
     Raises:
-        ValueError: the shapes differ.
+        ValueError: if the shapes differ.
 
     >>> truth = np.array([[True, True], [True, False]])
     >>> visibility_accuracy(np.ones((2, 2), bool), truth)  # the query frame does not count
@@ -254,7 +260,7 @@ def _percent_of_diagonal(tracks: NDArray[Any], truth: NDArray[Any], diagonal: fl
     if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 2:
         raise ValueError(f"tracks {tracks.shape} and truth {truth.shape} must both be [T, Q, 2]")
     if not diagonal > 0:
-        raise ValueError(f"diagonal {diagonal!r} must be positive pixels")
+        raise ValueError(f"diagonal {diagonal!r} must be a positive number of pixels")
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)
     percent: NDArray[np.float64] = np.where(np.isfinite(distances), distances, diagonal) * (100.0 / diagonal)
     return percent
@@ -262,13 +268,13 @@ def _percent_of_diagonal(tracks: NDArray[Any], truth: NDArray[Any], diagonal: fl
 
 def _without_query(counted: NDArray[np.bool_], shape: tuple[int, ...], query: int) -> NDArray[np.bool_]:
     if counted.shape != shape:
-        raise ValueError(f"counted has shape {counted.shape}; give [T, Q] = {shape}")
+        raise ValueError(f"counted has shape {counted.shape}; expected [T, Q] = {shape}")
     counts = counted.astype(np.bool_)
     counts[query] = False
     return counts
 
 
 def _medians(errors: NDArray[np.float64], counts: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Returns the median of each column over the rows that count; columns without such rows are left out."""
+    """Returns the median of each column over the selected rows. Columns without selected rows are omitted."""
     columns = [np.median(errors[counts[:, column], column]) for column in np.flatnonzero(counts.any(axis=0))]
     return np.array(columns, dtype=np.float64)

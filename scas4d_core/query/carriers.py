@@ -1,4 +1,4 @@
-"""The Gaussians that carry a point, and the position that they give it. NumPy only."""
+"""Selects the Gaussians that carry a point, and combines their predictions of its position. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -10,30 +10,32 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 WEISZFELD_ROUNDS = 12
-"""Number of iterations of the geometric median; later changes are a small part of the carriers' spread."""
+"""Number of iterations for the geometric median; later changes are a small fraction of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
 """Working memory for the search for carriers, in bytes."""
 ABSENT = -1e9
-"""Logarithm of the opacity of a retired Gaussian, so that it carries no points."""
+"""Log opacity assigned to retired Gaussians, so that they carry no points."""
 MIN_PRESENT_WEIGHT = 0.05
-"""Minimum share of a point's carrier weight that must be present; a few carriers at its edge do not determine it."""
+"""Fraction of a point's carrier weight that must be present; a few distant carriers cannot determine its position."""
 
 
 def carriers(
     gaussians: Gaussians, points: Float, count: int, softening: float
 ) -> tuple[NDArray[np.intp], Float, Float]:
-    """Returns the Gaussians that carry points: those with the largest o·exp(−½ m²), where m is the Mahalanobis
-    distance.
+    """Returns the Gaussians that carry each point: those with the largest o·exp(−½ m²).
+
+    Here, o is the opacity and m the Mahalanobis distance of the point.
 
     Args:
-        gaussians: the state, N Gaussians.
-        points: [Q, 3] metres, in the internal world.
-        count: K, number of Gaussians that carry a point (at most N).
+        gaussians: state of N Gaussians.
+        points: [Q, 3] points in the internal world, in metres.
+        count: number K of Gaussians that carry each point; limited to N.
         softening: softening in metres; m is computed with Σ + softening²·I.
 
     Returns:
-        Rows [Q, K], largest weight first. Weights [Q, K] proportional to o·exp(−½ m²), which sum to 1; far from all
-        Gaussians, only the nearest counts. Opacity 1 − Π(1 − o·exp(−½ m²)) of the K carriers at the point, [Q].
+        Rows [Q, K] of the carriers, largest weight first. Weights [Q, K] proportional to o·exp(−½ m²), which sum to 1;
+        far from all Gaussians, only the nearest counts. Opacity 1 − Π(1 − o·exp(−½ m²)) of the K carriers at each
+        point, [Q].
 
     >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
     >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
@@ -70,8 +72,8 @@ def geometric_median(points: Float, weights: Float) -> Float:
     """Returns the geometric median [Q, 3] of K points by Weiszfeld's iteration.
 
     Args:
-        points: [Q, K, 3].
-        weights: [Q, K], sum 1.
+        points: [Q, K, 3] points.
+        weights: [Q, K] weights; each row sums to 1.
 
     >>> points = np.array([[[0, 0, 0], [0.1, 0, 0], [9, 9, 9]]])
     >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the outlier is ignored
@@ -88,7 +90,7 @@ def geometric_median(points: Float, weights: Float) -> Float:
 
 
 def drop_absent(answers: Float, weights: Float, there: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Returns positions [Q, K, 3] and weights of the present carriers, and [Q] whether enough weight is present."""
+    """Excludes absent carriers; returns positions [Q, K, 3], weights [Q, K], and whether enough weight remains [Q]."""
     if there.all():
         return answers, weights, np.ones(len(answers), np.bool_)
     shares = np.where(there, weights, 0)

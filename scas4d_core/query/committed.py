@@ -21,7 +21,7 @@ from scas4d_core.storage.history import History
 
 
 class CommittedScene:
-    """Queries on a history. Cameras and points are in the user's world; ``index`` None is the newest frame.
+    """Queries on a history. Cameras and points are in the user's world; if ``index`` is None, the newest frame is used.
 
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
@@ -51,13 +51,15 @@ class CommittedScene:
         """Renders a novel view.
 
         Args:
-            camera: camera in the user's world. index: index of a committed frame.
+            camera: camera in the user's world.
+            index: index of a committed frame.
             background: RGB in 0…1; None for the scene's background.
-            labels: [N] part of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest frame are
-                valid for any frame: those of Gaussians added later are ignored.
+            labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest
+                frame are valid for any frame: those of Gaussians added later are ignored.
 
         Raises:
-            HistoryError: the frame was not committed. ValueError: the labels have a wrong shape or range.
+            HistoryError: the frame was not committed.
+            ValueError: the labels have the wrong shape or are out of range.
         """
         gaussians = self._state(index)
         if labels is not None and np.shape(labels) == (self.history.count,):
@@ -92,11 +94,11 @@ class CommittedScene:
         return tracks.with_visibility(camera, self._depth, tolerance)
 
     def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
-        """Returns part labels [N], sorted by size, and −1 for static Gaussians; see ``parts.parts``.
+        """Returns the part label of each Gaussian [N], largest part first, −1 for static ones; see ``parts.parts``.
 
         Args:
             count: number of parts; None to choose it by silhouette score.
-            previous: [N] labels from fewer frames; parts that persist keep their labels.
+            previous: [N] labels computed from fewer frames; parts that persist keep their labels.
         """
         return parts_of_history.parts(self.history, count, previous=previous)
 

@@ -1,4 +1,4 @@
-"""View-dependent colours as spherical harmonics, the format of standard splat files."""
+"""Converts view-dependent colours to spherical harmonics, as used in standard splat files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 COUNT = 16
-"""Number of harmonics up to degree 3, as in the files."""
+"""Number of spherical harmonics up to degree 3, the degree of these files."""
 DIRECTIONS = 100
 """Number of evenly distributed directions for the integration."""
 FAR_M = 1e4
@@ -20,9 +20,9 @@ FAR_M = 1e4
 
 
 def harmonics(gaussians: Gaussians) -> Float:
-    """Returns [N, 16, 3] coefficients of each Gaussian's RGB − 0.5 by viewing direction, in world axes.
+    """Returns the coefficients [N, 16, 3] of each Gaussian's RGB − 0.5 over viewing directions in world axes.
 
-    They are valid for this frame only, because highlights are fixed to the world while objects turn. Degree 3 is too
+    They are valid for this frame only, because highlights are fixed to the world while objects rotate. Degree 3 is too
     coarse for the highlight of a lamp, which becomes wider and dimmer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[0.5, 0.5, 1.0])
@@ -50,7 +50,7 @@ def harmonics(gaussians: Gaussians) -> Float:
 
 
 def basis_of(directions: NDArray[Any]) -> Float:
-    """Returns the [D, 16] harmonics of unit directions [D, 3], with signs and order of 3DGS (Kerbl et al. 2023)."""
+    """Evaluates the harmonics [D, 16] at unit directions [D, 3], in the signs and order of 3DGS (Kerbl et al. 2023)."""
     x, y, z = np.asarray(directions, np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     columns = [

@@ -1,11 +1,12 @@
 """Part segmentation: Gaussians with similar motion, by K-means on positions and material rotations over time.
 
-This is the paper's section "Visualization of Part Segmentation". The feature of Gaussian i is ``[λp·p_i(t), λR·R_i(t),
-λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of the moving Gaussians, so that one set of λ is
-suitable for every scene.
+Implements the section "Visualization of Part Segmentation" of the paper. The feature of Gaussian i is ``[λp·p_i(t),
+λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here, p is in units of the extent of the moving Gaussians, so that one set
+of λ suits every scene.
 
 When parts are computed again after more frames, they keep their labels. The clustering also starts from the previous
-parts and replaces them only by clearly better ones. New labels are matched to previous ones by their overlap.
+parts, and replaces them only if a fresh clustering is clearly better. New labels are matched to previous ones by their
+overlap.
 """
 
 from __future__ import annotations
@@ -27,27 +28,27 @@ Features = NDArray[np.float32]
 NO_PART = -1
 """Label of static Gaussians, which belong to no part."""
 SILHOUETTE_SAMPLE = 1000
-"""Number of Gaussians for choosing the number of parts; the silhouette score needs all pairwise distances."""
+"""Number of Gaussians sampled to choose the number of parts; the silhouette score needs all pairwise distances."""
 ROWS_AT_ONCE = 8192
-"""Number of rows whose features are in memory at once when all Gaussians are labelled."""
+"""Number of Gaussians labelled at a time, to limit the memory for features."""
 
 LAMBDA_POSITION = 0.25
-"""λp, for p over time, with p in units of the extent."""
+"""λp, the weight of p over time, with p in units of the extent."""
 LAMBDA_ROTATION = 1.0
-"""λR, for the entries of R over time; a rotation by angle a changes them by 2.8 sin(a/2). Rotation separates parts;
-position separates only those that rotate alike. A larger position weight would split long parts."""
+"""λR, the weight of the entries of R over time; a rotation by angle a changes them by 2.8 sin(a/2). Rotation separates
+parts; position separates only those that rotate alike. A larger position weight would split long parts."""
 LAMBDA_INITIAL = 0.25
-"""λp0, for p at the first frame, repeated as in the paper."""
+"""λp0, the weight of p at the first frame, which the paper repeats at every frame."""
 MAX_FRAMES = 32
-"""Maximum number of frames in the features, evenly spaced over the history; bounds memory."""
+"""Maximum number of frames in the features, evenly spaced over the history; limits memory use."""
 SAMPLE = 20_000
-"""Maximum number of Gaussians that are clustered; all are labelled."""
+"""Maximum number of Gaussians that are clustered; all are then labelled."""
 MAX_PARTS = 12
-"""Largest number of parts that is tried if none is given."""
+"""Largest number of parts to try if none is given."""
 STAY = 0.05
-"""Relative decrease of inertia by which a new clustering must improve to replace the previous parts."""
+"""Margin by which the inertia of the previous parts must exceed that of a fresh clustering to be replaced by it."""
 STAY_COUNT = 0.02
-"""Advantage in mean silhouette score of the previous number of parts."""
+"""Bonus on the mean silhouette score for keeping the previous number of parts."""
 RESTARTS = 10
 """Number of K-means initializations (n_init); the best result is kept."""
 SEED = 0
@@ -59,21 +60,21 @@ def parts(
     count: int | None = None,
     previous: NDArray[Any] | None = None,
 ) -> NDArray[np.int64]:
-    """Returns part labels of all Gaussians, [N] int64: 0…count−1, largest part first; −1 for static Gaussians.
+    """Returns the part label of each Gaussian, [N] int64: 0…count−1, largest part first; −1 for static Gaussians.
 
-    The newest committed frame decides which Gaussians move. Each Gaussian is weighted by its opacity times the area of
-    its two longest axes, approximately its image area, so that many small Gaussians do not dominate.
+    The newest committed frame determines which Gaussians move. Each Gaussian is weighted by its opacity times the
+    product of its two longest axes, approximately its image area, so that many small Gaussians do not dominate.
 
     Args:
-        history: with at least one committed frame; with a single frame, only positions separate parts.
+        history: history with at least one committed frame; with only one, positions alone separate parts.
         count: number of parts; None for the number from 2 to ``MAX_PARTS`` with the largest mean silhouette score
             (Rousseeuw 1987) on up to 1,000 Gaussians.
         previous: [N] labels from fewer frames with the same ``count`` (or None). Parts that persist then keep their
             labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
 
     Raises:
-        ValueError: nothing is committed or moving, count is below 1 or above the number of moving Gaussians, or
-            ``previous`` has a different number of Gaussians.
+        ValueError: no frame is committed, no Gaussian moves, count is below 1 or above the number of moving Gaussians,
+            or ``previous`` has a different number of Gaussians.
 
     >>> from scas4d_core.storage.history import History
     >>> boxes = np.random.default_rng(0).random((40, 3))
@@ -88,16 +89,16 @@ def parts(
     (1, 1, True)
     """
     if not len(history):
-        raise InputError("the history is empty", "commit a frame before asking for parts")
+        raise InputError("the history is empty", "commit a frame before requesting parts")
     newest = history.gaussians(history.indices[-1])
     rows = np.flatnonzero(newest.moving)
     if rows.size == 0:
         raise InputError(
-            "no Gaussian moves (foreground > 0.5), so there are no parts", "try again when something has moved"
+            "no Gaussian moves (foreground > 0.5), so there are no parts", "try again after something has moved"
         )
     if count is not None and not 1 <= count <= rows.size:
         raise InputError(
-            f"count {count} must be between 1 and the {rows.size} moving Gaussians", "give at most this many"
+            f"count {count} must be between 1 and {rows.size}, the number of moving Gaussians", "change the count"
         )
 
     if previous is not None and previous.shape != (len(newest),):
@@ -126,17 +127,17 @@ def parts(
 
 
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
-    """Renames parts to maximize their overlap with the previous labels (Hungarian method).
+    """Renumbers parts to maximize their overlap with the previous labels (Hungarian method).
 
     A part without overlap, or whose match was assigned to another part, gets the lowest free label.
 
     Args:
         labels: [N] new labels from 0; negative labels belong to no part and are unchanged.
         previous: [N] previous labels.
-        weights: [N] of the Gaussians.
+        weights: [N] weight of each Gaussian.
 
     Returns:
-        [N] labels.
+        The renumbered labels, [N].
 
     >>> previous = np.array([0, 0, 1, 1])
     >>> match_labels(np.array([1, 1, 0, 0]), previous, weights=np.ones(4))  # the same parts with different numbers
@@ -160,10 +161,10 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 
 
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Returns positions [T, M, 3] and material rotations [T, M, 4] of Gaussians at up to ``frames`` evenly spaced
-    frames.
+    """Returns positions [T, M, 3] and material rotations [T, M, 4] of Gaussians over time.
 
-    Frames before a Gaussian was added show it moving with its parent, or static without a parent.
+    At most ``frames`` evenly spaced frames are used. Before a Gaussian was added, it is assumed to move with its
+    parent, or to be static if it has none.
     """
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
@@ -179,7 +180,7 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
 
 
 def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Returns positions [T, M, 3] and rotations [T, M, 4] of Gaussians that move with their ancestors."""
+    """Returns positions [T, M, 3] and rotations [T, M, 4] of Gaussians as if they moved with their ancestors."""
     roots, parents, ancestors = history.roots(), history.parents, rows.copy()
     while (up := parents[ancestors] != NO_PARENT).any():
         ancestors = np.where(up, parents[ancestors], ancestors)
@@ -203,9 +204,9 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
     features are divided by √T, so that distances do not grow with the number of frames.
 
     Args:
-        positions: [T, M, 3] in metres.
-        rotations: [T, M, 4] unit quaternions.
-        extent: extent in metres.
+        positions: [T, M, 3] positions in metres.
+        rotations: [T, M, 4] material rotations as unit quaternions.
+        extent: extent of the moving Gaussians, in metres.
     """
     frames, count = positions.shape[:2]
     p = positions.transpose(1, 0, 2) / extent
@@ -223,7 +224,7 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
 
 
 def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
-    """Returns [N] opacity times the product of the two longest axes, in m²: about the area in an image."""
+    """Returns the opacity times the product of the two longest axes, [N] in m², an estimate of the image area."""
     axes = np.linalg.svd(gaussians.factors.astype(np.float64), compute_uv=False)
     return gaussians.opacities * axes[:, 0] * axes[:, 1]
 
@@ -249,7 +250,7 @@ def _cluster(
 
 
 def _best_count(features: Features, known: int) -> int:
-    """Returns the count with the largest mean silhouette score; the previous count ``known`` is favoured (0: none)."""
+    """Returns the count with the best mean silhouette score, favouring the previous count ``known`` (0 for none)."""
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0
@@ -262,7 +263,7 @@ def _best_count(features: Features, known: int) -> int:
 
 
 def _kmeans(count: int, **given: Any) -> Any:
-    """Returns scikit-learn's K-means; the deferred import takes a second that rendering does not need."""
+    """Returns scikit-learn's K-means; the import takes a second, so it is deferred for callers that only render."""
     from sklearn.cluster import KMeans
 
     return KMeans(n_clusters=count, **{"n_init": RESTARTS, "random_state": SEED, **given})

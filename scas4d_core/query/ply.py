@@ -29,9 +29,9 @@ Float = NDArray[np.float64]
 SH_DEGREE_0 = 0.28209479177387814
 """The constant spherical harmonic 1/(2√π): colour = 0.5 + SH_DEGREE_0 · f_dc."""
 OPACITY_MARGIN = 1e-6
-"""Minimum distance of opacities from 0 and 1, at which the logit is infinite."""
+"""Minimum distance of opacities from 0 and 1, where the logit is infinite."""
 JACOBI_SWEEPS = 12
-"""Sweeps of one-sided Jacobi; it converges quadratically, and a 3×3 matrix takes about five."""
+"""Number of one-sided Jacobi sweeps; convergence is quadratic, and a 3×3 matrix takes about five."""
 ORTHOGONAL = 1e-6
 """Cosine below which two axes count as orthogonal, at the precision of float32 factors."""
 
@@ -42,7 +42,7 @@ _FIELDS = (
 
 
 class PlyError(InputError):
-    """Gaussians that cannot be exported, or an invalid file. The message gives the rows or the path, and the fault."""
+    """Raised if Gaussians cannot be exported or a file is invalid; the message gives the rows or path and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +50,11 @@ class Splats:
     """The Gaussians of a splat file, in the user's world.
 
     Attributes:
-        means: [N, 3] float64.
+        means: [N, 3] float64 centres.
         scales: [N, 3] float64 standard deviations along the axes.
         rotations: [N, 4] float64 unit quaternions (w, x, y, z); the axes are the columns of the rotation matrix.
-        opacities: [N] float64 in (0, 1).
-        colours: [N, 3] float64 RGB.
+        opacities: [N] float64 opacities in (0, 1).
+        colours: [N, 3] float64 RGB colours.
     """
 
     means: Float
@@ -67,7 +67,7 @@ class Splats:
         return len(self.means)
 
     def covariances(self) -> Float:
-        """Returns the [N, 3, 3] covariances Σ in square user units."""
+        """Returns the covariances Σ, [N, 3, 3], in squared user units."""
         axes = Rotation.from_quat(np.roll(self.rotations, -1, axis=1)).as_matrix() * self.scales[:, None, :]
         result: Float = axes @ axes.transpose(0, 2, 1)
         return result
@@ -77,7 +77,9 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     """Writes one frame atomically, without its retired Gaussians.
 
     Args:
-        path: path of the file. gaussians: gaussians in the internal world. world: user to internal transform.
+        path: path of the file.
+        gaussians: state in the internal world.
+        world: transform from the user's world to the internal world.
 
     Raises:
         PlyError: some Gaussians are not finite or have no volume; the message gives their rows and ids.
@@ -113,7 +115,8 @@ def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
     """Reads a splat file; only degree 0 of the spherical harmonics is read.
 
     Args:
-        source: path or open file. name: for error messages; None for the path.
+        source: path or open file.
+        name: name of the file for error messages; None to use the path.
 
     Raises:
         PlyError: the file is not a splat file, or a property is missing.
@@ -166,7 +169,7 @@ def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
     to label the axes of a right-handed frame, the one with the largest trace against the columns of F is used.
 
     Args:
-        factors: [N, 3, 3], full rank.
+        factors: [N, 3, 3] factors F of full rank.
 
     >>> axes, lengths = split_factors(np.diag([3.0, 1.0, 2.0])[None])
     >>> lengths, bool(np.allclose(axes, np.eye(3)))
@@ -231,7 +234,7 @@ def _columns(of: Splats) -> dict[str, Float]:
 def _refuse(gaussians: Gaussians) -> None:
     for name in ("means", "factors", "opacities", "colours"):
         finite = np.isfinite(getattr(gaussians, name))
-        _name_rows(gaussians, ~finite.all(axis=tuple(range(1, finite.ndim))), f"{name} not finite")
+        _name_rows(gaussians, ~finite.all(axis=tuple(range(1, finite.ndim))), f"non-finite {name}")
     volume = np.abs(np.linalg.det(gaussians.factors.astype(np.float64)))
     _name_rows(gaussians, ~(volume > 0), "no volume (an axis of length 0)")
 
@@ -242,5 +245,5 @@ def _name_rows(gaussians: Gaussians, bad: NDArray[np.bool_], fault: str) -> None
         raise PlyError(
             f"{rows.size} Gaussians have {fault}: rows {rows[:5].tolist()}, ids {gaussians.ids[rows[:5]].tolist()}"
             f"{' …' if rows.size > 5 else ''}",
-            "export an earlier frame, or repair them",
+            "export an earlier frame, or fix these Gaussians",
         )

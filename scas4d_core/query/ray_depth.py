@@ -1,8 +1,8 @@
 """Surface depth along single rays, for pixel queries that need more accuracy than rendered depth.
 
 Rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here, each Gaussian absorbs light along the
-ray itself, around the point on the ray closest to its centre, measured in its own metric. The surface is at the depth
-at which half of the absorbed light is lost. At an edge, the mean lies between two surfaces, but this median lies on one
+ray itself, around the point on the ray that is closest to its centre in its own metric. The surface is at the depth by
+which half of the absorbed light has been lost. At an edge, the mean is between two surfaces, but this median is on one
 of them.
 """
 
@@ -21,16 +21,16 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 TILE_PX = 16
-"""Size, in pixels, of the squares in which rays share a search for Gaussians."""
+"""Size in pixels of the square tiles in which rays share a search for Gaussians."""
 RAYS_AT_ONCE = 64
-"""Number of rays that are processed at once; limits working memory to some megabytes."""
+"""Number of rays processed at once; limits working memory to a few megabytes."""
 DEEPEST = 96
-"""Maximum number of Gaussians per ray, those that absorb most; the others have no visible effect."""
+"""Maximum number of Gaussians per ray, those that absorb the most; the others have no visible effect."""
 BISECTIONS = 26
-"""Number of bisections: reduces a bracket of 10 m to less than a micrometre."""
+"""Number of bisection steps; reduces a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
-"""Maximum distance in depth of the absorption from a Gaussian's centre, in standard deviations. For a ray that only
-grazes the rim of a flat Gaussian, the nearest point on the ray can be anywhere."""
+"""Maximum depth difference between a Gaussian's absorption and its centre, in standard deviations. If a ray only grazes
+the rim of a flat Gaussian, the nearest point on the ray can be arbitrarily far away."""
 
 
 def ray_depths(
@@ -43,15 +43,15 @@ def ray_depths(
     """Returns the depth of the surface at continuous pixel positions.
 
     Args:
-        gaussians: a state, N Gaussians in the internal world.
+        gaussians: state of N Gaussians in the internal world.
         camera: camera in the internal world.
-        uv: [Q, 2] pixels; (0.5, 0.5) is the centre of the first pixel.
-        limits: constants of the rasterizer, so that a ray meets what a pixel shows.
-        softening: precision of the surface, added to every axis in quadrature, in metres.
+        uv: [Q, 2] pixel positions; (0.5, 0.5) is the centre of the first pixel.
+        limits: rasterizer constants, so that a ray hits the Gaussians that the rendered pixel shows.
+        softening: uncertainty of the surface in metres, added to every axis in quadrature.
 
     Returns:
-        z [Q] in metres along the camera's axis, NaN if the ray meets nothing; covered [Q] in 0…1, share of light that
-        is lost.
+        Depth z [Q] in metres along the camera's axis, NaN if the ray hits nothing; coverage [Q] in 0…1, the fraction of
+        light that is absorbed.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -125,7 +125,7 @@ class _Splats:
         alpha[after <= limits.transmittance_stop] = 0  # the rasterizer stops before it blends this Gaussian
         covered = 1 - np.prod(1 - alpha, axis=1)
 
-        # Each Gaussian absorbs around the ray point that is nearest in its own metric.
+        # Each Gaussian absorbs around the point on the ray that is nearest to its centre in its own metric.
         most = min(DEEPEST, alpha.shape[1])
         chosen = np.argpartition(-alpha * before, most - 1, axis=1)[:, :most]
         absorbs = -np.log1p(-np.take_along_axis(alpha, chosen, axis=1))

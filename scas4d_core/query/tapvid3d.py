@@ -1,4 +1,4 @@
-"""Exports tracks in the npz format of TAPVid-3D, so that its tools can read them as predictions.
+"""Exports tracks in the npz format of TAPVid-3D, whose tools can then read them as predictions.
 
 Names and axes are those of the benchmark's evaluation (google-deepmind/tapnet,
 ``tapvid3d/evaluation/evaluate_model.py``). Points are in metres, in the axes of one camera (OpenCV: x right, y down, z
@@ -27,17 +27,18 @@ def tapvid3d(
     """Returns the arrays of one file, without images (``images_jpeg_bytes``), which predictions do not need.
 
     Args:
-        positions: [T, Q, 3] in the user's world and units, NaN if unknown.
-        visibility: [T, Q] in the camera.
+        positions: [T, Q, 3] positions in the user's world and units, NaN if unknown.
+        visibility: [T, Q] visibility in the camera.
         camera: camera in the user's world.
-        queried: row of T in which the points were queried; −1 if that frame is not included.
+        queried: index in T of the frame in which the points were queried; −1 if that frame is not included.
         metres_per_unit: metres per user unit.
-        pixels: [Q, 2] queried pixels; None for the projections of the points in that row.
+        pixels: [Q, 2] queried pixels; None for the projections of the points in the queried frame.
 
     Returns:
-        ``tracks_XYZ`` [T, Q, 3] float32, metres in camera axes. ``visibility`` [T, Q] bool. ``queries_xyt`` [Q, 3]
-        float32: u, v (pixel centres at +0.5) and the row of T; u and v are NaN if unknown. ``fx_fy_cx_cy`` [4] float32.
-        ``extrinsics_w2c`` [T, 4, 4] float32: from the user's world in metres to the camera.
+        ``tracks_XYZ`` [T, Q, 3] float32: positions in camera axes, in metres. ``visibility`` [T, Q] bool.
+        ``queries_xyt`` [Q, 3] float32: u, v (pixel centres at +0.5) and the index in T; u and v are NaN if unknown.
+        ``fx_fy_cx_cy`` [4] float32. ``extrinsics_w2c`` [T, 4, 4] float32: transform from the user's world in metres to
+        the camera.
 
     Raises:
         ValueError: the shapes do not match.

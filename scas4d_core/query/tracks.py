@@ -26,24 +26,24 @@ from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
 RenderDepth = Callable[[Camera, int], tuple[NDArray[Any], NDArray[Any]]]
-"""Function of a camera (in the user's world) and a frame that returns z depth [H, W] in user units and alpha [H, W]."""
+"""Renders a frame from a camera in the user's world; returns z depth [H, W] in user units and alpha [H, W]."""
 
 ALPHA_OF_A_SURFACE = 0.5
-"""Minimum coverage of a pixel that shows a surface."""
+"""Minimum alpha of a pixel that counts as showing a surface."""
 CARRIERS = 32
-"""Number of Gaussians that carry a point; with 1, only the nearest. Compared with 1, the median 3D error decreases by 6
-% (cloth) to 25 % (stage)."""
+"""Number of Gaussians that carry a point. Compared with only the nearest, the median 3D error decreases by 6 % (cloth)
+to 25 % (stage)."""
 SOFTENING = 0.01
-"""Added in quadrature to a Gaussian's axes for its distance to a point, as a share of the extent. Gaussians are thinner
-than the uncertainty of the surface, and more carriers average out more noise. Compared with 0.001, the median 3D error
-decreases by 2 % (cloth) to 18 % (stage)."""
+"""Length added in quadrature to a Gaussian's axes when computing its distance to a point, as a fraction of the extent.
+Gaussians are thinner than the uncertainty of the surface, and more carriers average out more noise. Compared with
+0.001, the median 3D error decreases by 2 % (cloth) to 18 % (stage)."""
 RAY_SOFTENING = 0.003
-"""The same for the position of a Gaussian along the ray of a pixel query."""
+"""Like ``SOFTENING``, but for the position of a Gaussian along the ray of a pixel query."""
 AGREEMENT = 0.01
-"""Mean deviation of the carriers from the track, as a share of the extent, that halves the confidence."""
+"""Mean deviation of the carriers from the track that halves the confidence, as a fraction of the extent."""
 DEPTH_TOLERANCE = 0.0075
-"""Depth behind the rendered surface, as a share of the extent, up to which a point counts as visible. The error of the
-rendered depth has about this size."""
+"""Distance behind the rendered surface up to which a point counts as visible, as a fraction of the extent. It is about
+the error of the rendered depth."""
 PIXEL_REACH = 2.0
 """Distance in pixels within which a pixel query that misses a silhouette uses the nearest covered pixel's depth."""
 
@@ -53,15 +53,15 @@ class Tracks:
     """Trajectories of Q points over T frames.
 
     Attributes:
-        positions: [T, Q, 3] float64, in the user's world and units. NaN for a pixel query without a surface, and in
-            frames in which none of the carriers is present (not yet added, or retired).
+        positions: [T, Q, 3] float64 positions in the user's world and units. NaN for a pixel query without a surface,
+            and in frames in which too few of the carriers are present (not yet added, or retired).
         confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²). The numerator is the opacity of
             the carriers at the query point, where m is the Mahalanobis distance. The disagreement s in that frame is
-            the weighted mean distance of the carriers' positions from the track, and a = ``AGREEMENT``. The confidence
-            is 0 for a query without a surface, and if the position is NaN.
-        ids: [Q] int64: the Gaussian with the largest weight; −1 for a pixel query without a surface.
-        indices: [T] int64 frames.
-        visibility: by camera name, [T, Q] bool, for the queried cameras; see ``find_visibility``.
+            the weighted mean distance of the carriers' positions from the track, and a is ``AGREEMENT`` times the
+            extent. The confidence is 0 for a query without a surface, and if the position is NaN.
+        ids: [Q] int64 id of the Gaussian with the largest weight; −1 for a pixel query without a surface.
+        indices: [T] int64 frame indices.
+        visibility: maps the name of each queried camera to the visibility [T, Q] bool; see ``find_visibility``.
     """
 
     positions: Float
@@ -71,7 +71,7 @@ class Tracks:
     visibility: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def pixels(self, camera: Camera) -> Float:
-        """Returns the [T, Q, 2] projections into a camera (user's world) in pixels; NaN behind the camera."""
+        """Projects the tracks into a camera in the user's world; returns pixels [T, Q, 2], NaN behind the camera."""
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
@@ -91,11 +91,11 @@ def tracks_of_points(
     """Tracks 3D points over frames.
 
     Args:
-        history: the committed states.
-        world: user to internal transform.
-        points: [Q, 3] in the user's world at frame ``index``.
-        index: committed frame of the points.
-        indices: committed frames of the tracks, in any order.
+        history: history of committed states.
+        world: transform from the user's world to the internal world.
+        points: [Q, 3] points in the user's world at frame ``index``.
+        index: committed frame in which the points are given.
+        indices: committed frames over which to track the points, in any order.
         count: number of Gaussians that carry a point.
 
     Raises:
@@ -119,7 +119,7 @@ def tracks_of_points(
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise InputError(
-            f"points {bad[:5].tolist()} hold NaN or infinity", "give finite coordinates in the user's units"
+            f"points {bad[:5].tolist()} contain NaN or infinity", "give finite coordinates in the user's units"
         )
     theta = history.gaussians(index)
     extent = moving_extent(theta)
@@ -153,15 +153,15 @@ def tracks_of_pixels(
     """Tracks the surface points at pixels of one frame of a camera, with their visibility in that camera.
 
     Args:
-        history: the committed states.
-        world: user to internal transform.
+        history: history of committed states.
+        world: transform from the user's world to the internal world.
         camera: camera in the user's world.
-        uv: [Q, 2] continuous pixel positions: (0.5, 0.5) is the centre of the first pixel. The depth is from
-            ``ray_depth``. A ray that loses less than half of its light uses the rendered depth of the nearest covered
-            pixel within ``PIXEL_REACH``.
-        index: committed frame of ``uv``.
-        indices: committed frames of the tracks.
-        render_depth: returns rendered depth and alpha.
+        uv: [Q, 2] continuous pixel positions: (0.5, 0.5) is the centre of the first pixel. Their depth is computed by
+            ``ray_depth``. For a ray that loses less than half of its light, the rendered depth of the nearest covered
+            pixel within ``PIXEL_REACH`` is used.
+        index: committed frame in which the pixels are given.
+        indices: committed frames over which to track the points.
+        render_depth: function that returns rendered depth and alpha.
         limits: rasterizer constants that ``render_depth`` uses.
 
     Raises:
@@ -184,7 +184,7 @@ def tracks_of_pixels(
     outside = np.flatnonzero(~((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1))
     if outside.size:
         raise InputError(
-            f"pixel {uv[outside[0]].tolist()} (query {outside[0]}) lies outside the picture of camera {camera.name!r}",
+            f"pixel {uv[outside[0]].tolist()} (query {outside[0]}) is outside the image of camera {camera.name!r}",
             f"give 0 <= u < {camera.width}, 0 <= v < {camera.height}",
         )
     theta = history.gaussians(index)
@@ -212,10 +212,11 @@ def tracks_of_pixels(
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-    """Returns the trajectories of Gaussian means by id; their confidence is 1, or 0 in frames without the Gaussian.
+    """Returns the trajectories of the Gaussians with the given ids; confidence is 1, or 0 in frames without them.
 
     Raises:
-        ValueError: an id is unknown. HistoryError: a frame was not committed.
+        ValueError: an id is unknown.
+        HistoryError: a frame was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
@@ -232,7 +233,7 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
 
 
 def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
-    """Returns the tolerance of ``find_visibility``, user units: ``DEPTH_TOLERANCE`` × extent of moving Gaussians."""
+    """Returns the tolerance for ``find_visibility`` in user units: ``DEPTH_TOLERANCE`` × extent of moving Gaussians."""
     return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
 
 
@@ -241,16 +242,16 @@ def find_visibility(
 ) -> NDArray[np.bool_]:
     """Returns the visibility of points in a camera, [T, Q] bool: in the image, in front of the camera and not occluded.
 
-    A point is occluded if it is more than ``tolerance`` behind the rendered depth, where the farthest of the 3×3 pixels
-    around it counts. Tracks are often off by a pixel, which matters at edges; with true positions this rule is also
-    correct more often. A pixel that is less than half covered does not occlude.
+    A point is occluded if it is more than ``tolerance`` behind the farthest rendered depth in the 3×3 pixels around it.
+    Tracks are often off by a pixel, which matters at edges; this rule is also more often correct for true positions. A
+    pixel that is less than half covered does not occlude.
 
     Args:
-        positions: [T, Q, 3] in the user's world; NaN is never visible.
+        positions: [T, Q, 3] positions in the user's world; NaN is never visible.
         indices: [T] committed frames.
         camera: camera in the user's world.
-        render_depth: returns rendered depth and alpha.
-        tolerance: tolerance in user units.
+        render_depth: function that returns rendered depth and alpha.
+        tolerance: depth tolerance in user units.
     """
     uv, z = camera.project(positions)
     inside = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
@@ -268,7 +269,7 @@ def find_visibility(
 def _covered_near(
     depth: NDArray[Any], alpha: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp], reach: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Finds the nearest covered pixel of each pixel; returns whether it is within reach, its row and its column."""
+    """Finds the nearest covered pixel to each pixel; returns whether it is within reach, its row and its column."""
     covered = (alpha >= ALPHA_OF_A_SURFACE) & np.isfinite(depth)
     if not covered.any():
         return np.zeros(len(row), dtype=np.bool_), row, column

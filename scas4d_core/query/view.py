@@ -27,10 +27,11 @@ class View:
     """A rendered view.
 
     Attributes:
-        colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
-        depth: [H, W] float32, alpha-weighted mean z along the camera's axis, in user units; NaN if less than half of
+        colour: [H, W, 3] float32 RGB over the background, nominally in 0…1.
+        alpha: [H, W] float32 opacity.
+        depth: [H, W] float32 alpha-weighted mean z along the camera's axis, in user units; NaN if less than half of
             the pixel is covered.
-        parts: [H, W] uint8, or None without labels: 0 for no part, otherwise 1 + the label that covers the pixel most.
+        parts: [H, W] uint8: 1 + the label that covers most of the pixel, or 0 for no part. None without labels.
 
     >>> black = np.zeros((2, 2), np.float32)
     >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
@@ -48,7 +49,8 @@ class ViewRenderer:
     """Renders views of states; buffers are reused between views.
 
     Args:
-        world: transform from the user's world to the internal world of the states. limits: limits of the rasterizer.
+        world: transform from the user's world to the internal world of the states.
+        limits: limits of the rasterizer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
@@ -76,12 +78,14 @@ class ViewRenderer:
         """Renders a view of a state.
 
         Args:
-            gaussians: N Gaussians in the internal world. camera: camera in the user's world. background: RGB in 0…1.
-            colours: [N, 3] float32 RGB instead of the state's colours; None for its colours as this camera sees them.
-            labels: [N] part of each Gaussian, −1 for none; required for ``View.parts``.
+            gaussians: state of N Gaussians in the internal world.
+            camera: camera in the user's world.
+            background: background colour, RGB in 0…1.
+            colours: [N, 3] float32 RGB to use instead of the state's colours; None for the colours seen by this camera.
+            labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``.
 
         Raises:
-            ValueError: the labels have a wrong shape or range.
+            ValueError: the labels have the wrong shape or are out of range.
         """
         inside = self.world.camera_to_inside(camera)
         arrays = CameraArrays.of(inside)

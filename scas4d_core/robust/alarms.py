@@ -1,9 +1,9 @@
 """Alarms point out conditions that need attention after a frame. They are raised only here; other modules show them.
 
-They are derived from figures that an update computes anyway. A camera is compared with its own past and with the other
+Alarms are derived from values that an update computes anyway. A camera is compared with its own past and with the other
 cameras of the frame. A change that all cameras see is not attributed to one. Because a single frame may be noise, small
-deviations must persist for two frames. The thresholds follow from the captures; docs/stability.md has the
-distributions.
+deviations must persist for two frames. The thresholds were chosen from measurements on the captures; docs/stability.md
+has the distributions.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
 """Maximum deviation of one colour channel from the other two, relative to the camera's past and the other cameras. The
-values are for two consecutive frames, and for one. Clean captures: 0.03."""
+first value applies to two consecutive frames, the second to a single frame. Clean captures: 0.03."""
 GAIN = (0.15, 0.25)
-"""Maximum common deviation of all channels, likewise. Clean captures: 0.09, for a sheet seen edge-on."""
+"""Maximum common deviation of all channels, as in ``TINT``. Clean captures: 0.09, for a sheet seen edge-on."""
 SPREAD = 4.0
-"""Multiple of the deviation of half of the cameras in this frame to which ``TINT`` and ``GAIN`` are widened. If all
-cameras fit badly, as on small images, colours are unreliable."""
+"""``TINT`` and ``GAIN`` are raised to this multiple of the deviation that half of the cameras do not exceed in a frame.
+If all cameras fit badly, as on small images, colours are unreliable."""
 SHARPNESS = (0.12, 0.2)
-"""Maximum deviation of the log sharpness, likewise. Clean captures: 0.07; a blur of one pixel: 0.42."""
+"""Maximum deviation of the log sharpness, as in ``TINT``. Clean captures: 0.07; a blur of one pixel: 0.42."""
 FOLLOWS = 0.2
 """Rate at which the usual colours and sharpness of a camera follow new values; suspended while they are suspect."""
 ROW = 2
 """Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
-"""Mean channel value, 0…1, below which a channel is not compared."""
+"""Lower bound of a mean channel value, 0…1, when computing relative differences."""
 FLAT = 0.5
 """Minimum mean difference of neighbouring pixels, in levels of 255, for measuring sharpness."""
 ROWS = 64
@@ -49,9 +49,10 @@ class CameraFigures:
     """Figures from which the alarms of one camera are derived.
 
     Attributes:
-        colours: [3] usual ``colours_of`` minus the median over cameras; NaN if unknown. sharp: usual ``sharpness_of``;
-            NaN if unknown.
-        misfit, tint, gain, blur, same: numbers of consecutive suspect frames, or of identical images.
+        colours: [3] usual value of ``colours_of`` minus the median over cameras; NaN if unknown.
+        sharp: usual value of ``sharpness_of``; NaN if unknown.
+        misfit, tint, gain, blur: numbers of consecutive suspect frames.
+        same: number of consecutive frames in which the image was repeated.
     """
 
     colours: tuple[float, float, float] = (nan, nan, nan)
@@ -64,7 +65,7 @@ class CameraFigures:
 
     @classmethod
     def of(cls, past: Past, name: str) -> CameraFigures:
-        """Returns a camera's figures from the row that ``row`` created."""
+        """Returns a camera's figures from a row created by ``row``; the defaults if there is none."""
         row = past.camera_figures.get(name)
         if row is None:
             return cls()
@@ -92,15 +93,20 @@ def alarms_of(
     """Returns the alarms of an update, except those of excluded cameras, and the past with figures for the next frame.
 
     Args:
-        past, after: usual values before and after the frame. outcome, reason, exposure: of the frame.
-        offsets: by camera, dB above (+) or below its usual fit. colours: ``colours_of`` each rendered camera.
-        sharp: ``sharpness_of`` each image of the frame. same: cameras whose image is bit-identical to the previous one.
-            left_out: excluded cameras, which have a separate alarm.
+        past, after: usual values before and after the frame.
+        outcome: outcome of the frame.
+        reason: reason for the outcome.
+        exposure: brightness ratio of the frame to the usual brightness.
+        offsets: offset of each camera above (+) or below its usual fit, in dB.
+        colours: ``colours_of`` for each rendered camera.
+        sharp: ``sharpness_of`` for each image of the frame.
+        same: cameras whose image is bit-identical to the previous one.
+        left_out: excluded cameras, which have a separate alarm.
     """
     count = len(sharp)
     found = _frame_alarms(outcome, reason, exposure, same, count)
     if outcome.rejected or not offsets:
-        return found, after  # there is nothing to compare cameras with
+        return found, after  # there is nothing to compare the cameras with
     watch, raised = dict(after.camera_figures), dict[AlarmKind, dict[str, Alarm]]()
     beside, watches = _minus_median(colours), {name: CameraFigures.of(past, name) for name in sharp}
     changes = {name: value - watches[name].sharp for name, value in sharp.items()}
@@ -138,20 +144,24 @@ def _check_camera(
     """Returns a camera's figures for the next frame, and its alarms.
 
     Args:
-        before: the camera's previous figures. past: of all cameras. offset: in dB; None if not rendered. colours:
-            relative to the other cameras.
-        sharp: of its image. sharper: change from its usual sharpness, relative to the other cameras. same: whether its
-            image is unchanged while those of other cameras are not.
+        name: name of the camera.
+        before: previous figures of the camera.
+        past: usual values of all cameras.
+        offset: offset of the camera from its usual fit, in dB; None if it was not rendered.
+        colours: colours of the camera relative to the other cameras; None if unknown.
+        sharp: sharpness of the image.
+        sharper: change from the usual sharpness, relative to the other cameras.
+        same: whether the image is unchanged while those of other cameras have changed.
         spread: tint and gain deviations that half of the cameras do not exceed.
     """
     now, alarms = replace(before, same=before.same + 1 if same else 0), list[Alarm]()
     if now.same >= ROW:
-        text = f"its picture is the same, bit by bit, for {now.same + 1} frames, and those of the others are not"
+        text = f"its image has been identical for {now.same + 1} frames, while those of other cameras have changed"
         alarms.append(Alarm(AlarmKind.CAMERA_FROZEN, name, text))
     if offset is not None:
         now = replace(now, misfit=before.misfit + 1 if in_doubt(past, offset) else 0)
         if offset < LAST_DB + allowed(past) or now.misfit >= ROW:
-            text = f"its picture fits {-offset:.1f} dB worse than usual beside the others: moved, dirty or late?"
+            text = f"its image fits {-offset:.1f} dB worse than usual relative to the others: moved, dirty or late?"
             alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
     if colours is not None:
         usual = _known(before.colours, colours)
@@ -162,11 +172,11 @@ def _check_camera(
         now = replace(now, gain=before.gain + 1 if abs(gain) > gains[0] else 0)
         if tint > tints[1] or now.tint >= ROW:
             parts = ", ".join(f"{colour} {100 * part:+.0f} %" for colour, part in zip(COLOURS, change, strict=True))
-            text = f"its colours are off, against its past and the others: {parts}; white balance?"
+            text = f"its colours differ from its own past and the other cameras: {parts}; white balance?"
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
         elif abs(gain) > gains[1] or now.gain >= ROW:
             size = f"{100 * abs(gain):.0f} % {'brighter' if gain > 0 else 'darker'}"
-            text = f"its picture is {size} than it should be, against its past and the others: exposure?"
+            text = f"its image is {size} than expected from its own past and the other cameras: exposure?"
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
         if not now.tint and not now.gain:
             red, green, blue = (usual + FOLLOWS * change).tolist()
@@ -175,7 +185,7 @@ def _check_camera(
         now = replace(now, blur=before.blur + 1 if abs(sharper) > SHARPNESS[0] else 0)
         if abs(sharper) > SHARPNESS[1] or now.blur >= ROW:
             how, why = ("sharper", "noise?") if sharper > 0 else ("less sharp", "out of focus?")
-            text = f"its picture is {100 * abs(np.expm1(sharper)):.0f} % {how} than usual beside the others: {why}"
+            text = f"its image is {100 * abs(np.expm1(sharper)):.0f} % {how} than usual relative to the others: {why}"
             alarms.append(Alarm(AlarmKind.CAMERA_SHARPNESS, name, text))
     if np.isnan(before.sharp):
         now = replace(now, sharp=sharp)
@@ -201,7 +211,7 @@ def _known(usual: tuple[float, float, float], now: Numbers) -> Numbers:
 
 
 def _upper_median(sizes: Iterable[float]) -> float:
-    """Returns the size that half of them, rounded up, do not exceed; 0 if there are none."""
+    """Returns the absolute value that half of the values, rounded up, do not exceed; 0 if there are none."""
     ordered = sorted(abs(size) for size in sizes)
     return ordered[(len(ordered) - 1) // 2] if ordered else 0.0
 
@@ -210,11 +220,13 @@ def left_out_alarms(names: Sequence[str], shown: Collection[str], dropped: Mappi
     """Returns the alarms of cameras that were not used for a frame.
 
     Args:
-        names: names of the rig's cameras. shown: those with an image. dropped: excluded, with the reason.
+        names: names of the rig's cameras.
+        shown: names of the cameras with an image.
+        dropped: reason for the exclusion of each excluded camera.
     """
-    reasons = {name: "no picture came" for name in names if name not in shown} | dict(dropped)
+    reasons = {name: "no image was received" for name in names if name not in shown} | dict(dropped)
     return [
-        Alarm(AlarmKind.CAMERA_LEFT_OUT, name, f"left out of this frame: {why}")
+        Alarm(AlarmKind.CAMERA_LEFT_OUT, name, f"not used in this frame: {why}")
         for name, why in sorted(reasons.items())
     ]
 
@@ -223,7 +235,8 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
     """Returns the [3] relative brightness difference between a camera's channels and their rendering.
 
     Args:
-        shift: ``CameraFit.colour_shift``. mean: mean of the camera's image, 0…1.
+        shift: [3] colour shift of the camera, see ``CameraFit.colour_shift``.
+        mean: [3] mean colour of the camera's image, 0…1.
 
     >>> colours_of((0.05, 0.0, -0.02), (0.3, 0.2, 0.18)).round(3).tolist()
     [0.2, 0.0, -0.1]
@@ -234,7 +247,7 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
 
 
 def colours_by_camera(fits: Mapping[str, CameraFit], means: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    """Returns ``colours_of`` each camera with a measured shift and a given image mean."""
+    """Returns ``colours_of`` for each camera with a measured shift and a given image mean."""
     shifts = {name: (fit["colour_shift"], means[name]) for name, fit in fits.items() if name in means}
     return {name: colours_of(shift, mean) for name, (shift, mean) in shifts.items() if shift is not None}
 
@@ -242,8 +255,8 @@ def colours_by_camera(fits: Mapping[str, CameraFit], means: Mapping[str, Numbers
 def sharpness_of(picture: NDArray[np.uint8]) -> float:
     """Returns the log ratio of second to first differences along the rows of an image [H, W, 3].
 
-    The ratio cancels the amount of texture, so objects that move through the image do not affect it; NaN without
-    texture.
+    The ratio cancels the amount of texture, so objects that move through the image do not affect it. Returns NaN for an
+    image without texture.
     """
     rows = picture[:: max(1, len(picture) // ROWS)].astype(np.int16)
     first = np.diff(rows, axis=1)
@@ -257,7 +270,7 @@ def sharpness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
 
 
 def with_first_figures(past: Past, pictures: Mapping[str, NDArray[np.uint8]]) -> Past:
-    """Returns the past after frame 0, with figures of its images for the alarms."""
+    """Returns the past after frame 0, extended by the alarm figures of its images."""
     return replace(
         past, camera_figures={name: CameraFigures(sharp=value).row() for name, value in sharpness(pictures).items()}
     )
@@ -279,7 +292,7 @@ def _frame_alarms(
     if text is not None:
         return [Alarm(AlarmKind.FRAME_REJECTED if outcome.rejected else AlarmKind.FRAME_IN_PART, None, text)]
     if count and len(same) == count:
-        return [Alarm(AlarmKind.FRAME_REPEATED, None, f"all {count} cameras send the same pictures again, bit by bit")]
+        return [Alarm(AlarmKind.FRAME_REPEATED, None, f"all {count} cameras repeat bit-identical images")]
     if exposure != 1.0:
-        return [Alarm(AlarmKind.LIGHT, None, f"the pictures are {exposure:.2g} times as bright as before")]
+        return [Alarm(AlarmKind.LIGHT, None, f"the images are {exposure:.2g} times as bright as before")]
     return []

@@ -1,15 +1,15 @@
 """Checks of a frame's images before they are used, and of the resulting state.
 
-A black frame is finite, and 100 iterations would turn the scene black. Lights flicker, and auto-exposure changes all
-cameras together. If such a change were learnt as colours, it would have to be unlearnt in the next frame. Its gain is
-therefore removed from the images. It is measured relative to the previous scene: the median over pixels is that of the
-many pixels in which only the lighting has changed. A lighting change that persists, or continues from frame to frame
-like a dimming lamp, is treated differently (``solve_frame``). The scene's colours take the gain, and the images are not
-changed.
+A black frame contains no invalid values, but 100 iterations on it would turn the scene black. Lights flicker, and
+auto-exposure changes all cameras together. If such a change were learnt as colours, it would have to be unlearnt in the
+next frame. Its gain is therefore removed from the images. The gain is measured relative to the previous scene, as the
+median over pixels, because in most pixels only the lighting has changed. A lighting change that persists, or continues
+from frame to frame like a dimming lamp, is treated differently (``solve_frame``): the scene's colours are scaled by the
+gain, and the images are unchanged.
 
 A frame may repeat the images of the previous frame: a camera runs at half the rate of its rig, or a waiting rig resends
-its last frame. Nothing is learnt from it, and it does not count as a pause of the motion: the next frame starts from
-the motion before the repeated images.
+its last frame. Nothing is learnt from such a frame, and it does not count as a pause of the motion: the next frame
+starts from the motion before the repeated images.
 
 A state that is not finite, bounded and plausible is never committed. Single faulty Gaussians keep their previous state.
 If there are more than a few of them, the whole attempt has failed.
@@ -35,15 +35,15 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 EXPOSURE = 1.05
-"""Brightness ratio, median over cameras, above which the exposure of a frame differs; clean captures: 1.04."""
+"""Brightness ratio, as the median over cameras, above which the exposure of a frame differs. Clean captures: 1.04."""
 ALIKE = 1.03
 """Maximum ratio between consecutive brightness steps of a light that changes continuously. A lamp that crosses a room
-and dims to a half in ten frames has 1.017; flickering lights have no similar steps."""
+and dims to half its brightness in ten frames has 1.017; flickering lights have no similar steps."""
 ENOUGH = 8
 """Minimum number of cameras for estimating exposure: a turning object changes the brightness of one image by a third.
 """
 UNUSABLE = 2.0
-"""Brightness ratio above which the lighting is too different and nothing is learnt from the frame."""
+"""Brightness ratio above which the lighting is too different to learn from the frame."""
 BLIND = 0.05
 """Share of a camera's usual brightness, relative to the other cameras, below which its image is dark."""
 DARKEST = 1e-3
@@ -54,10 +54,10 @@ DARK = 0.05
 PIXELS = 100
 """Minimum number of usable pixels of a camera, on a grid of every other row and column."""
 SATURATED = 0.99
-"""Channel value, 0…1, from which a pixel is saturated and gives only a lower bound."""
+"""Channel value, 0…1, at which a pixel is saturated and gives only a lower bound of the brightness."""
 
 EVERY = 4
-"""Row and column stride of the pixels in a fingerprint; images of a camera are never identical by chance."""
+"""Row and column stride of the pixels in a fingerprint; two images of a camera are never identical by chance."""
 
 
 def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
@@ -79,14 +79,15 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
     """Compares the brightness of a frame's images with the usual one, before anything is rendered.
 
     Args:
-        past: past of the scene; excluded cameras stay excluded (``outliers.past_after_update``). bright: by camera.
+        past: usual values of the scene; excluded cameras stay excluded (``outliers.past_after_update``).
+        bright: brightness of each camera's image.
 
     Returns:
-        The brightness ratio of the frame, 1 if it is within the usual range. The cameras to exclude, with the reason.
-        The reason why nothing can be learnt from the frame, or None.
+        The brightness ratio of the frame, or 1 if it is within the usual range; the cameras to exclude, with the
+        reasons; and the reason why nothing can be learnt from the frame, or None.
     """
     left_out = {
-        name: "it has not fitted the other cameras since it was left out" for name in bright if past.is_left_out(name)
+        name: "it has not fitted the other cameras since it was excluded" for name in bright if past.is_left_out(name)
     }
     usual = {name: past.brightness.get(name, nan) for name in bright}
     ratios = {name: value / usual[name] for name, value in bright.items() if usual[name] > DARKEST}
@@ -95,10 +96,10 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
     common = float(np.median(list(ratios.values())))
     enough = len(ratios) >= ENOUGH
     if not 1 / UNUSABLE <= common <= UNUSABLE and (enough or common < BLIND or common > 1 / BLIND):
-        return common, left_out, f"the pictures are {common:.2g} times as bright as they were"
+        return common, left_out, f"the images are {common:.2g} times as bright as before"
     for name, ratio in ratios.items():
         if ratio < BLIND * common:
-            left_out[name] = f"it shows nothing: {ratio:.2g} times as bright as it was"
+            left_out[name] = f"its image is dark: {ratio:.2g} times as bright as before"
     if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
         common = 1.0
     return common, unless_most(left_out, len(bright)), None
@@ -117,8 +118,8 @@ def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
 def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
     """Returns true if a lighting change continues at the same rate as in the previous frame, faster than noise.
 
-    In this case the scene's own lighting changes, and the colours follow at once. Flicker returns, and a jump has no
-    previous step.
+    In this case the scene's own lighting changes, and the colours follow at once. Flicker reverses, and a sudden jump
+    has no previous step.
     """
     step = measure_brightness_ratio(past, bright)
     if 1 / EXPOSURE <= step <= EXPOSURE or (step > 1) != (past.brightness_ratio > 1):
@@ -136,7 +137,7 @@ def record_brightness(past: Past, bright: Mapping[str, float]) -> Past:
 
 
 def with_light(past: Past, light: float) -> Past:
-    """Returns the past with the lighting of a frame and the number of consecutive brighter or darker frames."""
+    """Returns the past with a frame's brightness ratio and the number of consecutive brighter or darker frames."""
     if light == 1.0 or not BLIND <= light <= 1 / BLIND:
         return replace(past, light=1.0, light_frames=0)
     same = past.light_frames > 0 and (light > 1) == (past.light > 1)
@@ -153,10 +154,15 @@ def compensate_exposure(
     """Estimates how much brighter than usual a frame is, and removes this gain from its views.
 
     Args:
-        state: Θ_{t−1}, as in the previous frame. views: of the frame. others: further views, not used for the estimate.
+        factory: factory that creates the new views.
+        renderer: renderer for the state.
+        state: previous state Θ_{t−1}.
+        views: views of the frame.
+        others: further views, which are not used for the estimate.
 
     Returns:
-        The gain, and both lists of views without it; 1 and the unchanged views if the gain is within the usual range.
+        The gain, and both lists of views with the gain removed; 1 and the unchanged views if the gain is within the
+        usual range.
     """
     shown = [_shown(renderer, state, view) for view in views]
     gain = _gain(views, shown)
@@ -169,7 +175,7 @@ def compensate_exposure(
 
 
 def measure_light_gain(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
-    """Returns the brightness of a frame relative to a rendering of Θ_{t−1}; None if no camera is usable."""
+    """Returns the brightness of a frame relative to renderings of Θ_{t−1}; None if no camera is usable."""
     return _gain(views, [_shown(renderer, state, view) for view in views])
 
 
@@ -217,7 +223,7 @@ SHRUNK, STRETCHED = 0.1, 10.0
 lengths would drift without limit (docs/stability.md, Long runs). An axis outside the bounds is set to the bound and
 counted."""
 BRIGHTEST = 8.0
-"""Maximum absolute value of a colour; cameras show 0…1, and camera gains extend this range."""
+"""Maximum absolute value of a colour; cameras record 0…1, and camera gains extend this range."""
 FEW = 0.01
 """Maximum share of moving Gaussians that keep their previous state; with more, the update is implausible."""
 
@@ -234,12 +240,15 @@ def check_plausible(
     """Restores the previous state of Gaussians that are not finite, bounded and plausible.
 
     Args:
-        before: Θ_{t−1}. result: of an attempt. rows: [M] rows of the moving Gaussians. radius: of the rig, in metres.
+        before: previous state Θ_{t−1}.
+        result: result of an attempt.
+        rows: [M] rows of the moving Gaussians.
+        radius: radius of the rig, in metres.
         first: [N, 3] ``axis_lengths`` of frame 0; None to limit axes only by ``LONGEST``.
 
     Returns:
-        The result with a state that may be committed, and None; or the result with ``before``, and the fault of its
-        state.
+        The result with a state that may be committed, and None. If the whole state is implausible, the result with the
+        state ``before``, and the reason.
     """
     after = result.gaussians
     bad = np.zeros(len(after), np.bool_)
@@ -270,7 +279,10 @@ def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: A
     """Clamps the axis lengths to their bounds, and returns how many were changed.
 
     Args:
-        squares: [M, 3] squared axis lengths. first: [N, 3] lengths in frame 0.
+        after: state to clamp.
+        rows: [M] rows of the moving Gaussians.
+        squares: [M, 3] squared axis lengths.
+        first: [N, 3] axis lengths in frame 0.
     """
     least, most = np.square(SHRUNK * first[rows]), np.square(STRETCHED * first[rows])
     which, axis = np.nonzero((squares < least) | (squares > most))
@@ -284,13 +296,13 @@ def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: A
 
 
 def _oriented(before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns [M] true if the map between two factors [M, 3, 3] preserves orientation."""
+    """Returns the [M] mask of Gaussians for which the map between two factors [M, 3, 3] preserves orientation."""
     same: NDArray[np.bool_] = ~(np.sign(_det(before)) * np.sign(_det(after)) < 0)
     return same
 
 
 def _det(factors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns [M] determinants of [M, 3, 3]; unscaled, because only the sign is used."""
+    """Returns the [M] determinants of [M, 3, 3] factors; only their sign is used."""
     a, b, c = factors[:, 0], factors[:, 1], factors[:, 2]
     det: NDArray[np.float32] = (a * np.cross(b, c)).sum(axis=1)
     return det
@@ -303,5 +315,5 @@ def _pairs(before: Gaussians, after: Gaussians) -> list[tuple[str, NDArray[np.fl
 
 
 def _like(rows: NDArray[np.bool_], array: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns the rows reshaped to [N, 1, …] for an array [N, …]."""
+    """Returns the mask of rows, reshaped to [N, 1, …] to match an array [N, …]."""
     return rows.reshape(-1, *[1] * (array.ndim - 1))

@@ -1,9 +1,9 @@
-"""The first update of a scene, in several view orders: it has no previous motion, and later updates depend on it.
+"""Runs the first update of a scene in several view orders: it has no previous motion, and later updates depend on it.
 
-The basin in which it ends is a matter of chance. With a bad order it ends 1 to 5 dB below others, and later updates do
-not recover. The orders also differ in their learning rates, because steps that are too large for one scene are too
-small for another. The errors in all training views decide which result is best; a few small images are not sufficient
-(docs/method.md).
+The local minimum in which it ends is a matter of chance. With a bad order it ends 1 to 5 dB below others, and later
+updates do not recover. The orders also differ in their learning rates, because steps that are too large for one scene
+are too small for another. The errors in all training views decide which result is best; a few small images are not
+sufficient (docs/method.md).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scas4d_core.update.result import UpdateResult
 FASTER = (1.0, 2.0, 2.0)
 """Factors on the layers' rates (``UpdateSettings.cold_start_rates``), one for each order that may be tried."""
 AGREE = 0.04
-"""Relative difference of errors below which two orders ended in the same basin, and no third order is tried."""
+"""Relative difference of errors below which two orders count as the same minimum, and no third order is tried."""
 ANOTHER_ORDER = 1_000_003
 """Added to the update's seed for each further order."""
 
@@ -29,8 +29,9 @@ class OrderResult(NamedTuple):
     """The result of one order.
 
     Attributes:
-        result, fault: of the update, and the fault of its state, or None.
-        fits: PSNR in dB of that state by camera; without excluded cameras.
+        result: result of the update.
+        fault: fault of the resulting state, or None.
+        fits: PSNR of that state for each camera that was not excluded, in dB.
     """
 
     result: UpdateResult
@@ -44,7 +45,8 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
     An update that needs no iteration is not repeated.
 
     Args:
-        run: runs the update with a seed and a factor on the layers' rates. seed: seed of the first order.
+        run: function that runs the update with a seed and a factor on the layers' rates.
+        seed: seed of the first order.
     """
     ends: list[OrderResult] = []
     while len(ends) < len(FASTER) and not _agree(errors_of(ends)):

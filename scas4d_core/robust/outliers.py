@@ -1,9 +1,9 @@
 """Outlying cameras and frames: each camera is compared with its own past and with the other cameras of the frame.
 
-The comparison uses figures that an update computes anyway. These are the fit of each camera when it was first and last
-rendered, and the mean brightness of its image (``checks``). A camera that fits much worse than the others is excluded.
-A change that all cameras show is accepted if the frame can be fitted as a whole. The thresholds follow from the
-captures; docs/stability.md has the distributions.
+The comparison uses values that an update computes anyway: the fit of each camera when it was first and last rendered,
+and the mean brightness of its image (``checks``). A camera that fits much worse than the others is excluded.
+A change that all cameras show is accepted if the frame can be fitted as a whole. The thresholds were chosen from
+measurements on the captures; docs/stability.md has the distributions.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 FIRST_DB = -9.0
-"""Offset from a camera's usual level, when first rendered, below which it is excluded at once; clean: -6.1."""
+"""Offset from a camera's usual level, when first rendered, below which it is excluded at once. Clean captures: -6.1."""
 LAST_DB = -5.0
-"""The same when last rendered; excluded from the next frame on. Clean: -3.7; moved by one or two pixels: -6 to -15."""
+"""The same when last rendered; the camera is then excluded from the next frame on. Clean captures: -3.7; camera moved
+by one or two pixels: -6 to -15."""
 NEAR_DB = -4.0
 """Offset below which a camera is suspect. Its usual level is then not updated, so that a lasting fault remains visible;
-two consecutive frames raise an alarm. Clean: -3.7."""
+two consecutive frames raise an alarm. Clean captures: -3.7."""
 FITS_DB = -4.0
-"""Offset above which an excluded camera is accepted again; colours that follow the other cameras do not follow it."""
+"""Offset above which an excluded camera is accepted again; meanwhile, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""
 DROP_DB = 6.0
@@ -34,8 +35,7 @@ DROPS_DB = (14.0, 9.0, 9.0)
 HALVED_DB = 3.0
 """Additional tolerance per halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 cost 3.2."""
 BEHIND_DB = 1.5
-"""The same drop for the first frames after rejected ones, above which the update is continued: objects have moved on.
-"""
+"""Drop above which the update of the first frames after rejected ones is continued, because objects have moved on."""
 RESTS_DB = 3.0
 """Drop up to which a scene without visible motion counts as static; noise that frame 0 fits costs 1 to 2 dB."""
 CATCH_UP = 3
@@ -44,10 +44,10 @@ MAX_OUT = 0.5
 """Maximum share of excluded cameras; if more do not fit, the frame itself has changed."""
 
 CLEAN_DB = 40.0
-"""Upper limit of PSNR values: above it, 5 dB are a thousandth of the value range and do not indicate a fault."""
+"""Upper limit of PSNR values: above it, 5 dB correspond to a thousandth of the value range and indicate no fault."""
 
 ERROR_RISE = 1.02
-"""Maximum ratio by which the usual error of a probe view rises in an update."""
+"""Maximum factor by which the usual error of a probe view rises per update."""
 OTHER_EFFORT = 1.5
 """Ratio of iterations between updates above which the usual level is reset."""
 
@@ -55,7 +55,7 @@ PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """Rates at which a camera's usual level and the overall level follow new values."""
 
 CAMERA_FIGURES, TIMING_FIGURES = 9, 6
-"""Numbers of figures per camera in ``alarms.CameraFigures`` and ``timing.CameraTimingSums``."""
+"""Numbers of values per camera in ``alarms.CameraFigures`` and ``timing.CameraTimingSums``."""
 
 Fault = TypeVar("Fault")
 
@@ -65,20 +65,23 @@ class Past:
     """The usual values of a scene and its cameras; carried from commit to commit.
 
     Attributes:
-        camera_levels: by camera, PSNR in dB of its last rendering minus the level of its frame; NaN if unknown.
-        brightness: by camera, mean of its image, 0…1, at the exposure of frame 0; NaN if unknown.
-        frames_left_out: by camera, number of consecutive frames for which it has been excluded; 0 if it is used.
-        level: PSNR in dB at the end of an update, see ``level_of``; NaN if unknown.
-        updates: number of updates included. rejected: number of consecutive rejected frames with usable images. fitted:
-            time in seconds of the last learnt frame. lagging_frames: number of frames since a rejected or skipped one,
-            0 when the PSNR is back to normal.
-        iterations: iterations of the last update. error: usual error at the end of an update, by probe view.
-        light: brightness ratio of the last frame, see ``checks.check_brightness``. light_frames: number of consecutive
-            brighter, or darker, frames.
-        last_brightness: by camera, mean of its image in the last frame, in any lighting. brightness_ratio: brightness
-            of the last frame relative to the one before it.
-        camera_figures: by camera, figures for alarms, see ``alarms.CameraFigures``.
-        timing: by camera, figures for timing, see ``timing.CameraTimingSums``.
+        camera_levels: usual PSNR of each camera when last rendered, minus the level of its frame, in dB; NaN if
+            unknown.
+        brightness: usual mean of each camera's image, 0…1, at the exposure of frame 0; NaN if unknown.
+        frames_left_out: number of consecutive frames for which each camera has been excluded; 0 if it is used.
+        level: usual PSNR at the end of an update, in dB, see ``level_of``; NaN if unknown.
+        updates: number of updates included in the usual values.
+        rejected: number of consecutive rejected frames with usable images.
+        fitted: time of the last learnt frame, in seconds.
+        lagging_frames: number of frames since a rejected or skipped one; 0 when the PSNR is back to normal.
+        iterations: number of iterations of the last update.
+        error: usual error at the end of an update, for each probe view.
+        light: brightness ratio of the last frame, see ``checks.check_brightness``.
+        light_frames: number of consecutive brighter, or darker, frames.
+        last_brightness: mean of each camera's image in the last frame, in any lighting.
+        brightness_ratio: brightness of the last frame relative to the one before it.
+        camera_figures: figures of each camera for alarms, see ``alarms.CameraFigures``.
+        timing: figures of each camera for its timing, see ``timing.CameraTimingSums``.
     """
 
     camera_levels: Mapping[str, float] = field(default_factory=dict)
@@ -141,7 +144,7 @@ class Past:
         """Creates a past from ``arrays``.
 
         Raises:
-            KeyError, ValueError: arrays are missing or do not match.
+            KeyError, ValueError: if arrays are missing or do not match.
         """
         rows = list(zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True))
         places = {name: place for name, (place, _, _) in rows}
@@ -167,19 +170,19 @@ class Past:
 
 
 def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str, tuple[float, ...]]:
-    """Returns figures by camera."""
+    """Returns the figures of each camera from an array of names and one of rows."""
     return {name: tuple(row) for name, row in zip(arrays[names].tolist(), arrays[rows].tolist(), strict=True)}
 
 
 def past_in_light(past: Past, gain: float) -> Past:
-    """Returns the past with a new usual lighting; errors are larger in brighter light."""
+    """Returns the past with usual values for the new lighting; errors are larger in brighter light."""
     brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
     return replace(past, brightness=brightness, level=level, error={}, light=1.0, light_frames=0)
 
 
 def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
-    """Returns each known camera's offset above (+) or below its usual level relative to the other cameras, in dB."""
+    """Returns the offset of each known camera above (+) or below its usual level among the cameras, in dB."""
     known = {name: value for name, value in _capped(psnr).items() if past.camera_level(name) == past.camera_level(name)}
     if not known:
         return {}
@@ -189,14 +192,16 @@ def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
-    """Returns the cameras that fit much worse than usual, with the reason.
+    """Returns the cameras that fit much worse than usual, with the reasons.
 
     Args:
-        psnr: PSNR in dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
+        past: usual values of the cameras.
+        psnr: PSNR of each camera, in dB.
+        limit: ``FIRST_DB`` or ``LAST_DB``.
     """
     limit += allowed(past)
     outlying = {
-        name: f"its picture fits {-off:.1f} dB worse than usual beside the others"
+        name: f"its image fits {-off:.1f} dB worse than usual relative to the others"
         for name, off in offsets(past, psnr).items()
         if off < limit
     }
@@ -217,8 +222,10 @@ def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) ->
     """Returns why an update has not fitted its frame, or None.
 
     Args:
-        psnr: in dB by camera, when last rendered. iterations: of the update; fewer than in the previous one allow a
-            lower PSNR. 0: the same number.
+        past: usual values before the update.
+        psnr: PSNR of each camera when last rendered, in dB.
+        iterations: number of iterations; a lower PSNR is accepted if there were fewer than in the previous update. 0
+            means the same number.
     """
     if not psnr or past.level != past.level:
         return None
@@ -226,13 +233,13 @@ def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) ->
     drop = DROPS_DB[past.updates] if past.updates < len(DROPS_DB) else DROP_DB
     if level > past.level - drop - _shorter(past, iterations):
         return None
-    return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
+    return f"the state fits the images at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
 
 
 def lag_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
     """Returns why an update after rejected or skipped frames should be continued, or None.
 
-    The arguments are those of ``misfit_reason``.
+    The arguments are the same as for ``misfit_reason``.
     """
     if not (past.rejected or past.lagging_frames) or not psnr or past.level != past.level:
         return None
@@ -253,7 +260,7 @@ def level_of(past: Past, psnr: Mapping[str, float]) -> float:
 
 
 def health(past: Past, off: float) -> float:
-    """Returns 0…1: 1 if a camera fits as usual or better, 0 at the exclusion limit; ``off`` is its offset in dB."""
+    """Returns a camera's health for its offset ``off`` in dB: 1 at or above its usual fit, 0 at the exclusion limit."""
     return float(np.clip(1 - off / (LAST_DB + allowed(past)), 0, 1))
 
 
@@ -268,10 +275,12 @@ def past_after_update(
     """Returns the past after a committed update.
 
     Args:
-        psnr: PSNR in dB by camera: of learnt cameras when last rendered, of excluded ones at the end of the update.
-        bright: of every image of the frame. exposure: of the frame. iterations: of the update; 0: as in the previous
-            one.
-        moved: whether this or an earlier update changed the state; otherwise no update's usual values are known.
+        past: usual values before the update.
+        psnr: PSNR of each camera in dB: of used cameras when last rendered, of excluded ones at the end of the update.
+        bright: brightness of each image of the frame.
+        exposure: brightness ratio of the frame.
+        iterations: number of iterations of the update; 0 means as in the previous update.
+        moved: whether this or an earlier update changed the state; otherwise, no usual values of updates are known.
     """
     psnr = _capped(psnr)
     off = offsets(past, psnr)
@@ -315,9 +324,9 @@ def past_after_update(
 
 
 def usual_errors(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
-    """Returns the usual errors by view: they fall at once and rise slowly.
+    """Returns the usual error of each view: it falls at once and rises slowly.
 
-    Otherwise the large error of a noisy frame would let the next good frame be skipped although it moved.
+    Otherwise, after the large error of a noisy frame, the next good frame would be skipped although objects moved.
     """
     return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}
 
@@ -328,5 +337,5 @@ def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def unless_most(found: dict[str, Fault], count: int) -> dict[str, Fault]:
-    """Returns the faults by camera, or no faults if most of ``count`` cameras have one."""
+    """Returns the faults of the cameras, or none if most of the ``count`` cameras have one."""
     return found if len(found) <= MAX_OUT * count else {}

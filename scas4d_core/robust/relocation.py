@@ -1,8 +1,8 @@
 """Relocates an object after a jump: the update tracks motions up to about the object's size, but no larger ones.
 
-Each camera compares its image with the scene without moving Gaussians; different pixels show the object. The rays
-through the object's centre now, and through the centre of its previous rendering, are intersected. The difference
-between the two points is the displacement. Rotation is left to the update that follows.
+Each image is compared with a rendering of the scene without moving Gaussians; pixels that differ show the object. The
+rays of all cameras through the object's centre are intersected, once for the images and once for renderings of the
+previous state. The difference between the two points is the displacement. The update that follows finds the rotation.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 DIFFERENT = 0.1
 """Channel difference, 0…1, above which a pixel shows the moving object and not the background."""
 SMALLEST_AREA = 0.25
-"""Minimum share of the object's rendered area that a camera must see now; the maximum is its inverse."""
+"""Minimum ratio of the object's area in an image to its rendered area; the maximum is the inverse."""
 CAMERAS = 3
 """Minimum number of such cameras."""
 AGREE = 0.25
@@ -33,7 +33,10 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Ren
     """Returns the [3] displacement of the moving Gaussians in metres; None if the cameras do not agree.
 
     Args:
-        gaussians: Θ_{t−1}. views: of frame t. renderer: renders views. rig: the cameras in the internal world.
+        gaussians: previous state Θ_{t−1}.
+        views: views of frame t.
+        renderer: renderer for the state.
+        rig: cameras in the internal world.
     """
     rows = gaussians.moving
     if not rows.any():
@@ -62,7 +65,7 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Ren
 
 
 def shift_moving(gaussians: Gaussians, shift: Float) -> Gaussians:
-    """Returns the state with its moving Gaussians shifted by [3] metres."""
+    """Returns the state with its moving Gaussians shifted by a vector [3], in metres."""
     means = gaussians.means.copy()
     means[gaussians.moving] += shift.astype(np.float32)
     return gaussians.replace(means=means)

@@ -44,11 +44,11 @@ LADDER = (
     AttemptOptions("smaller steps", rates=0.3, cold=True),
     AttemptOptions("rigid layers only", rates=0.3, rigid=True, freeze_colours=True, cold=True),
 )
-"""Attempts after one whose state is not plausible."""
+"""Options of further attempts, in order, while the resulting state is not plausible."""
 
-SEARCH = AttemptOptions("sought again", cold=True, iteration_factor=5.0)
-"""The search, from the position that silhouettes suggest or from the end of the update. If two of three frames of robot
-are lost, the next one is fitted at 33.5 dB with this factor, and at 32.1 dB with 2."""
+SEARCH = AttemptOptions("longer search", cold=True, iteration_factor=5.0)
+"""Options of a search from the position that silhouettes suggest or from the end of the update. If two of three frames
+of robot are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB with a factor of 2."""
 
 
 Solved = tuple[UpdateResult, Past]
@@ -61,10 +61,13 @@ class FrameSolver:
     """Solves the frames of a scene.
 
     Args:
-        updater: of the scene. factory: creates its views. renderer: has the background and limits of the settings.
+        updater: update of the scene's frames.
+        factory: factory of the scene's training views.
+        renderer: renderer with the background and limits of the settings.
+        settings: update settings.
 
     Attributes:
-        check_seconds: time of the checks outside the updates, in seconds.
+        check_seconds: time spent on checks outside the updates, in seconds.
     """
 
     def __init__(
@@ -77,13 +80,13 @@ class FrameSolver:
         self.check_seconds = 0.0
 
     def run(self, given: UpdateInput) -> Solved:
-        """Solves a frame; if it is rejected, state and motion are those of the input."""
+        """Solves a frame; if it is rejected, the state and the motion are those of the input."""
         result, past = self._solve(given)
         with self._time_checks():
             return self._with_alarms(given, result, past)
 
     def _with_alarms(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
-        """Adds the health of the cameras, the alarms, and the capture times of the images."""
+        """Adds the camera health, the alarms and the camera timing to a result."""
         if self._settings.reject_outliers:
             past = timing.record_timing(
                 past, given.state, result, self._renderer, given.seconds, given.step, given.seed
@@ -131,7 +134,7 @@ class FrameSolver:
             outcome = FrameOutcome.REJECTED_IMPLAUSIBLE
             return self._rejected(given, outcome, result.trace, lost, attempts, fault, exposure)
         if not result.trace.losses:
-            return _skipped(given, result.trace, exposure, "not moved")
+            return _skipped(given, result.trace, exposure, "no motion")
         outcome, reason = FrameOutcome.UPDATED, ""
         if len(attempts) > 1:
             outcome, reason = FrameOutcome.RETRIED, attempts[-2]
@@ -145,7 +148,7 @@ class FrameSolver:
                 outcome = FrameOutcome.REJECTED_MISFIT
                 return self._rejected(given, outcome, result.trace, lost, attempts, why, exposure)
             else:
-                reason = f"{why}, for {settings.max_rejected_frames} frames: taken as it is from here on"
+                reason = f"{why}, for {settings.max_rejected_frames} frames: accepted as the new normal"
                 outcome = FrameOutcome.ACCEPTED
                 given = replace(given, past=replace(given.past, level=nan, updates=0))
         elif outcome is FrameOutcome.UPDATED and (why := self._lag_reason(given, result)) is not None:
@@ -155,35 +158,35 @@ class FrameSolver:
         return self._accepted(given, result)
 
     def _scene_is_static(self, given: UpdateInput) -> str | None:
-        """Returns why no update is needed, according to the images only, or None."""
+        """Returns why the images show that no update is needed, or None."""
         if given.same and len(given.same) == len(given.brightness):
-            return "the same pictures again"
-        if not given.may_be_static or given.past.updates > 0:  # only a scene that was never updated can rest at frame 0
+            return "repeated images"
+        if not given.may_be_static or given.past.updates > 0:  # only a scene without any update can still be at frame 0
             return None
-        with self._time_checks():  # motion that most cameras do not confirm is possible
+        with self._time_checks():  # there may be motion that most cameras do not confirm
             fits = self._psnr_by_camera(given.views, given.state)
             level = outliers.level_of(given.past, fits)
-        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update will show the fault of the camera
+        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update will show what is wrong with the camera
             return None
-        return "nothing is seen to move" if level > given.past.level - outliers.RESTS_DB else None
+        return "no motion detected" if level > given.past.level - outliers.RESTS_DB else None
 
     def _retry_with_light_gain(self, given: UpdateInput) -> Solved | None:
-        """Solves a frame with persistent or continuing lighting by scaling the colours; None if no gain is measured.
+        """Solves a frame in lastingly changed lighting by scaling the colours; None if no gain is measured.
 
-        If the scene is as bright as before, a new object makes the images brighter, which is no reason to reject them.
+        If the lighting is unchanged, a new object makes the images brighter, which is no reason to reject them.
         """
         gain = measure_light_gain(self._renderer, given.state, given.views)
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
         if gain is None or (same and given.unusable is None):
             return None
-        gain, light = (1.0, "the same light") if same else (gain, f"{gain:.2g} times the light")
+        gain, light = (1.0, "unchanged lighting") if same else (gain, f"{gain:.2g} times the lighting")
         state, past = with_light_gain(given.state, gain), outliers.past_in_light(given.past, gain)
         in_light = replace(given, state=state, past=past, exposure=1.0, light_moves=False, unusable=None)
         result, past = self._solve(in_light)
         if not result.outcome.rejected:
-            return replace(result, attempts=[f"{light}, for good", *result.attempts]), past
+            return replace(result, attempts=[f"{light}, permanently", *result.attempts]), past
         lost = replace(given.past, rejected=given.past.rejected + 1)
-        why = f"in {light} {result.reason}"
+        why = f"with {light}, {result.reason}"
         return self._rejected(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
 
     def _attempt(self, given: UpdateInput, template: AttemptOptions, attempts: list[str]) -> Validated:
@@ -203,8 +206,8 @@ class FrameSolver:
     def _is_first_motion(self, given: UpdateInput, template: AttemptOptions) -> bool:
         """Returns true for the first motion of a scene, if its update may take longer and has no time limit.
 
-        A scene that resumes without its carry-over has no usual values for its cameras. After rejected frames, a longer
-        search has already been made.
+        A scene that resumes without its carry-over does not count: it has no usual values for its cameras. Nor does a
+        scene after rejected frames, for which a longer search has already been made.
         """
         first = (
             given.motion is None
@@ -266,7 +269,7 @@ class FrameSolver:
         )
 
     def _attempt_deadline(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
-        """Returns the deadline of an attempt; after rejected frames, half of the time is reserved for a search."""
+        """Returns the deadline of an attempt; after rejected frames, half of the time left is reserved for a search."""
         now = perf_counter()
         return (now + end) / 2 if given.past.rejected and template is AS_CONFIGURED and now < end else end
 
@@ -282,26 +285,27 @@ class FrameSolver:
         return outliers.lag_reason(given.past, result.trace.met, len(result.trace.losses))
 
     def _budget_is_spent(self, given: UpdateInput, more: int = 0) -> bool:
-        """Returns true if the budget has no time for another attempt after ``more`` iterations."""
+        """Returns true if the time budget has no room for another attempt after ``more`` iterations."""
         return given.end is not None and perf_counter() + (PROBE + more) * (given.iteration_seconds or 0.0) > given.end
 
     def _search(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult | None:
         """Runs longer attempts from the position that silhouettes suggest, and from the end of ``tried``.
 
-        The end is the validated one, because non-finite Gaussians cannot recover. Returns None if all attempts fail.
+        The end of ``tried`` has been validated, because non-finite Gaussians cannot recover. Returns None if all
+        attempts fail.
         """
         if self._budget_is_spent(given, len(given.views)):
-            attempts.append("not sought: the budget is spent")
+            attempts.append("no search: the budget is spent")
             return None
         ended = _with_colours_of(tried.gaussians, given.state)
-        starts = [("sought from where the update ended", ended)]
+        starts = [("search from the end of the update", ended)]
         jump = find_jump(given.state, given.views, self._renderer, self._rig)
         if jump is not None:
             length = float(np.linalg.norm(jump))
-            starts.insert(0, (f"sought {length:.2f} m away", shift_moving(given.state, jump)))
+            starts.insert(0, (f"search {length:.2f} m away", shift_moving(given.state, jump)))
         for name, start in starts:
             if self._budget_is_spent(given):
-                attempts.append(f"not {name}: the budget is spent")
+                attempts.append(f"no {name}: the budget is spent")
                 break
             options = self._options(given, replace(SEARCH, name=name))
             result = self._run(given, start, None, options)
@@ -316,7 +320,7 @@ class FrameSolver:
 
     def _continue_update(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
         """Continues an update from its end with more iterations; returns the better of both results."""
-        options = self._options(given, replace(SEARCH, name="on from where the update ended"))
+        options = self._options(given, replace(SEARCH, name="continued from the end of the update"))
         result = self._run(given, _with_colours_of(tried.gaussians, given.state), None, options)
         result, fault = self._check_plausible(given, given.state, result)
         after, before = (outliers.level_of(given.past, one.trace.met) for one in (result, tried))
@@ -333,7 +337,7 @@ class FrameSolver:
         reason: str,
         exposure: float,
     ) -> Solved:
-        """Returns the result of a rejected frame: state and motion are unchanged."""
+        """Returns the result of a rejected frame, with the state and the motion unchanged."""
         result = UpdateResult(
             given.state, given.motion, replace(trace, kept=Candidate.PREVIOUS), outcome=outcome, reason=reason,
             attempts=attempts, exposure=exposure, offsets=outliers.offsets(past, trace.fits), carried=given.carried,
@@ -343,7 +347,7 @@ class FrameSolver:
     def _accepted(self, given: UpdateInput, result: UpdateResult) -> Solved:
         trace, psnr = result.trace, result.trace.fits
         with self._time_checks():
-            # In short updates, a camera may have been rendered long before the end, so misfits are checked again.
+            # In short updates, a camera may have been last rendered long before the end, so misfits are checked again.
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
             again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._psnr_by_camera([*again, *given.suspects], result.gaussians)
@@ -362,9 +366,7 @@ class FrameSolver:
             return committed_errors(self._factory.rig, self._renderer, views, state)
 
     def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
-        """Returns each camera's PSNR in dB for a state, also for excluded cameras, which are accepted again when they
-        fit.
-        """
+        """Returns the PSNR of each view for a state, in dB; excluded cameras that fit well are accepted again."""
         return {view.name: self._renderer.compare(state, view).psnr for view in views}
 
 
@@ -377,7 +379,7 @@ def _skipped(given: UpdateInput, trace: UpdateTrace, exposure: float, reason: st
     """Returns the unchanged Θ_{t−1}; nothing was rendered, so the usual values do not change."""
     past = replace(
         given.past, rejected=0, lagging_frames=max(1, given.past.lagging_frames)
-    )  # motion may continue from here, or from further away
+    )  # the motion may continue from here or from farther away
     outcome = FrameOutcome.UNCHANGED
     result = UpdateResult(
         given.state, given.motion, trace, outcome=outcome, attempts=[reason], exposure=exposure, carried=given.carried

@@ -1,11 +1,10 @@
-"""Timing of the cameras: without genlock, images are captured up to half a frame before or after those of other
-cameras.
+"""Camera timing: without genlock, cameras capture images up to half a frame before or after the other cameras.
 
 After an update, a few cameras are measured, different ones in each frame. Moving Gaussians move from Θ_{t−1} to Θ_t
 within a frame. Renderings extrapolated forward and backward by half of this motion predict images of other times. They
 explain the residual of the image relative to Θ_t, and the fraction of the motion that fits best is the capture time.
-Measurements of a camera are averaged with exponential forgetting. An offset that all cameras share is delayed tracking,
-so the median over cameras is defined as 0. Nothing is corrected: no state depends on these figures.
+Measurements of a camera are averaged with exponential forgetting. An offset that all cameras share is a tracking lag,
+so the median over cameras is defined as 0. Nothing is corrected: no state depends on these values.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.update.result import UpdateResult
 
 LOOKS, ITERATIONS = 4, 25
-"""Maximum number of measured cameras per frame, and iterations of the update per measured camera; each needs two
-renderings.
+"""Maximum number of measured cameras per frame, and number of iterations of the update per measured camera; each camera
+needs two renderings.
 """
 HALF = 0.5
 """Fraction of a frame's motion by which moving Gaussians are extrapolated; larger offsets are not expected."""
@@ -38,29 +37,29 @@ BRIGHT = 0.98
 FEW, MOST = 50, 1500
 """Minimum and approximate maximum number of changing pixels that are used."""
 CAUCHY, QUIETEST = 2.4, 1 / 255
-"""As in ``effects.cameras.alignment``: large residuals have less weight, and the lower bound is quantization noise."""
+"""As in ``effects.cameras.alignment``: large residuals get less weight, and the lower bound is quantization noise."""
 SMALLEST = 1e-6
 """Regularization of possibly singular equations, relative to the square of each unknown."""
 NEIGHBOURS = 10.0
 """Approximate number of pixels with correlated errors, by which variances are increased."""
 USUAL = 0.1
-"""Variation of a camera's measurements for fast motion, in frames, because of tracking delay and curved motion."""
+"""Variation of a camera's measurements in fast motion, in frames, because of tracking lag and curved motion."""
 FARTHEST = 0.75
-"""Maximum offset of a measurement, in frames: motion that reverses has no measurable shift."""
+"""Limit to which a measured offset is clamped, in frames: motion that reverses has no measurable shift."""
 KEEPS = 0.95
-"""Weight of previous measurements at each new one; about the last forty count."""
+"""Factor on the weight of earlier measurements at each new one; effectively, the last forty count."""
 ENOUGH = 2.5
-"""Minimum number of equally weighted measurements for a known mean."""
+"""Minimum effective number of measurements for a known mean."""
 CAMERAS = 4
-"""Minimum number of known cameras for a median; with fewer, the one that is off cannot be identified."""
+"""Minimum number of cameras with known means for a median; with fewer, the one that is off cannot be identified."""
 APART = 0.02
 """Difference between the means of synchronized cameras on captures, in frames, as far as measurable; added to each
-error."""
+standard error in quadrature."""
 MAX_ERROR = 0.1
-"""Maximum error of a reported mean, in frames."""
+"""Maximum standard error of a reported mean, in frames."""
 OFF, SURE = 0.15, 4.0
-"""Minimum offset in frames, and in multiples of its error, of a camera that is out of step; clean: 0.05. See
-docs/calibration.md.
+"""Minimum offset of a camera that is out of step, in frames and in multiples of its standard error. Clean captures:
+0.05. See docs/calibration.md.
 """
 
 Array = NDArray[np.float32]
@@ -79,9 +78,12 @@ class CameraTimingSums:
     """The measurements of one camera as sums with exponential forgetting.
 
     Attributes:
-        weight, squares: sum of weights, and of squared weights. offset, spread: weighted sums of the seconds after the
-            state, and of their squares. frame: weighted sum of frame durations in seconds. last: index of the last
-            measured frame.
+        weight: sum of weights.
+        squares: sum of squared weights.
+        offset: weighted sum of the offsets after the state, in seconds.
+        spread: weighted sum of the squared offsets.
+        frame: weighted sum of frame durations, in seconds.
+        last: index of the last frame in which the camera was measured.
     """
 
     weight: float = 0.0
@@ -95,7 +97,9 @@ class CameraTimingSums:
         """Returns the sums with one more measurement.
 
         Args:
-            look: the measurement. way: seconds from Θ_{t−1} to Θ_t. frame: seconds since the previous frame.
+            look: the new measurement.
+            way: time from Θ_{t−1} to Θ_t, in seconds.
+            frame: time since the previous frame, in seconds.
         """
         weight = 1 / (NEIGHBOURS * look.variance + USUAL**2)
         seconds = way * min(FARTHEST, max(-FARTHEST, look.offset))
@@ -135,8 +139,13 @@ def record_timing(
     or any frame on a GPU, which keeps no renderings. Excluded cameras are not measured.
 
     Args:
-        past: after the frame. before: Θ_{t−1}. result: Θ_t, before Gaussians are added. renderer: renders views.
-        way: seconds between the two states. frame: seconds since the previous frame. index: index of the frame.
+        past: usual values after the frame.
+        before: previous state Θ_{t−1}.
+        result: result with Θ_t, before Gaussians are added.
+        renderer: renderer for the states.
+        way: time between the two states, in seconds.
+        frame: time since the previous frame, in seconds.
+        index: index of the frame.
     """
     trace, after = result.trace, result.gaussians
     plain = result.outcome is FrameOutcome.UPDATED and len(result.attempts) == 1 and result.exposure == 1.0
@@ -145,11 +154,11 @@ def record_timing(
     looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     views = [one for one in result.views if one.name in trace.shown and one.name not in trace.left_out]
     views = [one for one in views if not past.is_left_out(one.name)]
-    views.sort(key=lambda one: looks.get(one.name, CameraTimingSums()).last)  # longest not measured first, in rig order
+    views.sort(key=lambda one: looks.get(one.name, CameraTimingSums()).last)  # least recently measured first
     (ahead, back), most = half_frame_states(before, after), max(1, min(LOOKS, trace.iterations // ITERATIONS))
     for view in views[:most]:
         every, planes = trace.shown[view.name]
-        # otherwise the rendering of the end exists
+        # if the end was kept, its rendering exists already
         states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)
         here, there, *now = (_rendered(renderer, state, view)[:, ::every, ::every].copy() for state in states)
         shown = now[0] if now else planes[:3]
@@ -195,7 +204,9 @@ def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Pic
     and on a global gain and offset.
 
     Args:
-        target: [3, H, W] image. shown, ahead, back: renderings of Θ_t, and of half a frame forward and backward.
+        target: [3, H, W] image.
+        shown: [3, H, W] rendering of Θ_t.
+        ahead, back: [3, H, W] renderings of Θ_t extrapolated by half a frame forward and backward.
     """
     change = np.maximum(np.abs(ahead - shown), np.abs(shown - back)).max(axis=0)
     pixels = np.flatnonzero((change > STEEP) & (target.max(axis=0) < BRIGHT))
@@ -216,11 +227,11 @@ def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Pic
     variance = float(weights @ np.square(left) / weights.sum() * inverse[0, 0])
     return PictureTiming(
         float(numbers[0] / min(2.0, max(0.5, 1 + numbers[2]))), variance
-    )  # the change is scaled by the gain too
+    )  # the gain scales the change as well
 
 
 def timings(past: Past) -> dict[str, CameraTiming]:
-    """Returns each camera's relative capture time, if it is known with sufficient accuracy."""
+    """Returns the relative capture time of each camera for which it is known accurately enough."""
     looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     known = {name: one for name, one in looks.items() if one.count >= ENOUGH and one.error <= MAX_ERROR}
     if len(known) < CAMERAS:

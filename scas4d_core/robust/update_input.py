@@ -23,17 +23,26 @@ class UpdateInput:
     """The input of the update of one frame.
 
     Attributes:
-        state: Θ_{t−1}. motion: latest motion, or None. seconds: since the last learnt frame. step: since the previous
-            frame.
-        views: views of the frame, to learn from. suspects: views of excluded cameras. seed: seed of the update.
-        brightness: mean of each camera's image. past: the usual values. carried: arrays of the effects.
+        state: previous state Θ_{t−1}.
+        motion: latest motion, or None.
+        seconds: time since the last learnt frame, in seconds.
+        step: time since the previous frame, in seconds.
+        views: training views used for the update.
+        suspects: views of excluded cameras.
+        brightness: mean of each camera's image.
+        seed: seed of the update.
+        past: usual values of the scene and its cameras.
         lengths: [N, 3] axis lengths in frame 0, in metres.
-        exposure, left_out, unusable: from the image brightness, see ``checks.check_brightness``.
+        exposure: brightness ratio of the frame, see ``checks.check_brightness``.
         light_moves: whether the lighting change continues from frame to frame, see ``checks.light_continues``.
         may_be_static: whether the images have shown no motion yet, in scenes that learn labels from motion.
-        same: cameras whose image equals that of the last accepted frame. sharp: ``alarms.sharpness`` of each camera.
-        left_out: cameras excluded before the update, with the reason.
-        end: time by which the last iteration must end. iteration_seconds: seconds per iteration in previous updates.
+        same: cameras whose image equals that of the last accepted frame.
+        sharp: ``alarms.sharpness`` of each camera.
+        left_out: reason for each camera excluded before the update.
+        unusable: reason why nothing can be learnt from the frame, or None.
+        carried: arrays carried over by the effects, keyed by effect name.
+        end: ``perf_counter`` value by which the last iteration must end; no limit if None.
+        iteration_seconds: time per iteration in previous updates, in seconds; None if unknown.
     """
 
     state: Gaussians

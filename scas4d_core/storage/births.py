@@ -1,7 +1,7 @@
 """Births, retirements and revivals of Gaussians: the event log, lifetimes, and roots of newborn Gaussians.
 
-Each frame's file contains the log of all frames up to it, so the log survives when retention deletes files. Each birth
-has its own file, which all later frames need. Needs only numpy.
+The file of each frame contains the log of all frames up to it, so the log survives when retention deletes files. Each
+birth has its own file, which all later frames need. Needs only numpy.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scas4d_core.gaussians import Gaussians, quaternion_products, quaternions_to
 Int = NDArray[np.int64]
 
 COLUMNS = 4
-"""Columns of the log: frame, kind, first id, last id."""
+"""Number of columns of the log: frame, kind, first id and last id."""
 NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
 NO_PARENT = -1
 """Parent of a Gaussian that starts its own structure."""
@@ -40,9 +40,9 @@ class Life:
     Attributes:
         id: id of the Gaussian.
         born: frame of its birth; for initial Gaussians, the first frame.
-        retired, revived: increasing frames of its retirements and revivals. It is present from its birth or a revival
-            until
-            the next retirement.
+        retired: frames in which it was retired, in increasing order. It is present from its birth, or from a revival,
+            until the next retirement.
+        revived: frames in which it was revived, in increasing order.
     """
 
     id: int
@@ -52,13 +52,13 @@ class Life:
 
 
 def events_of(index: int, kind: Event, rows: NDArray[np.intp], ids: Int) -> Int:
-    """Returns the log [E, 4] of one kind of event in a frame; runs of consecutive rows and ids share one log row.
+    """Returns log rows [E, 4] for one kind of event in a frame; runs of consecutive rows and ids share one log row.
 
     Args:
         index: frame of the events.
         kind: kind of the events.
-        rows: rows of the Gaussians, in increasing order.
-        ids: [N] ids of all Gaussians, by row.
+        rows: rows of the affected Gaussians, in increasing order.
+        ids: [N] id of the Gaussian in each row.
 
     >>> events_of(5, Event.RETIRED, np.array([0, 1, 3]), ids=np.array([3, 4, 5, 7])).tolist()
     [[5, 1, 3, 4], [5, 1, 7, 7]]
@@ -80,8 +80,8 @@ def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
     """Returns which Gaussians [N] are retired at the end of a log.
 
     Args:
-        events: the log.
-        ids: [N] ids of all Gaussians, by row; the Gaussians of one event are in consecutive rows.
+        events: event log.
+        ids: [N] id of the Gaussian in each row; the Gaussians of one event are in consecutive rows.
 
     >>> events = np.array([[5, 1, 3, 4], [6, 2, 4, 4]])
     >>> retired_after(events, np.array([2, 3, 4]))
@@ -100,9 +100,9 @@ def revived_in(events: Int, index: int, ids: Int) -> Int:
     """Returns the rows of the Gaussians that were revived in a frame.
 
     Args:
-        events: the log.
-        index: the frame.
-        ids: [N] ids of all Gaussians, by row.
+        events: event log.
+        index: index of the frame.
+        ids: [N] id of the Gaussian in each row.
 
     >>> revived_in(np.array([[5, 1, 3, 4], [6, 2, 4, 4]]), 6, np.array([2, 3, 4]))
     array([2])
@@ -113,7 +113,7 @@ def revived_in(events: Int, index: int, ids: Int) -> Int:
 
 
 def rows_among(ids: Int, wanted: Int) -> Int:
-    """Returns the row of each wanted id, [Q], or −1 if there is none.
+    """Returns the row of each wanted id [Q], or −1 for unknown ids.
 
     >>> rows_among(np.array([7, 3, 5]), np.array([5, 4, 7]))
     array([ 2, -1,  0])
@@ -129,9 +129,9 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
     """Returns the lifetimes of the wanted Gaussians according to a log.
 
     Args:
-        events: the log.
+        events: event log.
         wanted: ids of the Gaussians.
-        first: the first frame, which is the birth frame of Gaussians without a birth event.
+        first: first frame, in which Gaussians without a birth event were born.
     """
     lives = []
     for id in wanted:
@@ -142,7 +142,7 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
 
 
 def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gaussians:
-    """Returns the roots of a state: Θ_0, extended by newborn Gaussians at the positions they would have had in it.
+    """Returns the roots of a state: Θ_0, plus newborn Gaussians at the positions that they would have had in it.
 
     Clusters and neighbours are computed from the roots. A newborn Gaussian is moved back by the inverse rigid motion of
     its parent; one without a parent keeps its position at birth.
@@ -150,7 +150,7 @@ def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gau
     Args:
         roots: [N] roots before this frame.
         state: [N + B] state after this frame.
-        parents: [B] rows of the parents; None if no newborn has one.
+        parents: [B] row of each newborn Gaussian's parent; None if no newborn Gaussian has a parent.
     """
     count, born = len(roots), state.rows(np.arange(len(roots), len(state)))
     if len(born):

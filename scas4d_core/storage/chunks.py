@@ -1,4 +1,4 @@
-"""Chunks: compact files in a history's folder, each with a run of older frames. Needs numpy and zstandard.
+"""Chunks: compact files in the folder of a history, each with a series of older frames. Needs numpy and zstandard.
 
 ``states_<index>.s4d`` starts with the frame of that index. A frame is in a chunk once the record of its state is
 complete; the note before it contains the frame's report. If a frame also has its own file, that file takes precedence.
@@ -30,23 +30,23 @@ from scas4d_core.storage.npz import open_atomically
 REPORT = "report"
 """Key of the report in a frame's note."""
 READERS = 2
-"""Number of chunks that stay open per process, each with a cached state: tracks read sequentially, views jump."""
+"""Number of chunks that each process keeps open with a cached state, for sequential tracks and for random views."""
 _CHUNK_FILE = re.compile(r"states_(\d{6,})\.s4d")
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A compact file of a history.
+    """Compact file of a history.
 
     Attributes:
         path: path of the file.
-        size, changed: size in bytes and modification time in ns when the file was last checked.
-        times: times of its frames in seconds, by index.
-        stamps: stamps of its frames: their bytes in the file, and −1 minus the checksum of the state. The negative
-            value
-            distinguishes them from stamps of frame files.
-        damage: description of damage after which no frames are listed, or None.
-        foreign: whether the file has another format.
+        size: size in bytes when the file was last checked.
+        changed: modification time in ns when the file was last checked.
+        times: time of each frame in seconds, keyed by frame index.
+        stamps: stamp of each frame: its size in the file in bytes, and −1 minus the checksum of the state. The negative
+            value distinguishes it from stamps of frame files.
+        damage: description of the damage after which no frames could be listed, or None.
+        foreign: whether the file has an unsupported format.
     """
 
     path: Path
@@ -70,7 +70,7 @@ class Chunks:
         directory: folder of the history.
 
     Attributes:
-        known: chunks by the index of their first frame, as of the last ``refresh``.
+        known: chunks as of the last ``refresh``, keyed by the index of their first frame.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -89,7 +89,7 @@ class Chunks:
         self.known, self._firsts = known, list(known)
 
     def refresh_chunk(self, first: int) -> None:
-        """Updates the chunk that starts with a frame, after it was created or extended."""
+        """Updates the chunk that starts with frame ``first``, after the chunk was created or extended."""
         if (chunk := self._load_chunk(first)) is not None:
             self.known[first] = chunk
             if first not in self._firsts:
@@ -132,12 +132,12 @@ class Chunks:
 
     @property
     def damaged(self) -> list[str]:
-        """One sentence per chunk with frames that cannot be listed because of damage."""
+        """One sentence per chunk whose frames cannot all be listed because of damage."""
         return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
 
     @property
     def foreign(self) -> list[str]:
-        """One sentence per chunk of another format."""
+        """One sentence per chunk with an unsupported format."""
         return [str(chunk.damage) for chunk in self.known.values() if chunk.foreign]
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
@@ -155,7 +155,7 @@ class Chunks:
 
     def _read(self, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
         if (chunk := self.of(index)) is None:
-            raise FileNotFoundError(f"frame {index} is in no chunk")
+            raise FileNotFoundError(f"no chunk contains frame {index}")
         with _disk_errors(chunk.path):
             return self._read_from(chunk, index, names, optional)
 
@@ -180,14 +180,14 @@ class Chunks:
         return arrays
 
     def reader(self, index: int) -> CompactReader:
-        """Returns an open reader of the chunk that contains a frame; it is owned by this object.
+        """Returns the open reader of the chunk that contains a frame; this object closes it.
 
         Raises:
             FileNotFoundError: no chunk contains the frame.
             FileError: the chunk cannot be opened.
         """
         if (chunk := self.of(index)) is None:
-            raise FileNotFoundError(f"frame {index} is in no chunk")
+            raise FileNotFoundError(f"no chunk contains frame {index}")
         return self._reader(chunk)
 
     def _reader(self, chunk: Chunk) -> CompactReader:
@@ -205,9 +205,9 @@ class Chunks:
             known[1].close()
 
     def fault(self, index: int) -> str | None:
-        """Reads everything that a frame in a chunk needs from disk; returns the problem, or None if it is intact."""
+        """Rereads a frame of a chunk from disk; returns the problem, or None if the frame is intact."""
         if (chunk := self.of(index)) is None:
-            return f"frame {index} is gone"
+            return f"frame {index} is missing"
         self._close(chunk.path)
         try:
             self.read(index, ("means", "report"))
@@ -216,11 +216,11 @@ class Chunks:
         return None
 
     def remove(self, first: int) -> None:
-        """Deletes the chunk that starts with a frame."""
+        """Deletes the chunk that starts with frame ``first``."""
         (self.directory / chunk_file(first)).unlink(missing_ok=True)
 
     def truncate(self, index: int) -> None:
-        """Removes a frame and all later ones from the chunk that contains it; the chunk then has no index."""
+        """Removes a frame and all later ones from the chunk that contains it, together with the chunk's index."""
         if (chunk := self.of(index)) is None:
             return
         self._close(chunk.path)
@@ -242,14 +242,14 @@ def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
 
 
 def make_note(report: Mapping[str, Any], log: Int, before: int) -> dict[str, Any]:
-    """Returns the note on a frame: its report, and its events.
+    """Returns the note of a frame, which contains its report and its events.
+
+    The note of the first frame in a chunk contains the whole log, so that no other chunk is needed to read it.
 
     Args:
-        report: the frame's report.
+        report: report of the frame.
         log: [E, 4] event log up to the frame.
-        before: previous frame in the chunk, or −1. The first frame's note contains the whole log, so that no other
-            chunk is
-            needed to read it.
+        before: index of the previous frame in the chunk, or −1 for the first one.
     """
     own = log[log[:, 0] > before]
     return {REPORT: dict(report), **({EVENTS: own.tolist()} if len(own) else {})}
@@ -262,7 +262,7 @@ def _log(reader: CompactReader, index: int) -> Int:
 
 
 def chunk_file(first: int) -> str:
-    """Returns the name of the chunk that starts with a frame.
+    """Returns the file name of the chunk that starts with frame ``first``.
 
     >>> chunk_of(chunk_file(121))
     121
@@ -271,13 +271,13 @@ def chunk_file(first: int) -> str:
 
 
 def chunk_of(name: str) -> int | None:
-    """Returns the index of the first frame for the name of a chunk; None for other files."""
+    """Returns the index of the first frame of a chunk, given its file name; None for other files."""
     match = _CHUNK_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def _listed(path: Path, status: os.stat_result) -> Chunk:
-    """Lists the frames of a chunk; a chunk that cannot be opened has none."""
+    """Lists the frames of a chunk; none if the chunk cannot be opened."""
     size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:
@@ -292,7 +292,7 @@ def _listed(path: Path, status: os.stat_result) -> Chunk:
 
 @contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
-    """Converts disk read errors to ``FileError``, as for damage."""
+    """Converts disk read errors to ``FileError``, which is also raised for damage."""
     try:
         yield
     except FileNotFoundError:

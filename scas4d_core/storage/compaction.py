@@ -1,8 +1,8 @@
 """Compaction: moves older states from their own files to chunks, frame by frame. Needs numpy and zstandard.
 
 The first and the newest frames stay exact, because updates, replays and restarts need their bits. A frame is appended
-to a chunk with its report as the note, the chunk is synced, and then the frame's own file is deleted. Therefore every
-frame stays readable whenever the process ends. A past view changes at most once.
+to a chunk with its report as a note, the chunk is synced, and then the frame's own file is deleted. Therefore every
+frame stays readable no matter when the process ends. A view of an older frame changes at most once.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
 
 CHUNK_FRAMES = 120
-"""Frames per chunk. Its first state is as large as five to ten others, and retention deletes a chunk as a whole."""
+"""Number of frames per chunk. The first state is as large as five to ten others; retention deletes whole chunks."""
 
 NOT_ENCODED = (ValueError, ArithmeticError, MemoryError)
-"""Exceptions for states that cannot be read or encoded; errors of histories and compact files are ValueErrors."""
+"""Exceptions for states that cannot be read or encoded, including the errors of histories and compact files."""
 
 log = logging.getLogger("scas4d.storage")
 
@@ -33,8 +33,11 @@ class Compaction:
 
     Args:
         history: history in a directory.
-        head: returns the file header with the error bounds; called when a chunk is created or resumed.
+        head: function that returns the file header with the error bounds; called when a chunk is created or resumed.
         exact: number of newest states that stay exact, at least ``NEWEST_KEPT``.
+
+    Attributes:
+        exact: number of newest states that stay exact.
 
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
@@ -58,25 +61,25 @@ class Compaction:
         self._history, self._files, self._head = history, history.files, head
         self._writer: CompactWriter | None = None
         self._first = -1
-        """First frame of the chunk being written."""
+        """First frame of the current chunk."""
         self._passed = max(history.files.chunks, default=-1)
         """Last frame that is in a chunk or could not be moved."""
         self._queue: deque[int] = deque()
-        """Frames to move, oldest first."""
+        """Frames to be moved, oldest first."""
         self._complete()
 
     @property
     def due(self) -> int:
-        """Lower bound on the number of states to move; at least one if any is due."""
+        """Lower bound on the number of states to be moved; at least 1 if there are any."""
         if not self._queue:
             self._queue.extend(self._history.older_than_newest(self.exact, self._passed))
         return len(self._queue)
 
     def step(self) -> int | None:
-        """Moves one state; returns its frame, or None if none is due.
+        """Moves one state and returns its frame, or None if there is none to move.
 
         Raises:
-            OSError: the disk is full or failing. Nothing is lost, and the next step retries.
+            OSError: the disk is full or failing; nothing is lost, and the next step retries.
         """
         while self.due:
             index = self._queue[0]
@@ -100,7 +103,7 @@ class Compaction:
         self._release_writer()
 
     def _complete(self) -> None:
-        """Deletes files of frames that are also intact in a chunk on disk, which an interruption left behind."""
+        """Deletes leftover files of frames that an interrupted step had already moved to a chunk."""
         first = next(iter(self._history.indices), -1)
         names = map(frame_of, os.listdir(self._files.directory))
         own = [index for index in names if index is not None and index != first and index in self._files.chunks]
@@ -136,7 +139,7 @@ class Compaction:
         writer.sync()
         files.chunks.refresh_chunk(self._first)
         if index not in files.chunks:
-            raise FileError(f"{writer.path.name}: frame {index} is not in it after it was written")
+            raise FileError(f"{writer.path.name}: frame {index} is missing after it was written")
         files.path(index).unlink(missing_ok=True)
         history.mark_compacted(index)
 
@@ -161,13 +164,13 @@ class Compaction:
     def _begin_chunk(self, index: int) -> CompactWriter:
         self._first = index
         path: Path = self._files.directory / chunk_file(index)
-        path.unlink(missing_ok=True)  # an interruption left a chunk without a complete state
+        path.unlink(missing_ok=True)  # left by an interruption, without a complete state
         writer = CompactWriter(path, self._head())
         sync_folder(path.parent)
         return writer
 
     def _finish(self, writer: CompactWriter | None) -> None:
-        """Completes a chunk with its index."""
+        """Completes a chunk by writing its index."""
         if writer is not None:
             writer.close()
             _confirm(writer.path)
@@ -175,7 +178,7 @@ class Compaction:
         self._writer = None
 
     def _release_writer(self) -> None:
-        """Closes the current chunk; resuming it truncates an incomplete record."""
+        """Closes the current chunk without an index; an incomplete record is truncated when the chunk is resumed."""
         if self._writer is not None:
             self._writer.abandon()
         self._writer = None

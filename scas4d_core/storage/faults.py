@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class HistoryError(ValueError):
-    """Raised if a history cannot be extended or read; the message names the frame or file, problem and remedy."""
+    """Raised if a history cannot be extended or read; the message names the frame or file and the problem."""
 
 
 class OtherFormatError(HistoryError):
@@ -24,14 +24,14 @@ def other_format(what: str, written: int | None, read: int) -> OtherFormatError:
 
     Args:
         what: description of the files.
-        written: their format, or None if they name none.
-        read: the supported format.
+        written: format of the files, or None if they do not state one.
+        read: supported format.
 
     >>> str(other_format("states, a folder,", 3, 1))[:54]
-    'states, a folder, has format 3; this scas4d reads form'
+    'states, a folder, has format 3; this version reads for'
     """
-    known = "names no format" if written is None else f"has format {written}"
+    known = "has no format number" if written is None else f"has format {written}"
     return OtherFormatError(
-        f"{what} {known}; this scas4d reads format {read}: "
-        "use the scas4d that wrote it, or reconstruct the scene again from its pictures"
+        f"{what} {known}; this version reads format {read}: "
+        "use the version of scas4d that wrote it, or reconstruct the scene again from its images"
     )

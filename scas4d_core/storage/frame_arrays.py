@@ -1,4 +1,4 @@
-"""The arrays of a committed frame's file: state, effects data, event log, time and report. Needs only numpy."""
+"""The arrays in the file of a committed frame: state, effect arrays, event log, time and report. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Stamp = tuple[int, int]
 EVENTS = "events"
 """Name of the array with the log of births, retirements and revivals up to the frame; absent if there are none."""
 EFFECTS = "effects"
-"""Name of the array with the effects' data for a cold start, the bytes of an npz; absent if there is none."""
+"""Name of the array with the effect arrays for a cold start, packed as bytes of an npz; absent if there are none."""
 EffectArrays = Mapping[str, Mapping[str, NDArray[Any]]]
-"""Arrays of effects, by effect and array name."""
+"""Effect arrays, keyed by effect and array name."""
 
 
 def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
-    """Packs the arrays of effects into one array of bytes, or returns None if there are none.
+    """Packs effect arrays into one array of bytes; returns None if there are none.
 
     >>> unpack_effects(pack_effects({"shadows": {"c.0": np.arange(3)}}))
     {'shadows': {'c.0': array([0, 1, 2])}}
@@ -38,7 +38,7 @@ def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
 
 
 def unpack_effects(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
-    """Inverts ``pack_effects``; returns the arrays by effect and name."""
+    """Inverts ``pack_effects``; returns the arrays keyed by effect and array name."""
     effects: dict[str, Arrays] = {}
     if given is not None:
         with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
@@ -51,14 +51,14 @@ def unpack_effects(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
 def frame_file_arrays(
     frame: Mapping[str, NDArray[Any]], time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None
 ) -> dict[str, Any]:
-    """Returns the arrays of a frame's file.
+    """Returns the arrays to write to the file of a frame.
 
     Args:
         frame: arrays of the state.
-        time: time in seconds.
+        time: time of the frame in seconds.
         report: encoded report.
         log: event log up to the frame.
-        left: packed arrays of effects, or None.
+        left: packed effect arrays, or None.
     """
     if len(log):
         frame = {**frame, EVENTS: log}

@@ -1,13 +1,13 @@
-"""The folder of a history: names of its files, and reading, writing and repairing them. Needs only numpy.
+"""The folder of a history: file names, and functions to read, write and repair the files. Needs only numpy.
 
 ``fixed.npz``, written once, contains the data that all frames share; ``frame_<index>.npz`` contains a committed frame.
 Every file is written under a temporary name, synced and renamed. A file with its final name is therefore complete, and
 the directory listing is the only index. ``fixed.npz`` and the first frame, which everything needs, have copies that are
 read if the original is damaged or missing.
 
-``born_<index>.npz``, the Gaussians born in a frame, has a copy too, because all later frames need it. It is written
-before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks (``chunks``); a
-frame's own file takes precedence over its chunk.
+``born_<index>.npz`` contains the Gaussians born in a frame. It also has a copy, because all later frames need it. It is
+written before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks
+(``chunks``); a frame's own file takes precedence over its chunk.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
 FORMAT = 1
-"""Format of a folder of states and its checkpoints, stored in ``fixed.npz``; folders of other formats are rejected."""
+"""Format of a folder of states and checkpoints, stored in ``fixed.npz``; folders with other formats are rejected."""
 _FORMAT = "format"
 INDEX = "index"
 """Name of the array, in the copy of the first frame, that contains its index."""
@@ -43,9 +43,8 @@ class FrameFiles:
 
     Attributes:
         chunks: compact files that contain older frames.
-        faults: files that could not be read, by name with the reason; cleared when reported. A frame in a chunk is
-            listed
-            under the name that its own file would have.
+        faults: names of files that could not be read, with the reason; cleared when reported. A frame in a chunk is
+            listed under the name that its own file would have.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -77,7 +76,7 @@ class FrameFiles:
                     stamps[index] = _stamp(entry.stat())
                 except FileNotFoundError:  # deleted or compacted in the meantime
                     continue
-        self.chunks.refresh()  # after listing files, since a frame is in a chunk before its file is deleted
+        self.chunks.refresh()  # after listing files, because a frame is in a chunk before its file is deleted
         stamps = self.chunks.stamps() | stamps
         first = self._first()
         if stamps and first is not None and first[1] < min(stamps):
@@ -85,7 +84,7 @@ class FrameFiles:
         return dict(sorted(stamps.items()))
 
     def stamps_of(self, indices: Iterable[int]) -> dict[int, Stamp]:
-        """Returns the stamps of those given frames that exist, without listing the directory."""
+        """Returns the stamps of the given frames, as far as they exist, without listing the directory."""
         stamps: dict[int, Stamp] = {}
         absent: list[int] = []
         for index in sorted(indices):
@@ -103,7 +102,7 @@ class FrameFiles:
         return dict(sorted(stamps.items()))
 
     def _first(self) -> tuple[Stamp, int] | None:
-        """Returns stamp and frame index of the first frame's copy, or None if it cannot be read."""
+        """Returns the stamp and the frame index of the copy of the first frame, or None if it cannot be read."""
         try:
             stamp = _stamp(self.first_copy.stat())
             if self._copied is None or self._copied[0] != stamp:
@@ -113,7 +112,7 @@ class FrameFiles:
         return self._copied
 
     def write(self, index: int, arrays: Mapping[str, Any]) -> Stamp:
-        """Writes the file of a frame, which commits it; returns its stamp."""
+        """Writes the file of a frame, which commits the frame, and returns its stamp."""
         file = self.path(index)
         write_npz(file, arrays)
         return _stamp(file.stat())
@@ -128,8 +127,8 @@ class FrameFiles:
         """Returns the time of a frame in seconds.
 
         Args:
-            index: the frame.
-            stamp: stamp of the frame, if known; it avoids reading the file if the frame is in a chunk.
+            index: index of the frame.
+            stamp: stamp of the frame, if known, which avoids reading the file if the frame is in a chunk.
 
         Raises:
             FileNotFoundError: the frame does not exist.
@@ -140,12 +139,12 @@ class FrameFiles:
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Reads the named arrays of a frame from its file, else from its chunk or, for the first frame, from the copy.
+        """Reads arrays of a frame from its file, or else from its chunk or, for the first frame, from the copy.
 
         Args:
-            index: the frame.
+            index: index of the frame.
             names: names of the arrays.
-            optional: further arrays to read if present.
+            optional: names of further arrays to read if present.
 
         Raises:
             FileNotFoundError: the frame does not exist.
@@ -194,7 +193,7 @@ class FrameFiles:
             raise other_format(f"{self.directory.name}, a folder of states,", written, FORMAT)
 
     def read_fixed(self, names: Sequence[str]) -> Arrays:
-        """Reads named arrays that all frames share.
+        """Reads arrays that all frames share.
 
         Raises:
             UnreadableFrameError: the file and its copy are damaged or missing.
@@ -207,7 +206,7 @@ class FrameFiles:
         write_npz(self.directory / born_file(index, copy=True), arrays)
 
     def read_born(self, index: int, names: Sequence[str] | None = None) -> Arrays:
-        """Reads the arrays of Gaussians born in a frame, all or the named ones.
+        """Reads the arrays of Gaussians born in a frame: the named ones, or all if ``names`` is None.
 
         Raises:
             UnreadableFrameError: the file and its copy are damaged or missing.
@@ -234,12 +233,12 @@ class FrameFiles:
 
         Args:
             first: index of the first committed frame.
-            fixed: the arrays that all frames share, as read.
-            born: arrays of the births, by frame.
+            fixed: arrays that all frames share.
+            born: arrays of the births, keyed by frame.
 
         Returns:
-            The problem of each rewritten file, by name. If a file and its copy are both damaged, they are left
-            unchanged.
+            The problem of each rewritten file, keyed by file name. The first frame is left unchanged if its copy is
+            damaged too.
         """
         mended: dict[str, str] = {}
         needed = dict.fromkeys((self.fixed, self.fixed_copy), with_format(fixed))
@@ -262,7 +261,7 @@ class FrameFiles:
         return mended
 
     def remove(self, index: int) -> None:
-        """Deletes a frame if it exists; if it is in a chunk, all later frames of the chunk are deleted too."""
+        """Deletes a frame if it exists, together with all later frames of its chunk if it is in one."""
         self.path(index).unlink(missing_ok=True)
         self.chunks.truncate(index)
 
@@ -275,7 +274,7 @@ class FrameFiles:
         return index in self.chunks
 
     def chunk_of(self, index: int) -> list[int]:
-        """Returns all frames of the chunk that contains a frame, or just the frame if no chunk does."""
+        """Returns all frames of the chunk that contains a frame, or only the frame if it is in no chunk."""
         chunk = self.chunks.of(index)
         return [index] if chunk is None else list(chunk.times)
 
@@ -283,8 +282,8 @@ class FrameFiles:
         """Deletes frames, and chunks that contain no remaining frame.
 
         Args:
-            deleted: frames to delete.
-            left: the remaining frames of the history.
+            deleted: indices of the frames to delete.
+            left: indices of the remaining frames of the history.
         """
         firsts: set[int] = set()
         for index in deleted:
@@ -302,7 +301,7 @@ class FrameFiles:
 
 
 def with_format(fixed: Arrays) -> Arrays:
-    """Returns the arrays of ``fixed.npz``: those that all frames share, and the format of the folder."""
+    """Returns the arrays of ``fixed.npz``: the arrays that all frames share, and the format of the folder."""
     return {**fixed, _FORMAT: np.asarray(FORMAT, np.int64)}
 
 
@@ -312,18 +311,18 @@ def frame_file(index: int) -> str:
 
 
 def frame_of(name: str) -> int | None:
-    """Returns the frame index for a frame's file name; None for other files."""
+    """Returns the index of a frame, given the name of its file; None for other files."""
     match = _FRAME_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def born_file(index: int, copy: bool = False) -> str:
-    """Returns the name of the birth file of a frame, or of its copy."""
+    """Returns the name of a frame's birth file, or of the copy of this file."""
     return f"born_{index:06d}{'.copy' if copy else ''}.npz"
 
 
 def born_of(name: str) -> int | None:
-    """Returns the frame index for the name of a birth file or its copy; None for other files."""
+    """Returns the index of a frame, given the name of its birth file or the copy; None for other files."""
     match = _BORN_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
@@ -334,7 +333,7 @@ def checkpoint_file(index: int) -> str:
 
 
 def checkpoint_of(name: str) -> int | None:
-    """Returns the frame index for the name of a checkpoint file; None for other files."""
+    """Returns the index of a frame, given the name of its checkpoint file; None for other files."""
     match = _CHECKPOINT_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
@@ -349,7 +348,7 @@ def fault_of(file: Path) -> str | None:
 
 
 def _reason(file: Path, error: Exception) -> str:
-    return f"{file.name} is gone" if isinstance(error, FileNotFoundError) else str(error)
+    return f"{file.name} is missing" if isinstance(error, FileNotFoundError) else str(error)
 
 
 def _stamp(status: os.stat_result) -> Stamp:

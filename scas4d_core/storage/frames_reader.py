@@ -20,11 +20,11 @@ from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unp
 from scas4d_core.storage.frame_files import FrameFiles, frame_file
 
 FRAMES_KEPT = 4
-"""Number of frames of an on-disk history that are cached in memory: the newest, and the last ones read."""
+"""Number of frames of an on-disk history that are cached in memory: the newest and the most recently read ones."""
 
 
 class FramesReader:
-    """The committed frames, in this process's memory or in a directory that another process writes.
+    """Committed frames, in the memory of this process or in a directory to which another process writes.
 
     Attributes:
         damaged: frames whose file cannot be read, with the reason; they are not in ``indices``.
@@ -42,14 +42,14 @@ class FramesReader:
         self._scratch_reports: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
         """Reports of frames moved to a scratch file (``History.move_to_scratch``)."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
-        """Packed effects data of frames that were written by this process and are in memory."""
+        """Packed effect arrays of frames that were written by this process and are in memory."""
         self._frames: OrderedDict[int, Mapping[str, NDArray[Any]]] = OrderedDict()
         self._births: dict[int, Arrays] = {}
-        """Arrays of births, by frame, including truncated frames."""
+        """Arrays of the births of each frame, including truncated frames."""
         self._log: tuple[int, Int] = (-1, NO_EVENTS)
-        """Newest frame and its event log."""
+        """Index of the newest frame, and its event log."""
         self._grown: tuple[list[tuple[int, int, int]], Arrays] = ([], {})
-        """Births, and fixed arrays of all Gaussians up to them."""
+        """Births, and the fixed arrays of all Gaussians after them."""
 
     @classmethod
     def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> Self:
@@ -57,15 +57,15 @@ class FramesReader:
 
         Args:
             directory: directory of the history.
-            only: frames to read, if known; None checks every file in the directory.
+            only: indices of the frames to read; if None, every file in the directory is checked.
 
         Raises:
             HistoryError: there is no history, or the file that all frames need is damaged.
-            OtherFormatError: the folder, or a compact file in it, has another format.
+            OtherFormatError: the folder, or a compact file in it, has an unsupported format.
         """
         files = FrameFiles(Path(directory))
         if not files.exists:
-            raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
+            raise HistoryError(f"{files.directory.name} contains no history: {files.fixed.name} is missing")
         files.require_format()
         history = cls()
         history._files = files
@@ -77,13 +77,14 @@ class FramesReader:
         return history
 
     def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
-        """Reads the changes made by the process that writes this directory, without reopening known frames.
+        """Reads the changes made by the process that writes to this directory, without reopening known frames.
 
         Args:
-            only: frames that may have changed, if known; listing all states of a long scene is slow.
+            only: indices of frames that may have changed. If None, all states are listed, which is slow for a long
+                scene.
 
         Returns:
-            The indices that are new or rewritten, and those that were deleted.
+            The indices of new or rewritten frames, and the indices of deleted frames.
         """
         if self._files is None:
             return [], []
@@ -115,14 +116,14 @@ class FramesReader:
         return added, gone
 
     def older_than_newest(self, newest: int, after: int) -> list[int]:
-        """Returns the frames after ``after``, in increasing order, without the first and the ``newest`` last ones."""
+        """Returns the frames after ``after``, in increasing order, except the first and the ``newest`` newest ones."""
         first = next(iter(self._times), -1)
         frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
         return list(frames)[::-1]
 
     @property
     def damaged_chunks(self) -> list[str]:
-        """One sentence per damaged compact file with frames missing from ``indices``."""
+        """One sentence per damaged compact file whose frames are partly missing from ``indices``."""
         return [] if self._files is None else self._files.chunks.damaged
 
     def is_compacted(self, index: int) -> bool:
@@ -137,7 +138,7 @@ class FramesReader:
                 kept.pop(index, None)
 
     def pop_faults(self) -> dict[str, str]:
-        """Returns files found damaged or missing since the last call, by name with the reason."""
+        """Returns the files found damaged or missing since the last call, with the reason."""
         if self._files is None:
             return {}
         faults, self._files.faults = self._files.faults, {}
@@ -145,7 +146,7 @@ class FramesReader:
 
     @property
     def directory(self) -> Path | None:
-        """Directory of the states; None for a history in memory."""
+        """Directory of the states, or None for a history in memory."""
         return None if self._files is None else self._files.directory
 
     def __len__(self) -> int:
@@ -166,7 +167,7 @@ class FramesReader:
 
     @property
     def files(self) -> FrameFiles | None:
-        """Files on disk, for repairing them (``scas4d_core.recompute``); None for a history in memory."""
+        """Files on disk, to repair them (``scas4d_core.recompute``); None for a history in memory."""
         return self._files
 
     def time(self, index: int) -> float:
@@ -216,11 +217,11 @@ class FramesReader:
         return self._background or (0.0, 0.0, 0.0)
 
     def effects(self, index: int) -> dict[str, Arrays]:
-        """Returns the effects' data of a committed frame for a cold start, by effect; empty if it cannot be read."""
+        """Returns the effect arrays of a committed frame that a cold start needs; empty if they cannot be read."""
         return unpack_effects(self._left(index))
 
     def _left(self, index: int) -> NDArray[np.uint8] | None:
-        """Returns the effects' data in packed form; None if there is none."""
+        """Returns the packed effect arrays, or None if there are none."""
         self._require(index)
         left = self._packed.get(index)
         if left is None and self._files is not None:
@@ -232,13 +233,13 @@ class FramesReader:
         """Returns the event log [E, 4] of the newest readable frame."""
         while (newest := self._newest()) >= 0:
             known, log = self._log
-            if known > newest or (known >= 0 and self._files is None):  # frames were truncated since
+            if known > newest or (known >= 0 and self._files is None):  # frames have been truncated since
                 log = log[log[:, 0] <= newest]
             elif known < newest:
                 try:
                     log = self._from_file(newest, (), (EVENTS,)).get(EVENTS, NO_EVENTS)
                 except UnreadableFrameError:
-                    continue  # drop this frame; the previous log lacks only its events
+                    continue  # the frame was dropped; the log of the previous one lacks only its events
             self._log = (newest, log)
             return log
         return NO_EVENTS
@@ -270,7 +271,7 @@ class FramesReader:
             except UnreadableFrameError as error:
                 raise DamagedFrameError(str(error)) from error
         if known is None or (known["ids"][0], known["ids"][-1]) != (first, last):
-            raise DamagedFrameError(f"the Gaussians {first} to {last}, born in frame {index}, are not those on disk")
+            raise DamagedFrameError(f"Gaussians {first} to {last}, born in frame {index}, do not match those on disk")
         return known
 
     def _require(self, index: int) -> None:
@@ -282,7 +283,7 @@ class FramesReader:
         raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
     def _newest(self) -> int:
-        """Returns the index of the last frame, or -1 if there is none; unlike ``indices``, this copies nothing."""
+        """Returns the index of the newest frame, or -1 if there is none; unlike ``indices``, it copies nothing."""
         return next(reversed(self._times), -1)
 
     def _from_file(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
@@ -291,7 +292,7 @@ class FramesReader:
             return self._files.read(index, names, optional)
         except FileNotFoundError:
             self._forget(index)  # deleted by the appending process or by another
-            self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
+            self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is missing"
             self._require(index)
             raise
         except UnreadableFrameError as error:

@@ -1,8 +1,8 @@
 """Stores the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Needs only numpy.
 
 On disk (``frame_files``), a history has one file with opacities and ids, written once, and one file per committed
-frame with its state, time and report. Each frame with newborn Gaussians has another file. Renaming a frame's file to
-its final name is the commit. One process appends and deletes through a ``History``; other processes read, and see its
+frame with its state, time and report. Frames with newborn Gaussians have a second file. Renaming a frame's file to its
+final name is the commit. One process appends and deletes through a ``History``; other processes only read, and see the
 changes after ``refresh``.
 """
 
@@ -38,7 +38,7 @@ __all__ = [
 NEWEST_KEPT = 2
 """Number of newest states that retention never deletes.
 
-If the last is damaged, the scene resumes from the one before.
+If the newest state is damaged, the scene resumes from the one before it.
 """
 
 
@@ -46,8 +46,9 @@ class History(HistoryReader):
     """The committed states of one scene in frame order, for the process that appends to them.
 
     Args:
-        directory: folder of the states, created if missing; None keeps states in memory, and older ones in a scratch
-            file (``move_to_scratch``). Use ``History.load`` or ``History.open`` if the folder has states already.
+        directory: folder of the states, created if missing. If None, states are kept in memory, and older ones in a
+            scratch file (``move_to_scratch``). For a folder with existing states, use ``History.load`` or
+            ``History.open``.
 
     Attributes:
         record_seconds: seconds that the last ``append`` spent on the report: encoding it, and a share of the write time
@@ -67,7 +68,7 @@ class History(HistoryReader):
            [0., 0., 3.]], dtype=float32)
     >>> history.append(1, 0.2, state)
     Traceback (most recent call last):
-    scas4d_core.storage.faults.HistoryError: frame 1 comes after frame 1; append frames in ascending order
+    scas4d_core.storage.faults.HistoryError: frame 1 is not after frame 1; append frames in ascending order
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:
@@ -77,14 +78,14 @@ class History(HistoryReader):
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
             if self._files.list_stamps():
-                raise HistoryError(f"{self._files.directory.name} already holds a history; History.load opens it")
+                raise HistoryError(f"{self._files.directory.name} already contains a history; open it by History.load")
 
     @classmethod
     def open(cls, directory: Path | str) -> History:
         """Opens the history in a directory, or creates one if there is none.
 
         Raises:
-            HistoryError: as for ``load``.
+            HistoryError: see ``load``.
         """
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,7 +98,7 @@ class History(HistoryReader):
         self.copy_frames(self.indices, directory)
 
     def copy_frames(self, indices: Iterable[int], directory: Path | str | None = None) -> History:
-        """Copies some committed frames to memory or another directory; ids, births and lifetimes are preserved."""
+        """Copies committed frames to memory or to another directory; ids, births and lifetimes are preserved."""
         copy = History(directory)
         for index in sorted(set(indices)):
             arrays, log = self.gaussians(index).arrays(), self.log_at(index)
@@ -118,24 +119,24 @@ class History(HistoryReader):
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:
-        """Commits the state of one frame with its report. When this returns, both are on disk if there is a directory.
+        """Commits the state of one frame with its report. A history in a directory has both on disk on return.
 
         Args:
-            index: frame number, greater than all previous ones.
-            time: seconds.
-            gaussians: the state, with the same ids and opacities as the previous frame. Additional rows are newborn
-                Gaussians without ids, which are assigned here. The arrays are copied.
+            index: frame index, greater than all previous ones.
+            time: time of the frame in seconds.
+            gaussians: state with the same ids and opacities as the previous frame. Additional rows are newborn
+                Gaussians without ids; their ids are assigned here. The arrays are copied.
             report: report of JSON values (finite numbers, strings, lists, mappings).
-            parents: [B] rows of the parents of newborn Gaussians; None if no newborn has one.
-            roots: roots of all Gaussians (``births.extend_roots``); None uses newborn Gaussians as their own roots.
-            effects: arrays that a cold start needs, by effect.
+            parents: [B] row of each newborn Gaussian's parent; None if no newborn Gaussian has a parent.
+            roots: roots of all Gaussians (``births.extend_roots``); if None, newborn Gaussians are their own roots.
+            effects: arrays that a cold start needs, keyed by effect and array name.
 
         Raises:
-            HistoryError: the index is not above the last, Gaussians are missing, ids or opacities differ, or the report
-                is not valid JSON.
+            HistoryError: the index is not greater than the last one, Gaussians are missing, ids or opacities differ, or
+                the report is not valid JSON.
         """
         if index <= self._newest():
-            raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in ascending order")
+            raise HistoryError(f"frame {index} is not after frame {self._newest()}; append frames in ascending order")
         began = perf_counter()
         try:
             text = json.dumps(dict(report or {}), allow_nan=False)
@@ -153,7 +154,7 @@ class History(HistoryReader):
                     f"frame {index}: {name} differ from those of the first frame; they are fixed within one history"
                 )
         if not (arrays["ids"][count:] == UNBORN).all():
-            raise HistoryError(f"frame {index}: new Gaussians have ids; leave them {UNBORN}: the commit assigns them")
+            raise HistoryError(f"frame {index}: new Gaussians have ids; use {UNBORN}, because the commit assigns ids")
         for name in PER_FRAME:
             if len(arrays[name]) != rows:
                 raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {rows}, one per Gaussian")
@@ -180,8 +181,7 @@ class History(HistoryReader):
         """Returns the stored arrays of a birth.
 
         If a truncated frame is committed again with the same birth, the birth keeps its ids. Any other birth gets ids
-        that no
-        Gaussian ever had, not even one of a truncated frame.
+        that no Gaussian ever had, not even in a truncated frame.
         """
         count = len(born)
         origin = born if roots is None else roots.rows(np.arange(len(roots) - count, len(roots)))
@@ -208,14 +208,14 @@ class History(HistoryReader):
         """Commits a frame that has been validated.
 
         Args:
-            index: frame number.
-            time: time in seconds.
+            index: index of the frame.
+            time: time of the frame in seconds.
             frame: arrays of the state.
             text: report as JSON.
-            log: event log up to the frame.
-            births: births, by frame, that may not have been written yet.
+            log: event log up to and including the frame.
+            births: arrays of births that may not have been written yet, keyed by frame.
             fixed: fixed arrays of the first frame.
-            left: packed arrays of effects.
+            left: packed arrays of the effects, or None.
         """
         if self._files is not None:
             encoded = text.encode()
@@ -244,18 +244,18 @@ class History(HistoryReader):
             self.move_to_scratch(None, IN_MEMORY)
 
     def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
-        """Deletes the oldest states until the limits hold. Without a limit, all states are kept.
+        """Deletes the oldest states until the limits are met. Without a limit, all states are kept.
 
-        The first frame is always kept because every update needs it. The ``NEWEST_KEPT`` newest are kept because an
-        interrupted
-        scene resumes from them. Frames of a chunk are deleted together, once ``last`` includes none of them.
+        The first frame is always kept because every update needs it. The ``NEWEST_KEPT`` newest frames are kept because
+        an interrupted scene resumes from them. Frames of a chunk are deleted together, once ``last`` includes none of
+        them.
 
         Args:
-            last: number of states to keep in addition to the first.
-            size_bytes: maximum total size of all frames' files.
+            last: number of states to keep in addition to the first; no limit if None.
+            size_bytes: maximum total size of the frame files in bytes; no limit if None.
 
         Returns:
-            The deleted indices, in increasing order.
+            The indices of the deleted frames, in increasing order.
 
         Raises:
             HistoryError: a limit is below 1.
@@ -274,18 +274,18 @@ class History(HistoryReader):
         return deleted
 
     def move_to_scratch(self, folder: Path | None, keep_newest: int = 1) -> None:
-        """Moves states from memory to a scratch file, except the first and the newest; their bits are unchanged.
+        """Moves all states except the first and the newest from memory to a scratch file, without any loss.
+
+        If there is no disk space, states stay in memory. The file is deleted with this history.
 
         Args:
-            folder: folder on the disk for the file, which is deleted with this history; None uses the system's
-                temporary
-                folder. If there is no space, states stay in memory.
+            folder: folder for the scratch file; the system's temporary folder if None.
             keep_newest: number of newest states that stay in memory.
         """
         self._scratch = self._scratch or ScratchFile(folder)
         for index in reversed(self.indices[1:-keep_newest] if self._files is None else ()):
             if (moved := self._scratch.store(self._frames[index])) is self._frames[index]:
-                break  # this state and all earlier ones are moved already, or the disk is full
+                break  # this and all earlier states have already been moved, or the disk is full
             self._frames[index] = moved
             self._scratch_reports[index] = self._scratch.store(
                 {"report": np.frombuffer(self._texts.pop(index), np.uint8)}
@@ -295,7 +295,7 @@ class History(HistoryReader):
         """Removes all commits after frame ``after``.
 
         Returns:
-            The removed indices, including damaged frames, in increasing order.
+            The indices of the removed frames, including damaged ones, in increasing order.
         """
         known = sorted(index for index in {*self._times, *self.damaged} if index > after)
         for index in reversed(known):  # newest first, so that an interruption leaves no gaps
@@ -308,10 +308,10 @@ class History(HistoryReader):
         return known
 
     def repair_fixed(self) -> dict[str, str]:
-        """Rewrites damaged files that every frame needs, and their copies.
+        """Rewrites damaged files that every frame needs, and damaged copies of these files.
 
         Returns:
-            The problem of each rewritten file, by file name.
+            The problem of each rewritten file, keyed by file name.
         """
         if self._files is None or not self._times or not self._fixed:
             return {}
@@ -346,18 +346,19 @@ class History(HistoryReader):
         """Rewrites the state of a frame whose file is damaged or missing.
 
         Args:
-            index: frame before the newest one.
-            time: time in seconds.
+            index: index of a frame before the newest one.
+            time: time of the frame in seconds.
             arrays: arrays of ``PER_FRAME``, and of ``WHOLES`` if any.
-            report, effects: as for ``append``.
+            report: report of JSON values, as for ``append``.
+            effects: arrays that a cold start needs, as for ``append``.
 
         Raises:
-            HistoryError: the frame is not before the newest, or has another number of Gaussians.
+            HistoryError: the frame is not before the newest one, or the number of Gaussians differs.
         """
         assert self._files is not None
         log = self.log_at(index)
         if index >= self._newest() or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
-            raise HistoryError(f"frame {index} cannot replace a committed frame")
+            raise HistoryError(f"frame {index} cannot be replaced: it is the newest, or its number of rows differs")
         frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         text = json.dumps(dict(report), allow_nan=False).encode()
         self._forget(index)

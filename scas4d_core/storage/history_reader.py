@@ -1,4 +1,4 @@
-"""Reads the committed states of a scene, Θ_0 … Θ_t, and the presence of Gaussians over time. Needs only numpy."""
+"""Reads the committed states of a scene, Θ_0 … Θ_t, and the lifetimes of Gaussians. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from scas4d_core.storage.faults import DamagedFrameError, HistoryError, Unreadab
 from scas4d_core.storage.frames_reader import FramesReader
 
 ROOT = "root."
-"""Prefix of a birth's arrays that place newborn Gaussians in the first frame (``roots``)."""
+"""Name prefix of the birth arrays that describe newborn Gaussians in the first frame (``roots``)."""
 ROOTS = ("means", "factors", "rotations")
-"""Arrays of ``Gaussians`` that have separate values in the roots."""
+"""Names of the ``Gaussians`` arrays that have separate values in the roots."""
 
 
 class HistoryReader(FramesReader):
-    """Reads committed states from this process's memory, or from a directory that another process writes.
+    """Reads committed states from the memory of this process, or from a directory to which another process writes.
 
     Attributes:
         damaged: frames whose file cannot be read, with the reason; they are not in ``indices``.
@@ -60,7 +60,7 @@ class HistoryReader(FramesReader):
             return Gaussians(**frame, **self._fixed)
         fixed = self._fixed_after(births_in(log))
         if len(frame["means"]) != len(fixed["ids"]):
-            raise DamagedFrameError(f"frame {index}: {len(frame['means'])} Gaussians, its log says {len(fixed['ids'])}")
+            raise DamagedFrameError(f"frame {index}: {len(frame['means'])} Gaussians, expected {len(fixed['ids'])}")
         return Gaussians(**frame, **fixed, retired=retired_after(log, fixed["ids"]))
 
     @property
@@ -69,7 +69,7 @@ class HistoryReader(FramesReader):
         return self.gaussians(self.indices[0])
 
     def roots(self, index: int | None = None) -> Gaussians:
-        """Returns the first frame, extended by later-born Gaussians at their positions in it (``births.extend_roots``).
+        """Returns the first frame with all later Gaussians, at their positions in it (``births.extend_roots``).
 
         Args:
             index: frame up to which births and retirements are included; None for the newest.
@@ -92,8 +92,7 @@ class HistoryReader(FramesReader):
         """Completes a recomputed state of a frame with the Gaussians that were born or revived in it.
 
         Newborn Gaussians are read from their birth file. Revived ones are not stored separately, so they are taken from
-        the
-        next readable frame.
+        the next readable frame.
         """
         log = self.log_at(index)
         for birth in births_in(log):
@@ -115,7 +114,7 @@ class HistoryReader(FramesReader):
 
     @property
     def ids(self) -> Int:
-        """[count] ids of all Gaussians so far, by row."""
+        """[count] id of the Gaussian in each row, for all Gaussians so far."""
         ids: Int = self._fixed_after(births_in(self._events())).get("ids", np.zeros(0, np.int64))
         return ids
 
@@ -126,20 +125,20 @@ class HistoryReader(FramesReader):
 
     @property
     def born_at(self) -> Int:
-        """[count] birth frame of each Gaussian, by row; the first frame for initial Gaussians."""
+        """[count] birth frame of the Gaussian in each row; the first frame for initial Gaussians."""
         first = np.full(len(self._fixed.get("ids", ())), next(iter(self._times), -1), np.int64)
         later = [np.full(last - begin + 1, index, np.int64) for index, begin, last in births_in(self._events())]
         return np.concatenate([first, *later])
 
     @property
     def parents(self) -> Int:
-        """[count] row of the parent that each Gaussian joined at birth, by row; −1 if it has none."""
+        """[count] row of the parent that the Gaussian in each row joined at birth; −1 if it has none."""
         none = np.full(len(self._fixed.get("ids", ())), NO_PARENT, np.int64)
         return np.concatenate([none, *(self._born(birth)["parents"] for birth in births_in(self._events()))])
 
     @property
     def highest_id(self) -> int:
-        """Highest id that any Gaussian ever had, including truncated frames; −1 if there is none."""
+        """Highest id that any Gaussian ever had, including those of truncated frames; −1 if there is none."""
         known = [self.ids, *(arrays["ids"] for arrays in self._births.values())]
         if (files := self._files) is not None:
             for index in set(files.births()) - self._births.keys():
@@ -148,11 +147,11 @@ class HistoryReader(FramesReader):
         return max((int(ids.max()) for ids in known if len(ids)), default=-1)
 
     def rows_of(self, ids: ArrayLike) -> Int:
-        """Returns the row of each id, [Q], or −1 if no Gaussian has the id."""
+        """Returns the row of each id [Q], or −1 if no Gaussian has this id."""
         return rows_among(self.ids, np.asarray(ids, np.int64).reshape(-1))
 
     def present(self, index: int) -> NDArray[np.bool_]:
-        """Returns which Gaussians [count], by row, are present in a committed frame: already born and not retired.
+        """Returns whether the Gaussian in each row [count] is present in a committed frame: born and not retired.
 
         Raises:
             HistoryError: the frame was not committed.
@@ -164,25 +163,25 @@ class HistoryReader(FramesReader):
         return there
 
     def known_rows(self, ids: ArrayLike) -> Int:
-        """Returns the row of each id, [Q].
+        """Returns the row of each id [Q].
 
         Raises:
-            InputError: no Gaussian has one of the ids.
+            InputError: an id is unknown.
         """
         wanted, rows = np.asarray(ids, np.int64).reshape(-1), self.rows_of(ids)
         unknown = wanted[rows < 0]
         if len(unknown):
             raise InputError(
-                f"ids {unknown[:5].tolist()} are not Gaussians of this scene",
-                f"take ids from an answer, or of its {self.count} Gaussians",
+                f"ids {unknown[:5].tolist()} do not exist in this scene",
+                f"use ids of its {self.count} Gaussians, such as those in a response",
             )
         return rows
 
     def lives(self, ids: ArrayLike) -> list[Life]:
-        """Returns the lifetimes of Gaussians, given by id: frames of birth, retirement and revival.
+        """Returns the lifetimes of the Gaussians with the given ids: frames of birth, retirement and revival.
 
         Raises:
-            InputError: no Gaussian has one of the ids.
+            InputError: an id is unknown.
         """
         wanted = self.ids[self.known_rows(ids)].tolist()
         return lives_of(self._events(), wanted, next(iter(self._times), -1))
@@ -190,25 +189,24 @@ class HistoryReader(FramesReader):
     def stacked(
         self, name: str, indices: Sequence[int] | None = None, rows: NDArray[np.intp] | None = None
     ) -> NDArray[Any]:
-        """Returns one array for several frames, [T, N, ...], in the order of ``indices`` (default: all frames).
+        """Returns one array over several frames, [T, N, ...].
 
         Values are NaN before a Gaussian's birth, and keep the last value while it is retired. Only this array is read
-        from the
-        files, so memory use is limited to the result.
+        from the files, so memory use is limited to the result.
 
         Args:
-            name: one of ``PER_FRAME``.
-            indices: committed frames; may repeat.
+            name: name of the array, one of ``PER_FRAME``.
+            indices: indices of committed frames, in the order of the result; may repeat. All frames if None.
             rows: rows of Gaussians, of any shape; the result is then [T, *rows.shape, ...].
 
         Raises:
             HistoryError: ``name`` is not in ``PER_FRAME``, or a frame was not committed.
         """
         if name not in PER_FRAME:
-            raise HistoryError(f"{name!r} is not kept per frame; ask for one of {', '.join(PER_FRAME)}")
+            raise HistoryError(f"{name!r} is not stored per frame; use one of {', '.join(PER_FRAME)}")
         chosen = self.indices if indices is None else list(indices)
         if not chosen:
-            raise HistoryError("indices is empty; name at least one committed frame")
+            raise HistoryError("indices is empty; give at least one committed frame")
         result: NDArray[Any] | None = None
         for row, index in enumerate(chosen):
             self._require(index)
@@ -227,7 +225,7 @@ class HistoryReader(FramesReader):
 
 
 def _taken(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
-    """Returns rows of an array, in any shape; NaN for rows beyond its end."""
+    """Returns the given rows of an array; NaN for rows beyond its end."""
     if not rows.size or int(rows.max()) < len(array):
         return array[rows]
     taken = np.full((*rows.shape, *array.shape[1:]), np.nan, array.dtype)

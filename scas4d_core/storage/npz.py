@@ -1,8 +1,8 @@
 """Writes npz files atomically with a checksum per array, and reads them with verification. Needs only numpy.
 
-The zip comment contains a 128-bit BLAKE2b of every array, over dtype, shape and values. The zip's own CRC-32 does not
-suffice: a flipped bit in an array's header can make numpy read too few bytes, and then the CRC is never checked. Files
-without these checksums are rejected.
+The zip comment contains a 128-bit BLAKE2b digest of the dtype, shape and values of every array. The CRC-32 of the zip
+does not suffice: a flipped bit in an array header can make numpy read too few bytes, and then the CRC is never checked.
+Files without these checksums are rejected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DAMAGE = (
 )  # fmt: skip
 """Exceptions that reading a truncated or overwritten zip of arrays can raise.
 
-An overwritten header is parsed before its array's checksum is checked, and may request an impossible array.
+An overwritten array header is parsed before the checksum is verified, and may describe an impossible array.
 """
 DIGEST = 16
 """Size of a checksum in bytes."""
@@ -39,7 +39,7 @@ PIECE = 1 << 20
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes an npz atomically: temporary file, sync, rename, sync of the folder.
+    """Writes an npz atomically, via a temporary file that is synced and renamed.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -79,7 +79,7 @@ def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
 
 
 def _comment(checksums: Mapping[str, str]) -> bytes:
-    """Serializes the checksums as the zip's comment, shortened if there are too many to fit."""
+    """Serializes the checksums for the zip comment, and shortens them if they do not fit."""
     for length in (2 * DIGEST, 8, 4):
         short = {name: digest[:length] for name, digest in checksums.items()}
         comment = json.dumps({"blake2b": short}, separators=(",", ":")).encode()
@@ -95,7 +95,7 @@ def _digest(array: NDArray[Any]) -> str:
 
 
 def _checksum_matches(kept: str, found: str) -> bool:
-    """Returns whether a stored checksum, possibly shortened, matches that of the array read."""
+    """Returns whether a stored, possibly shortened checksum matches the checksum of the data."""
     return len(kept) >= 4 and found.startswith(kept)
 
 
@@ -104,18 +104,18 @@ def _start_checksum(dtype: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.bla
 
 
 def _checksums(archive: zipfile.ZipFile) -> dict[str, str]:
-    """Returns the stored checksums by array name."""
+    """Returns the stored checksums, keyed by array name."""
     if not archive.comment:
-        raise ValueError("it has no checksums")
+        raise ValueError("the file has no checksums")
     kept: dict[str, str] = json.loads(archive.comment)["blake2b"]
     names = {name.removesuffix(".npy") for name in archive.namelist()}
     if names != kept.keys():
-        raise ValueError("its arrays are not the written ones")
+        raise ValueError("the arrays do not match the list of checksums")
     return kept
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs a folder so that renames and deletions in it survive a power failure."""
+    """Syncs a folder, so that renames and deletions in it survive a power failure."""
     if os.name != "posix":  # other systems cannot open a directory for syncing
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -126,22 +126,22 @@ def sync_folder(folder: Path) -> None:
 
 
 def member(name: str) -> str:
-    """Returns the file name of an array in an npz; a plain name that ends in ".npy" would be ambiguous in numpy."""
+    """Returns the file name of an array in an npz; numpy treats array names that end in ".npy" ambiguously."""
     return f"{name}.npy"
 
 
 def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Reads the named arrays of an npz, or all, and verifies their checksums; nothing is unpickled.
+    """Reads arrays of an npz and verifies their checksums; nothing is unpickled.
 
     Args:
         path: path of the file.
-        names: names of the arrays; None for all.
-        optional: further arrays to read if the file has them.
+        names: names of the arrays; all if None.
+        optional: names of further arrays to read if present.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged or lacks a name; the message gives the file name, without its folder, and the
-            reason.
+        ValueError: the file is damaged, or an array is missing; the message gives the file name, without its folder,
+            and the reason.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -150,7 +150,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
     ...     shortened = file.write_bytes(file.read_bytes()[:-40])
     ...     read_npz(file)
     Traceback (most recent call last):
-    ValueError: a.npz is damaged, or no npz file (...)
+    ValueError: a.npz is damaged or not an npz file (...)
     """
     try:
         # Opened here because numpy does not close damaged files.
@@ -169,11 +169,11 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
 
 
 def iter_verified(path: Path) -> Iterator[int]:
-    """Verifies a whole npz piece by piece, and yields the size of each piece; raises if the file is damaged.
+    """Verifies a whole npz piece by piece and yields the size of each piece in bytes.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: as for ``read_npz``.
+        ValueError: the file is damaged, see ``read_npz``.
     """
     try:
         with path.open("rb") as opened, zipfile.ZipFile(opened) as archive:
@@ -197,7 +197,7 @@ def verify(path: Path) -> None:
 
 
 def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
-    """Reads one array, yields the size of each piece, and returns the array's checksum; verifies the CRC at the end."""
+    """Reads one array in pieces, yields their sizes, and returns its checksum; the CRC is verified at the end."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, fortran, dtype = readers[version](file)
@@ -213,10 +213,10 @@ def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
 
 
 def _damage(path: Path, error: BaseException) -> ValueError:
-    return ValueError(f"{path.name} is damaged, or no npz file ({type(error).__name__}: {message_of(error)})")
+    return ValueError(f"{path.name} is damaged or not an npz file ({type(error).__name__}: {message_of(error)})")
 
 
 def clear_parts(folder: Path) -> None:
-    """Removes temporary files of interrupted ``write_npz`` calls; only the folder's writer may call this."""
+    """Removes temporary files of interrupted ``write_npz`` calls; only the process that writes to it may call this."""
     for part in folder.glob(".*.npz.*.part"):
         part.unlink(missing_ok=True)

@@ -1,11 +1,11 @@
-"""Selects the states that retention deletes: the oldest ones, where states of a chunk are deleted together."""
+"""Selection of the states that retention deletes: the oldest ones; the states of a chunk are deleted together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
 GoWith = Callable[[int], list[int]]
-"""Returns the frames that can only be deleted together with a frame, including itself; some may be deleted already."""
+"""Returns a frame and all frames that must be deleted together with it; some may already have been deleted."""
 
 
 def surplus(
@@ -16,16 +16,16 @@ def surplus(
     size_bytes: int | None,
     go_with: GoWith | None = None,
 ) -> list[int]:
-    """Returns the states to delete, in increasing order. The first and the newest ones are always kept.
+    """Returns the indices of the states to delete, in increasing order; the first and newest states are never deleted.
 
     Args:
         indices: indices of all states, in increasing order.
-        size_of: returns the size of a state in bytes.
+        size_of: function that returns the size of a state in bytes.
         newest: number of newest states that are always kept.
-        last: number of states to keep in addition to the first; None for all. A chunk is deleted once it has none of
-            them.
-        size_bytes: maximum total size in bytes, enforced by deleting whole chunks; None for no limit.
-        go_with: returns the states deleted together with one; None deletes each separately.
+        last: number of states to keep in addition to the first; all if None. A chunk is deleted once it contains none
+            of them.
+        size_bytes: maximum total size in bytes, enforced by deleting whole chunks; no limit if None.
+        go_with: function that returns the states to delete together; if None, each state is deleted separately.
 
     >>> ten = lambda index: 10
     >>> surplus(range(8), ten, 2, None, 61)
@@ -47,7 +47,7 @@ def surplus(
 
 
 def _groups(candidates: Sequence[int], go_with: GoWith | None) -> Iterator[list[int]]:
-    """Yields frames that are deleted together, the oldest first."""
+    """Yields groups of frames that are deleted together, oldest first."""
     known, taken = set(candidates) if go_with is not None else set(), set[int]()
     for index in candidates:
         if index not in taken:

@@ -20,10 +20,10 @@ IN_MEMORY = 16
 
 
 class ScratchFile:
-    """An unnamed temporary file, deleted however the process ends. It is neither synced nor checksummed.
+    """Unnamed temporary file that is removed even if the process crashes. It is neither synced nor checksummed.
 
     Args:
-        within: a folder on the disk to use; None uses the system's temporary folder. The file is created on first use.
+        within: folder in which the file is created on first use; the system's temporary folder if None.
     """
 
     def __init__(self, within: Path | None) -> None:
@@ -31,7 +31,7 @@ class ScratchFile:
         self._file: IO[bytes] | None = None
         self._end = 0
         self._free: dict[int, list[int]] = {}
-        """Free blocks, by size."""
+        """Offsets of the free blocks of each size."""
         self._full = False
         self._one_at_a_time = Lock()
 
@@ -46,10 +46,10 @@ class ScratchFile:
             return frame
 
     def put(self, array: NDArray[Any]) -> int:
-        """Adds an array and returns its offset.
+        """Adds an array to the file and returns its offset.
 
         Raises:
-            OSError: there is no space.
+            OSError: the file cannot be written, for example because the disk is full.
         """
         with self._one_at_a_time:
             if self._file is None:
@@ -97,8 +97,8 @@ class ScratchFrame(Mapping[str, NDArray[Any]]):
 
     Args:
         file: file that contains the arrays.
-        begins: offsets by name.
-        frame: the arrays, for their dtypes and shapes.
+        begins: offset of each array in the file.
+        frame: arrays of the frame, of which only the dtypes and shapes are used.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

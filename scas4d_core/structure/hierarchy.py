@@ -1,9 +1,9 @@
 """Cluster hierarchy (paper, Training Strategy): K-means for the finest layer, agglomerative merging for the others.
 
-Clusters are numbered so that, with Gaussians sorted by their finest cluster, every cluster of every layer is one
+Clusters are numbered such that, with Gaussians sorted by their finest cluster, every cluster of every layer is a
 contiguous range. The kernels and the gradient sums rely on this order.
 
-Gaussians that are not finite belong to no cluster: they do not move, and are counted (``guards.LEFT_OUT``).
+Gaussians with non-finite positions belong to no cluster. They do not move, and are counted (``guards.LEFT_OUT``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ KMEANS_ROUNDS = 30
 """Maximum number of Lloyd iterations; the update needs compact clusters, not an optimum."""
 
 KMEANS_SAMPLE_PER_CLUSTER = 256
-"""Points per cluster that K-means uses; sampling bounds time and memory (1 M points: 330,000 x 3)."""
+"""Number of points per cluster on which K-means is fitted; sampling bounds time and memory (330,000 of 1 M points)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class Hierarchy:
     """Nested clusters of the M moving Gaussians.
 
     Attributes:
-        rows: [M] int64, rows of the moving Gaussians in Θ, in the order that makes clusters contiguous.
-        labels: per layer, coarse to fine, [M] int32 cluster of each entry of ``rows``; ascending.
-        starts: per layer, [K + 1] int64 range of entries of each cluster.
-        left_out: number of moving Gaussians that are not finite and therefore in no cluster.
+        rows: [M] int64 row of each moving Gaussian in Θ, in an order that makes clusters contiguous.
+        labels: for each layer, coarse to fine, the [M] int32 cluster index of each entry of ``rows``, ascending.
+        starts: for each layer, the [K + 1] int64 boundaries of the clusters in ``rows``.
+        left_out: number of moving Gaussians that are in no cluster because their positions are not finite.
     """
 
     rows: Int
@@ -48,23 +48,24 @@ class Hierarchy:
 
     @property
     def without_layers(self) -> Hierarchy:
-        """Returns a hierarchy of the same Gaussians in the same order, without layers."""
+        """A hierarchy of the same Gaussians in the same order, but without layers."""
         return Hierarchy(self.rows, (), (), self.left_out)
 
 
 def build_hierarchy(
     means: NDArray[Any], moving: NDArray[np.bool_], clusters: tuple[int, ...], smallest: int, seed: int = 0
 ) -> Hierarchy:
-    """Clusters the moving Gaussians (paper, Training Strategy).
+    """Groups the moving Gaussians into layers of nested clusters (paper, Training Strategy).
 
     Args:
-        means: [N, 3] metres; rows that are not finite belong to no cluster. moving: [N] Gaussians to cluster.
-        clusters: number of clusters per layer, coarse to fine, ascending; capped to an average of at least ``smallest``
-            Gaussians per cluster. Empty: no layers.
+        means: [N, 3] positions in metres; Gaussians with non-finite positions belong to no cluster.
+        moving: [N] bool, Gaussians to cluster.
+        clusters: number of clusters per layer, coarse to fine, ascending; no layers if empty.
+        smallest: minimum average number of Gaussians per cluster, which caps the numbers of clusters.
         seed: random seed of K-means.
 
     Raises:
-        ValueError: if the numbers of clusters are not ascending.
+        ValueError: the numbers of clusters are not ascending.
 
     >>> points = np.array([[0, 0, 0], [5, 0, 0], [0.1, 0, 0], [5.1, 0, 0], [9, 9, 9]])
     >>> moving = np.array([True, True, True, True, False])
@@ -84,7 +85,7 @@ def build_hierarchy(
     if not sizes:
         return Hierarchy(rows, (), (), left_out)
     points = np.asarray(means, dtype=np.float64)[rows]
-    # Library sums depend on the thread order, so a single thread is used to get reproducible clusters.
+    # Sums in the libraries depend on the order of threads, so a single thread is used for reproducible clusters.
     with threadpool_limits(limits=1):
         finest = _kmeans(points, sizes[-1], seed)
         layers = [finest]
@@ -104,8 +105,8 @@ def build_hierarchy(
 def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
     """Returns K-means labels [M]; empty clusters are removed.
 
-    It works in float64 on centred points, so that nearly equidistant points get the same label on every processor,
-    regardless of rounding in its linear algebra.
+    Points are centred and in float64, so that nearly equidistant points get the same label on every processor despite
+    differences in rounding.
     """
     from sklearn.cluster import KMeans  # the import takes a second and is not needed for views and frame 0
 
@@ -121,11 +122,11 @@ def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
 
 
 def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
-    """Returns labels [M] after merging the clusters to ``count`` clusters.
+    """Merges clusters into ``count`` larger ones, and returns the new labels [M].
 
-    Agglomerative clustering of the mean positions (as in the paper) initializes a K-means among the clusters. K-means
-    assigns clusters at a border to the nearer parent, and keeps the layers nested. Without it, clusters that were
-    merged early stay together even if they fit badly later.
+    Agglomerative clustering of the centroids (as in the paper) initializes K-means over the clusters. K-means assigns
+    clusters at a border to the nearer parent, and keeps the layers nested. Without it, clusters that were merged early
+    would stay together even if they no longer belong together.
     """
     from sklearn.cluster import AgglomerativeClustering, KMeans
 

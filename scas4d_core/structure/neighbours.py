@@ -15,8 +15,9 @@ class Neighbours:
     """Neighbour graph over M Gaussians, in the order of the hierarchy.
 
     Attributes:
-        index: [M, k] int32. weights: [M, k] float32, exp(−falloff d²), 0 for missing neighbours.
-        distances: [M, k] float32 metres, at the time when the graph was built.
+        index: [M, k] int32 indices of the neighbours of each Gaussian.
+        weights: [M, k] float32 weights exp(−falloff d²), 0 for missing neighbours.
+        distances: [M, k] float32 distances in metres when the graph was built.
     """
 
     index: NDArray[np.int32]
@@ -25,10 +26,12 @@ class Neighbours:
 
 
 def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbours:
-    """Finds the ``count`` nearest neighbours of each of ``means`` [M, 3]; fewer if there are fewer Gaussians.
+    """Finds the ``count`` nearest neighbours of each Gaussian, or fewer if there are fewer Gaussians.
 
     Args:
-        means: [M, 3] metres. count: k. falloff: 1/m²; the weight of a neighbour at distance d is exp(−falloff d²).
+        means: [M, 3] positions in metres.
+        count: number of neighbours k.
+        falloff: decay of the weights in 1/m²; a neighbour at distance d has the weight exp(−falloff d²).
 
     >>> graph = build_neighbours(np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]]), count=1, falloff=1.0)
     >>> graph.index[:, 0], graph.distances[:, 0]
@@ -44,7 +47,7 @@ def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbo
     distances = np.zeros((total, count), np.float32)
     if neighbour_count > 0:
         far, near = (np.asarray(found_by) for found_by in cKDTree(points).query(points, k=neighbour_count + 1))
-        # The point itself is usually first; if points coincide, it may be at any place or missing.
+        # A point usually comes first among its own neighbours; if points coincide, it may be anywhere or missing.
         own = near == np.arange(total)[:, None]
         own[~own.any(axis=1), -1] = True
         near, far = near[~own].reshape(total, neighbour_count), far[~own].reshape(total, neighbour_count)

@@ -10,16 +10,16 @@ images and which results are accepted.
 The objects that one update passes through, from ``Reconstruction.step`` to the commit:
 
 1. ``engines.views.TrainingView``: one camera's image of the frame, created by ``view_factory``.
-2. ``checkpoint.CarryOver``: the state that the previous update passes on in addition to Θ_{t−1}; at the end, that of
+2. ``checkpoint.CarryOver``: the data that the previous update passes on in addition to Θ_{t−1}; at the end, the data of
 this update.
 3. ``robust.outliers.Past``: the usual values of the scene and its cameras; part of the carry-over.
 4. ``warm_start.Motion``: the motion of the previous update; part of the carry-over.
 5. ``preparation.PreparedUpdate``: the updater for the current clusters and effects, with the carry-over.
-6. ``robust.update_input.UpdateInput``: all of these for one frame, and its time limits.
+6. ``robust.update_input.UpdateInput``: the input of one frame's update, assembled from these, with its time limits.
 7. ``result.AttemptOptions``: the options of one attempt at the frame.
 8. ``result.UpdateTrace``: the record of an attempt.
 9. ``result.UpdateResult``: the final state, its motion and trace.
 10. ``frame_report.FrameReport``: the report that is committed with the state.
 
-``frame_context.FrameContext`` holds these objects for one frame during processing.
+``frame_context.FrameContext`` contains these objects while a frame is processed.
 """

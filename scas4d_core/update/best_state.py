@@ -1,7 +1,7 @@
 """Compares the candidates for Θ_t on a few training views: the end of an update, its warm start, and Θ_{t−1}.
 
 An update may end at any time. The committed state is never worse than the previous state or the extrapolated motion.
-The probe views are the same in every frame, and rendering them counts as time of the update.
+The probe views are the same in every frame, and the time to render them counts towards the update.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from scas4d_core.update.warm_start import Motion, warm_start
 VIEWS = 4
 """Number of probe views per frame."""
 SCALE = 0.5
-"""Scale of their images: a quarter of the pixels is sufficient for comparing states."""
+"""Scale of the images of probe views: a quarter of the pixels is sufficient for comparing states."""
 FEWEST = 80
-"""Minimum side of the scaled images in pixels; otherwise full-size images are compared. With 32, the extrapolated
-motion was preferred for ten consecutive frames while all cameras lost 1.2 dB.
+"""Minimum side of the scaled images, in pixels; if they are smaller, full-size images are compared. With 32, the
+extrapolated motion was preferred for ten consecutive frames while all cameras lost 1.2 dB.
 """
 ALIASED = 2.0
 """Ratio between the previous state's errors in small and full-size images above which full-size images are compared.
@@ -35,31 +35,31 @@ Small images then show aliasing from Gaussians smaller than their pixels."""
 
 
 def spread_cameras(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
-    """Returns ``count`` of the cameras by farthest-point sampling of their centres."""
+    """Returns the names of ``count`` cameras, selected by farthest-point sampling of their centres."""
     centres = np.array([rig[name].centre for name in names])
     return [names[index] for index in farthest_first(centres, count)]
 
 
 def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
-    """Returns the mean over the named views that have an error; NaN if there are none."""
+    """Returns the mean error over the named views that have one; NaN if there are none."""
     values = [errors[name] for name in names if name in errors]
     return float(np.mean(values)) if values else nan
 
 
 WHOLE = " whole"
-"""Suffix of the names of views that were compared at full size, in errors over several frames."""
+"""Suffix of the names of views compared at full size, in errors that are kept across frames."""
 
 COMMITTED = " committed"
-"""Suffix of the names of views in which a committed state was evaluated at full size."""
+"""Suffix of the names of views in which a committed state was evaluated at full size, in the same errors."""
 CONFIRMING = 2
-"""Number of such views; full-size images have four times the pixels."""
+"""Number of views in which a committed state is evaluated; full-size images have four times as many pixels."""
 SLOW = 0.5
 """Relative excess error of Θ_{t−1} over Θ_t in small images up to which the next frame may be static; only then are
 full-size images evaluated."""
 
 
 def label_by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
-    """Returns errors with names that distinguish full-size images, whose errors are smaller, from small ones.
+    """Returns errors with names that distinguish full-size images, whose errors are smaller, from scaled images.
 
     >>> label_by_size({"c0": 0.1}, whole=True)
     {'c0 whole': 0.1}
@@ -68,7 +68,7 @@ def label_by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
 
 
 def probe_views(rig: Rig, views: Sequence[TrainingView], count: int = VIEWS) -> list[TrainingView]:
-    """Returns the probe views among the views: ``spread_cameras`` over the rig."""
+    """Returns the probe views, selected from the views with ``spread_cameras``."""
     chosen = set(spread_cameras(rig, [view.name for view in views], count))
     return [view for view in views if view.name in chosen]
 
@@ -77,11 +77,12 @@ class ProbeViews:
     """Fixed training views for comparing states; the engine loads ``views`` as the probes of a frame.
 
     Args:
-        factory: of the rig. engine: computes the errors. views: of the frame, from which ``spread_cameras`` selects;
-            without views, nothing is compared.
+        factory: factory of the rig's training views.
+        engine: engine that computes the errors.
+        views: views of the frame, from which ``spread_cameras`` selects; if empty, nothing is compared.
 
     Attributes:
-        views: the full-size images, then the small ones if they are used.
+        views: the probe views at full size, then the scaled ones if they are used.
         whole: whether full-size images are compared; known after the first comparison.
     """
 
@@ -97,7 +98,7 @@ class ProbeViews:
         self._engine, self._looked = engine, self.whole
 
     def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
-        """Returns the image loss of a state in each view, by camera name.
+        """Returns the image loss of a state in each probe view, keyed by camera name.
 
         Args:
             moved, learnt: select the state, see ``UpdateEngine.probe``.
@@ -120,7 +121,11 @@ class ProbeViews:
 
 
 def is_slow_motion(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
-    """Returns true if Θ_{t−1} fits a frame nearly (``SLOW``) as well as the kept state; ``errors`` by probe view.
+    """Returns true if Θ_{t−1} fits a frame nearly as well as the kept state (``SLOW``).
+
+    Args:
+        errors: error of each candidate in each probe view.
+        kept: candidate that became Θ_t.
 
     >>> is_slow_motion({Candidate.PREVIOUS: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
     True
@@ -133,7 +138,10 @@ def committed_errors(rig: Rig, renderer: Renderer, views: Sequence[TrainingView]
     """Returns the image loss of a committed state in a few full-size probe views, under separate names.
 
     Args:
-        rig: as given, without pose drift. renderer: compares full-size images. views: views of the frame.
+        rig: rig as calibrated, without pose drift.
+        renderer: renderer that computes the image loss.
+        views: views of the frame.
+        state: the committed state.
     """
     chosen = probe_views(rig, views, CONFIRMING)
     return {view.name + COMMITTED: renderer.compare(state, view).image_loss for view in chosen}
@@ -143,11 +151,16 @@ class BestState:
     """Selects the best start of an update and the best state at its end.
 
     Args:
-        probes: probes of the frame. engine: has loaded Θ_{t−1}. hierarchy: hierarchy of the moving Gaussians.
-        motion: of the previous update, or None. seconds: since it was measured. momentum: see ``UpdateSettings``.
+        probes: probe views of the frame.
+        engine: engine that has loaded Θ_{t−1}.
+        hierarchy: hierarchy of the moving Gaussians.
+        motion: motion of the previous update, or None.
+        seconds: time since that motion was measured, in seconds.
+        momentum: share of the motion of individual Gaussians that is extrapolated, see ``warm_start``.
 
     Attributes:
-        errors: by candidate, then by probe view. seconds: duration for which the motion is extrapolated.
+        errors: error of each candidate in each probe view.
+        seconds: duration over which the motion is extrapolated, in seconds.
     """
 
     def __init__(
@@ -173,8 +186,8 @@ class BestState:
         """Sets the previous motion, or no motion if that fits the frame better, as the start in the engine.
 
         Args:
-            step: seconds since the previous frame, if that frame was skipped and the motion may have paused. None: the
-                same as since the motion was measured.
+            step: time since the previous frame in seconds, if that frame was skipped and the motion may have paused. If
+                None, the motion is extrapolated over the whole time since it was measured.
         """
         motion = self._motion
         self._record(Candidate.PREVIOUS, self._probes.errors(moved=False, learnt=False))
@@ -188,7 +201,7 @@ class BestState:
         return tables
 
     def _try_after_pause(self, motion: Motion, step: float) -> Tables:
-        """Extrapolates the motion only from the previous frame, and keeps it if it fits the frame better."""
+        """Tries to extrapolate the motion only over the last ``step`` seconds, and keeps the better fit."""
         whole, errors = self.seconds, self.errors[Candidate.WARM]
         self.seconds = step
         tables = self._set(motion)
@@ -201,8 +214,9 @@ class BestState:
     def can_skip(self, skip_below: Mapping[str, float] | None, confirm_skip: Callable[[], bool] | None = None) -> bool:
         """Returns true if Θ_{t−1} fits this frame within ``skip_below`` and ``confirm_skip`` agrees.
 
-        ``skip_below`` has errors as from ``label_by_size``. If it is None, the result is false; a ``confirm_skip`` of
-        None is not called.
+        Args:
+            skip_below: maximum error of each view, named as by ``label_by_size``. If None, the result is false.
+            confirm_skip: function that confirms the skip, called only if the errors allow it; None for no confirmation.
         """
         still = self.errors.get(Candidate.PREVIOUS)
         if (
@@ -218,8 +232,9 @@ class BestState:
 
         The result is 1 if nothing is compared, there was no previous motion, or nothing has changed.
 
-        No motion reduces the error of the static scene. ``reference_errors``, errors at the end of updates as from
-        ``label_by_size``, are subtracted to remove it.
+        Args:
+            reference_errors: errors at the end of previous updates, named as by ``label_by_size``. They are subtracted,
+                because no motion can reduce the error of the static scene.
         """
         still, warm = (self.errors.get(candidate) for candidate in (Candidate.PREVIOUS, Candidate.WARM))
         if still is None or warm is None or not reference_errors:
@@ -240,7 +255,8 @@ class BestState:
         """Selects the best candidate and sets the engine's tables to it.
 
         Args:
-            iterations: number of iterations in the update. left_out: cameras to ignore.
+            iterations: number of iterations in the update.
+            left_out: cameras to ignore.
         """
         if not self.errors:
             return Candidate.END
@@ -257,7 +273,7 @@ class BestState:
         return best
 
     def _best_at_full_size(self, best: Candidate, left_out: Mapping[str, str]) -> Candidate:
-        """Returns the best candidate on full-size images, which may show slow motion; ties are resolved to ``best``.
+        """Returns the best candidate on full-size images, which may reveal slow motion; ties are resolved to ``best``.
 
         The engine's tables are unchanged afterwards.
         """
@@ -283,7 +299,7 @@ class BestState:
             self.errors[candidate] = errors
 
     def _full_size_error(self, learnt: bool, left_out: Mapping[str, str]) -> float:
-        """Returns the mean error on full-size images without ignored cameras; NaN counts as infinite."""
+        """Returns the mean error on full-size images, without ignored cameras; infinity instead of NaN."""
         errors = self._probes.full_size_errors(moved=True, learnt=learnt)
         return _nan_to_inf(mean_error(errors, [name for name in errors if name not in left_out]))
 

@@ -31,22 +31,25 @@ Array = NDArray[np.float32]
 SMOOTH_GLOSS_EVERY = 10
 """Iterations between two smoothing passes of the gloss changes over neighbours."""
 GLOSS_END = 0.1
-"""Share of the gloss learning rates that remains at the end of an update."""
+"""Fraction to which the gloss learning rates decay by the end of an update."""
 
 
 class FrameUpdate:
     """Updates the frames of a scene for one hierarchy, on one engine.
 
     Args:
-        engine: computes the update; it is bound to the plan here. built: plan and parts of the active effects.
+        engine: engine that computes the updates; it is bound to the plan here.
+        built: plan and parts of the active effects.
         neighbours: neighbours of the moving Gaussians; None if no term needs them.
 
     Attributes:
-        plan: plan of the updates. hierarchy: hierarchy of the moving Gaussians.
-        curve: whether loss terms are computed that only the report needs; they do not affect state and evidence.
+        settings: settings of the updates.
+        plan: plan of the updates.
+        hierarchy: hierarchy of the moving Gaussians.
+        curve: whether to compute loss terms that only the report needs; they do not affect the state or the evidence.
 
     Raises:
-        EngineError: the engine does not support the plan.
+        EngineError: if the engine does not support the plan.
     """
 
     curve = True
@@ -68,12 +71,16 @@ class FrameUpdate:
         options: AttemptOptions = AS_CONFIGURED,
         carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
-        """Finds D_t and applies it to Θ_{t−1}.
+        """Finds the deformation D_t and applies it to Θ_{t−1}.
 
         Args:
-            previous: Θ_{t−1}. views: of frame t. motion: motion of the previous update, or None.
-            seconds: between the frames. seed: for the order of views and the sampled neighbours.
-            options: of this attempt. carried: arrays that the effects carry over, by effect.
+            previous: previous state Θ_{t−1}.
+            views: training views of frame t.
+            motion: motion of the previous update, or None.
+            seconds: time between the frames, in seconds.
+            seed: seed for the order of views and the sampled neighbours.
+            options: options of this attempt.
+            carried: arrays carried over by the effects, keyed by effect name.
         """
         settings, engine = self.settings, self._engine
         motion = predicted(motion, self.plan.freedom)
@@ -128,7 +135,7 @@ class FrameUpdate:
         return UpdateResult(state, after, trace, carried=attempt.carried, views=self._exposed(views))
 
     def _exclude_outliers(self, gate: Gate, attempt: Attempt, order: ViewPlan, trace: UpdateTrace) -> None:
-        """Excludes cameras that do not fit from the rest of an attempt; called after each camera was rendered once."""
+        """Excludes cameras that do not fit from the rest of an attempt; called once every camera has been rendered."""
         trace.load_log(self._engine.log(), attempt.views)
         trace.left_out.update(gate(trace.first))
         excluded = [index for index, view in enumerate(attempt.views) if view.name in trace.left_out]
@@ -169,7 +176,10 @@ class FrameUpdate:
         """Returns the scalars of an iteration.
 
         Args:
-            planned: total iterations. planned_before: the same as planned for the previous iteration.
+            rates: learning rates of the attempt.
+            iteration: index of the iteration.
+            planned: total number of iterations, as currently planned.
+            planned_before: total number of iterations, as planned at the previous iteration.
             samples: number of neighbour samples.
         """
         rigidity = self.plan.rigidity
@@ -202,7 +212,9 @@ def structure_of(hierarchy: Hierarchy, neighbours: Neighbours | None, first: Gau
     """Returns the structure that an update deforms, with the axis lengths of frame 0.
 
     Args:
-        first: the roots, Θ_0 plus all Gaussians added since.
+        hierarchy: hierarchy of the moving Gaussians.
+        neighbours: neighbours of the moving Gaussians, or None.
+        first: root Gaussians: Θ_0 plus all Gaussians added since.
     """
     lengths: Array = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
     return Structure(hierarchy, neighbours, first.means, lengths)

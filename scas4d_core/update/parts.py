@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 Arrays = dict[str, NDArray[Any]]
 NOTHING: Mapping[str, Arrays] = MappingProxyType({})
-"""Empty arrays of effects."""
+"""No arrays of any effect."""
 
 P = TypeVar("P", bound="UpdatePart")
 
@@ -42,13 +42,16 @@ class Attempt:
     """One attempt at a frame, as seen by the parts.
 
     Attributes:
-        engine: computes the attempt. renderer: renders states of the scene.
-        previous: Θ_{t−1}. views: that the attempt learns from. rates: of this attempt.
+        engine: engine that computes the attempt.
+        renderer: renderer for states of the scene.
+        previous: previous state Θ_{t−1}.
+        views: training views that the attempt uses.
+        rates: learning rates of this attempt.
         tables: initial deformation; a part may change it in ``begin``.
+        carried: arrays from the previous frame, keyed by effect name; in ``end``, parts replace them with those for the
+            next frame.
         gains: [cameras, 3] initial camera gains; None if gains are not estimated.
-        carried: arrays from the previous frame, by effect; in ``end``, parts replace them with those for the next
-            frame.
-        kept: the candidate that becomes Θ_t; valid at the end.
+        kept: candidate that becomes Θ_t; valid in ``end``.
     """
 
     engine: UpdateEngine
@@ -78,9 +81,13 @@ class PlanBuilder:
     """Builds the plan and the parts of a scene's updates while the active effects register.
 
     Attributes:
-        scene, update: the settings, with the floor in the internal world. factory: creates the scene's views.
-            hierarchy: of the moving Gaussians. first: the roots, Θ_0 plus all Gaussians added since (``preparation``).
-        plan: filled in by the effects. parts: parts of the effects, in order.
+        scene: scene settings, with the floor in the internal world.
+        update: update settings.
+        factory: factory of the scene's training views.
+        hierarchy: hierarchy of the moving Gaussians.
+        first: root Gaussians: Θ_0 plus all Gaussians added since (``preparation``).
+        plan: plan that the effects fill in.
+        parts: parts of the effects, in order.
     """
 
     scene: SceneSettings

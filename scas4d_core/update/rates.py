@@ -1,4 +1,4 @@
-"""Learning rates of an update, identical on every engine: the rate and active period of each parameter.
+"""Learning rates of an update, identical on every engine: the rate and the active period of each parameter.
 
 Coarse motion is found first: a layer of clusters starts after the layers above it. If the previous motion predicts the
 frame well, coarse layers are frozen before the finer ones. Their remaining fluctuation from view to view would move
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 RATE_SCALING = 0.002
 """Learning rate of a cluster's c (1/m) and s, per iteration."""
 STANDARD_RADIUS_M = 4.0
-"""The scene radius to which the layers' translation rates refer, in metres."""
+"""Scene radius to which the layers' translation rates refer, in metres."""
 
 
 LAYER_STARTS = (0.0, 0.2, 0.4)
@@ -32,7 +32,7 @@ LAYER_ENDS = (0.5, 0.75, 1.0)
 (docs/tried.md)."""
 FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
 """The same for the first update, which runs in several view orders: motion that one order misses by then is found by
-another. It gained 0.0 to 0.5 dB (docs/tried.md)."""
+another. These values gained 0.0 to 0.5 dB (docs/tried.md)."""
 NEAR_FINEST = 4.0
 """Factor on the rates of the finest layer if the layers above it are frozen early."""
 NEAR_OWN = 2.0
@@ -41,8 +41,8 @@ keep their rates: with faster ones, synthetic scenes fit less well (docs/tried.m
 LEAST_TIME = 0.3
 """Minimum share of the iterations for a layer before it is frozen."""
 NEAR = 0.6
-"""Maximum unexplained share of the change for early freezing of layers. With every second frame left out it was about
-0.55 to 1.2, and unconditional freezing cost 0.6 to 3.4 dB (docs/tried.md)."""
+"""Maximum unexplained share of the change for early freezing of layers. With every second frame left out, the share was
+about 0.55 to 1.2, and unconditional freezing cost 0.6 to 3.4 dB (docs/tried.md)."""
 
 
 FASTER_IN_CHANGING_LIGHT = 2.0
@@ -50,12 +50,14 @@ FASTER_IN_CHANGING_LIGHT = 2.0
 
 
 def first_iteration(start: float, iterations: int) -> int:
-    """Returns the iteration, from 0, of the first step of a parameter that starts after a share ``start``."""
+    """Returns the index of the first iteration of a parameter that starts after the share ``start`` of the update."""
     return round(start * iterations)
 
 
 def learning_span(start: float, rest: float, iterations: int) -> range:
-    """Returns the iterations, from 0, in which a parameter learns between two shares; at least one.
+    """Returns the indices of the iterations in which a parameter learns, from one share of the update to another.
+
+    The range contains at least one iteration.
 
     >>> learning_span(0.25, 0.75, 8), learning_span(0.4, 0.5, 2)
     (range(2, 6), range(1, 2))
@@ -69,15 +71,18 @@ class Rates:
     """Adam learning rates per iteration; with a rate of 0, a parameter keeps its initial value.
 
     Attributes:
-        layers: (rotation r, translation t in metres, scaling c and s) per layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving Gaussians. static_colour: RGB of
-            static Gaussians.
-        end: fraction to which a rate decays on a half-cosine until its layer is frozen or the update ends; 1: constant
-            rate.
-        beta1, beta2: Adam decays.
-        layer_starts: share of the iterations after which each layer starts; missing layers start at once.
+        layers: rates of rotation r, translation t (in metres), and scaling c and s of each layer, coarse to fine.
+        position: rate of Δp, in metres.
+        rotation: rate of ΔR.
+        scale: rate of Δs.
+        colour: rate of the RGB of moving Gaussians.
+        static_colour: rate of the RGB of static Gaussians.
+        end: fraction to which a rate decays on a half-cosine until its layer is frozen or the update ends; 1 means
+            constant rates.
+        beta1, beta2: decay rates of Adam.
+        layer_starts: share of the iterations after which each layer starts to learn; missing layers start at once.
         layer_ends: share of the iterations after which each layer is frozen; missing layers learn to the end.
-        start: as ``layer_starts``, for the Gaussians' own Δp, ΔR, Δs.
+        start: share of the iterations after which the Gaussians' own Δp, ΔR and Δs start to learn.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -94,10 +99,14 @@ class Rates:
     start: float = 0.0
 
     def factor(self, iteration: int, iterations: int, start: float = 0.0, rest: float = 1.0) -> float:
-        """Returns the factor on a rate in an iteration, for a parameter that learns between two shares; 0 outside of
-        them.
+        """Returns the factor on the rate of a parameter in an iteration; 0 while the parameter does not learn.
 
         A parameter learns for at least one iteration.
+
+        Args:
+            iteration: index of the iteration.
+            iterations: total number of iterations.
+            start, rest: shares of the iterations after which the parameter starts and stops to learn.
 
         >>> rates = Rates((), 0, 0, 0, 0, end=0.2)
         >>> [round(rates.factor(i, 8, 0.25, 0.75), 2) for i in range(8)]
@@ -151,10 +160,10 @@ class Rates:
         return moving if plan.moving else 0.0, static if plan.static else 0.0
 
     def for_cold_start(self, factor: float, several_orders: bool = False) -> Rates:
-        """Returns the rates without a previous motion: layers rotate and translate faster, because they have farther to
-        go.
+        """Returns the rates for an update without a previous motion.
 
-        Layers are frozen early only if the update runs in ``several_orders`` of its views.
+        Layers rotate and translate faster by ``factor``, because they have farther to go. They are frozen early only if
+        the update is run in several view orders.
         """
         layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
         return replace(
@@ -166,8 +175,8 @@ class Rates:
     def for_warm_start(self, unexplained: float) -> Rates:
         """Returns the rates for a previous motion that leaves a share of the change unexplained.
 
-        If the share is at most ``NEAR``, layers are frozen early and the levels below learn faster; otherwise none is
-        frozen.
+        If the share is at most ``NEAR``, layers are frozen early, and the finest layer and the Gaussians' own Δp learn
+        faster. Otherwise no layer is frozen.
         """
         if not unexplained <= NEAR:  # also true for NaN
             return replace(self, layer_ends=())
@@ -180,7 +189,10 @@ class Rates:
     def for_attempt(self, factor: float, rigid: bool, freeze_colours: bool) -> Rates:
         """Returns all rates multiplied by a factor.
 
-        ``rigid``: only cluster rotations and translations learn. ``freeze_colours``: colours do not learn.
+        Args:
+            factor: factor on all rates.
+            rigid: whether only cluster rotations and translations learn.
+            freeze_colours: whether colours do not learn.
         """
         if (factor, rigid, freeze_colours) == (1.0, False, False):
             return self
@@ -197,7 +209,7 @@ class Rates:
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
-        """Returns the rates for a number of layers and a camera reach ``radius`` in metres (``Rig.reach``)."""
+        """Returns the rates for a number of layers and the reach of the rig, ``radius``, in metres (``Rig.reach``)."""
         layer_starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
@@ -219,12 +231,12 @@ class Rates:
 def _layer_ends(layer_ends: tuple[float, ...], layer_starts: tuple[float, ...]) -> tuple[float, ...]:
     """Returns the share of the iterations after which each layer is frozen, at least ``LEAST_TIME`` after its start.
 
-    With fewer layers the last values of ``layer_ends`` are used; with more layers the first one repeats.
+    With fewer layers, the last values of ``layer_ends`` are used; with more layers, the first value repeats.
     """
     ends = (layer_ends[max(k - len(layer_starts), -len(layer_ends))] for k in range(len(layer_starts)))
     return tuple(min(1.0, max(end, start + LEAST_TIME)) for end, start in zip(ends, layer_starts, strict=True))
 
 
 def latest_start(settings: UpdateSettings) -> float:
-    """Returns the share of the iterations after which every layer and the Gaussians' own deltas learn."""
+    """Returns the share of the iterations after which all layers and the Gaussians' own deltas learn."""
     return max(settings.deltas_start, *LAYER_STARTS)

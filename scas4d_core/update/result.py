@@ -19,17 +19,19 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Takes the first PSNR of each camera in dB, and returns the cameras to exclude with a reason."""
+"""Takes the first PSNR of each camera in dB, and returns the cameras to exclude, with a reason for each."""
 
 
 class Stopwatch:
-    """Measures seconds by stage; the overhead of the timers counts as ``REPORT``.
+    """Measures the time of each stage; the overhead of the timers counts as ``REPORT``.
 
     Args:
         began: ``perf_counter`` value at the start; None for now.
 
     Attributes:
-        seconds: seconds spent in each stage. began, last: ``perf_counter`` values at the start and at the last lap.
+        seconds: time spent in each stage, in seconds.
+        began: ``perf_counter`` value at the start.
+        last: ``perf_counter`` value at the last lap.
     """
 
     def __init__(self, began: float | None = None) -> None:
@@ -59,20 +61,25 @@ class AttemptOptions:
     """Options of one attempt at an update.
 
     Attributes:
-        name: as in the report.
-        rates: factor on all Adam learning rates. rigid: only cluster rotations and translations learn. freeze_colours:
-            colours do not learn.
-        cold: do not use the previous motion. iteration_factor: factor on the iterations.
-        several_orders: whether several view orders are tried and the best result is used. layer_rate_factor: factor on
-            the layers' rates without a previous motion.
-        stopping: decides the number of iterations; None for that of the settings.
-        gate: called with each camera's first PSNR (dB) after all were rendered; returns the cameras to exclude, with
-            the reason. None: no exclusion.
+        name: name of the attempt in the report.
+        rates: factor on all Adam learning rates.
+        rigid: whether only cluster rotations and translations learn.
+        freeze_colours: whether colours do not learn.
+        cold: whether to ignore the previous motion.
+        iteration_factor: factor on the number of iterations.
+        several_orders: whether several view orders are tried and the best result is used.
+        layer_rate_factor: factor on the layers' rates without a previous motion.
+        stopping: rule that decides the number of iterations; None for the number in the settings.
+        gate: function that selects cameras to exclude from their first PSNR in dB, called once all cameras have been
+            rendered. No cameras are excluded if None.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
-        skip_below: image loss by probe view up to which Θ_{t−1} needs no iteration; None: never skip.
-        confirm_skip: called before a skip; returns true if full-size images confirm it. None: no confirmation.
-        reference_errors: errors at the end of previous updates, from ``best_state.label_by_size``; None if unknown.
-        step: seconds since the previous frame, if nothing was learnt from it (``BestState.start``); otherwise None.
+        skip_below: maximum image loss of Θ_{t−1} in each probe view for skipping the iterations; never skipped if None.
+        confirm_skip: function called before a skip, which returns true if full-size images confirm it. No confirmation
+            is needed if None.
+        reference_errors: errors at the end of previous updates, named as by ``best_state.label_by_size``; None if
+            unknown.
+        step: time since the previous frame in seconds, if nothing was learnt from that frame (``BestState.start``);
+            otherwise None.
     """
 
     name: str = "as set"
@@ -100,8 +107,9 @@ class CameraFit(TypedDict):
     """The fit of one camera when it was last rendered; a row of the report on disk.
 
     Keys:
-        psnr: in dB. colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1; None if not measured.
-        health: 0…1: 1 if it fits as usual relative to the other cameras, 0 at the exclusion limit
+        psnr: PSNR in dB.
+        colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1; None if not measured.
+        health: 1 if the camera fits as usual relative to the other cameras, 0 at the exclusion limit
             (``outliers.health``).
     """
 
@@ -120,19 +128,20 @@ class UpdateTrace:
     """Record of one attempt, filled during the attempt.
 
     Attributes:
-        losses: weighted loss of each iteration. psnr: dB of each rendered view, in order; one or more per iteration,
-            depending on the settings. iteration_ends: seconds from the start of the update to the end of each
-            iteration.
-        seconds: seconds spent in each stage.
-        first: dB of each camera when first rendered. cameras: fit of each camera when last rendered, by name.
-        left_out: cameras that the gate excluded, with the reason.
+        losses: weighted loss of each iteration.
+        psnr: PSNR of each rendered view in dB, in order; one or more per iteration, depending on the settings.
+        iteration_ends: time from the start of the update to the end of each iteration, in seconds.
+        seconds: time spent in each stage, in seconds.
+        first: PSNR of each camera when first rendered, in dB.
+        cameras: fit of each camera when last rendered.
+        left_out: reason for each camera that the gate excluded.
         planned: (iteration, total iterations) for each change of plan by the stopping rule.
-        errors: image loss by candidate, then by probe view; empty if nothing was compared. kept: the candidate that
-            became Θ_t.
+        errors: image loss of each candidate in each probe view; empty if nothing was compared.
+        kept: candidate that became Θ_t.
         whole: whether these errors are for full-size images.
-        shown: by camera, the renderings of the last ``engine.KEPT_PICTURES`` iterations, which evidence uses without
-            rendering again. Empty if an update ended earlier than planned.
-        guards: number of actions of each guard that acted.
+        shown: rendering of each camera in the last ``engine.KEPT_PICTURES`` iterations, which evidence uses without
+            rendering again. Empty if the update ended earlier than planned.
+        guards: number of interventions of each guard that intervened.
     """
 
     losses: list[float] = field(default_factory=list)
@@ -156,12 +165,12 @@ class UpdateTrace:
 
     @property
     def fits(self) -> dict[str, float]:
-        """PSNR in dB by camera, when last rendered."""
+        """PSNR of each camera when last rendered, in dB."""
         return {name: fit["psnr"] for name, fit in self.cameras.items()}
 
     @property
     def met(self) -> dict[str, float]:
-        """PSNR in dB of the cameras that were not excluded."""
+        """PSNR of each camera that was not excluded, when last rendered, in dB."""
         return {name: psnr for name, psnr in self.fits.items() if name not in self.left_out}
 
     def load_log(self, log: IterationLog, views: Sequence[TrainingView]) -> None:
@@ -181,19 +190,24 @@ class UpdateResult:
     """The result of an attempt, and of the frame that commits it.
 
     Attributes:
-        gaussians: Θ_t. motion: for the next warm start; None for a cold start. trace: of the attempt; for a rejected
-            frame, of the last attempt before any search.
-        frozen: number of Gaussians that keep their previous state. bounded: number of axes clamped to their minimum or
-            maximum length.
-        outcome: outcome of the frame. reason: in words, if the outcome is degraded.
-        attempts: each attempt at the frame, with its result.
+        gaussians: new state Θ_t.
+        motion: motion for the next warm start; None for a cold start.
+        trace: trace of the attempt; for a rejected frame, that of the last attempt before any search.
+        frozen: number of Gaussians that keep their previous state.
+        bounded: number of axes clamped to their minimum or maximum length.
+        outcome: outcome of the frame.
+        reason: human-readable reason for a degraded outcome.
+        attempts: description of each attempt at the frame, with its result.
         exposure: brightness ratio of the frame to the usual brightness.
-        offsets: dB by camera above (+) or below its usual level among the cameras; empty if nothing was rendered.
-        health: 0…1 by camera of ``offsets``. alarms: except those of excluded cameras (``robust/alarms.py``).
-        timing: by camera, relative capture time (``robust/timing.py``).
-        carried: arrays for the next update, by effect. views: that were learnt from, with their final exposures.
-        parents: [B] int64 for the Gaussians added in this frame, which are the last rows. Each has the row of the
-            parent whose clusters and neighbours it joins, or −1 if it starts a new structure. None: none were added.
+        offsets: offset of each camera above (+) or below its usual level among the cameras, in dB; empty if nothing was
+            rendered.
+        health: health of each camera in ``offsets``, 0…1.
+        alarms: alarms of the frame, except those of excluded cameras (``robust/alarms.py``).
+        timing: relative capture time of each camera (``robust/timing.py``).
+        carried: arrays for the next update, keyed by effect name.
+        views: training views that were used, with their final exposures.
+        parents: [B] int64 row of the parent of each Gaussian added in this frame, whose clusters and neighbours it
+            joins; −1 if it starts a new structure. The added Gaussians are the last rows. None if none were added.
     """
 
     gaussians: Gaussians
@@ -214,13 +228,13 @@ class UpdateResult:
     parents: NDArray[np.int64] | None = None
 
     def with_motion_after(self, first: UpdateResult) -> UpdateResult:
-        """Returns the result with the combined motion, for an update that continued another one."""
+        """Returns the result of an update that continued ``first``, with the motions of both combined."""
         if self.motion is None or first.motion is None:
             return self
         return replace(self, motion=self.motion.after(first.motion))
 
     def with_errors_of(self, first: UpdateResult) -> UpdateResult:
-        """Returns a later attempt with the first attempt's errors of the previous state and warm start."""
+        """Returns the result of a later attempt, with the errors of the previous state and warm start of ``first``."""
         errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
         errors.pop(Candidate.END, None)
         if self.trace.errors:

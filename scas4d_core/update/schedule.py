@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scas4d_core.settings import UpdateSettings
 
 NEIGHBOUR_SAMPLE = 4000
-"""Number of Gaussians per iteration whose neighbours are used, so that the cost does not grow with the scene."""
+"""Number of Gaussians whose neighbours are used in an iteration, so that the cost does not grow with the scene."""
 
 IMAGE_WEIGHT = 1.0
 """Weight of the image loss, 0.8 L1 + 0.2 (1 − SSIM); other weights (``Weights``) are relative to it."""
@@ -25,18 +25,20 @@ SOFT_COLOUR_WEIGHT = 0.01
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
-    """Returns the view for each iteration: a new random permutation after all views have been used."""
+    """Returns the view of each iteration, from successive random permutations of all views."""
     rounds = -(-iterations // count)
     order = np.concatenate([rng.permutation(count) for _ in range(rounds)])[:iterations]
     return [int(index) for index in order]
 
 
 class ViewPlan:
-    """The view indices of each iteration, in random passes over all views.
+    """Selects the views of each iteration, in random passes over all views.
 
     Args:
-        count: number of views. each: views per iteration.
-        most: maximum number of iterations; the order repeats after them.
+        count: number of views.
+        each: number of views per iteration.
+        most: maximum number of iterations, after which the order repeats.
+        rng: random generator for the order.
     """
 
     def __init__(self, count: int, each: int, most: int, rng: np.random.Generator) -> None:
@@ -50,10 +52,10 @@ class ViewPlan:
         """Excludes views from the following iterations; at least one view must remain."""
         self._left_out |= set(views)
         if len(self._left_out) == self._count:
-            raise ValueError(f"all {self._count} views are left out; an update needs one")
+            raise ValueError(f"all {self._count} views are excluded; an update needs at least one")
 
     def take(self) -> list[int]:
-        """Returns the views of the next iteration."""
+        """Returns the view indices of the next iteration."""
         return [self._next_view() for _ in range(self._each)]
 
     def _next_view(self) -> int:
@@ -67,7 +69,8 @@ class ViewPlan:
 def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
     """Returns disjoint random sets of ``NEIGHBOUR_SAMPLE`` of ``count`` Gaussians that cover all; one per iteration.
 
-    A remainder of less than a quarter joins the previous set; otherwise a few Gaussians would have the whole weight.
+    A remainder of less than a quarter of a set joins the previous set; otherwise a few Gaussians would get all the
+    weight.
     """
     order = rng.permutation(count)
     size = min(NEIGHBOUR_SAMPLE, max(count, 1))
@@ -78,7 +81,7 @@ def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]
 
 
 def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
-    """Returns the weight of the mask loss for a scene of ``count`` Gaussians, ``moving`` of them in motion."""
+    """Returns the weight of the mask loss for a scene of ``count`` Gaussians, of which ``moving`` may move."""
     return settings.weights.mask if moving < count else settings.weights.mask_alone
 
 
@@ -87,36 +90,38 @@ COOLING = 0.15
 already frozen."""
 
 LOOK_EVERY = 10
-"""Iterations between two evaluations of the probe views by the stopping rule."""
+"""Number of iterations between evaluations of the probe views by the stopping rule."""
 
 PROBE = 4
-"""Iterations after which an update's own pace replaces the pace of previous updates."""
+"""Number of iterations after which an update's own speed replaces the speed of previous updates."""
 
 MAX_TIMED = 4000
 """Maximum number of iterations with a time limit."""
 
 UNTIMED = 100
-"""Number of planned iterations before the pace is known."""
+"""Number of planned iterations before the speed is known."""
 
 RATE = 0.3
 """Rate at which the budget's predictions follow new measurements."""
 FOR_BIRTHS = 0.4
-"""Share of the budget for fitting added Gaussians: about the time of an update if an object entered."""
+"""Share of the time budget for fitting added Gaussians: about the time of an update when an object enters."""
 AFTER_S = 0.05
-"""Predicted seconds after the last iteration before any frame was measured."""
+"""Predicted time after the last iteration before any frame has been measured, in seconds."""
 
 
 class Stopping:
-    """Decides the length of an update: a fixed number of iterations, a time limit, or an early stop without progress.
+    """Decides the length of an update: a number of iterations, a time limit, or an early stop without progress.
 
     Args:
         most: maximum number of iterations.
-        end: ``clock`` time in seconds by which the last iteration must end; at least one iteration is run. None:
-            ``most`` iterations.
-        iteration_seconds: seconds per iteration in previous updates, or None if unknown.
+        end: ``clock`` time by which the last iteration must end, in seconds; at least one iteration is run. If None,
+            ``most`` iterations are run.
+        iteration_seconds: time per iteration in previous updates, in seconds; None if unknown.
         gain: minimum relative decrease of the error on the probe views per ``LOOK_EVERY`` iterations; with less, the
-            update cools down and stops. Probe views are training views, never held-out ones. 0: no early stop.
+            update cools down and stops. Probe views are training views, never held-out ones. There is no early stop if
+            0.
         first: share of the iterations before which there is no early stop, so that late parameters have started.
+        clock: function that returns the current time in seconds.
 
     Attributes:
         planned_so_far: (iteration, total iterations) for each change of plan.
@@ -144,9 +149,7 @@ class Stopping:
         self._stop: int | None = None
 
     def planned(self, done: int) -> int:
-        """Returns the total iterations, as planned before iteration ``done`` (from 0); the update ends if it is at most
-        ``done``.
-        """
+        """Returns the total number of iterations planned after ``done`` of them; the update ends when it is reached."""
         total = self._total(done)
         if self._stop is not None:
             total = min(total, self._stop)
@@ -166,7 +169,7 @@ class Stopping:
         self._error = error
 
     def _total(self, done: int) -> int:
-        """Returns the total iterations without an early stop."""
+        """Returns the planned total number of iterations without an early stop."""
         if self.end is None:
             return self.most
         now = self._clock()
@@ -182,14 +185,16 @@ class Stopping:
 
 
 class TimeBudget:
-    """The time limit per frame of a scene; predicts the time after the iterations from previous frames.
+    """Time limit per frame of a scene; predicts the time needed after the iterations from previous frames.
 
-    Decoding happens before the iterations and is measured by the clock. Comparison and checks at the end, the
-    checkpoint and the commit happen after them and are predicted.
+    Decoding happens before the iterations and is measured by the clock. The comparison and checks at the end, the
+    checkpoint and the commit happen after the iterations, and their time is predicted.
 
     Attributes:
-        milliseconds: limit per frame; None for no limit. iteration_seconds: seconds per iteration; None if unknown.
-        after: seconds from the last iteration to the end of the commit, without fits of added Gaussians.
+        milliseconds: time limit per frame in milliseconds; no limit if None.
+        iteration_seconds: predicted time per iteration in seconds; None if unknown.
+        after: predicted time from the last iteration to the end of the commit in seconds, without fits of added
+            Gaussians.
         births: whether the next frame reserves time for such fits, because the previous frame had some.
     """
 
@@ -209,15 +214,17 @@ class TimeBudget:
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
     def record_birth_fits(self, spent: float, postponed: Sequence[str]) -> None:
-        """Records the duration of fits of added Gaussians, and those that did not fit the budget."""
+        """Records the time spent on fits of added Gaussians, and the fits that exceeded the budget."""
         kept = self.births  # time that was reserved but was not sufficient is not reserved again
         self.births = bool(spent or postponed) and not (kept and postponed)
 
     def record_frame(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:
-        """Records the duration of a frame.
+        """Records the time spent on a frame.
 
         Args:
-            moments, seconds: of its update, see ``UpdateTrace``. commit: seconds of checks and writing.
+            moments: end of each iteration of the update, see ``UpdateTrace.iteration_ends``.
+            seconds: time spent in each stage of the update, in seconds.
+            commit: time spent on checks and writing, in seconds.
         """
         if not moments:
             return

@@ -17,11 +17,12 @@ class ViewFactory:
     """Creates the training views of each frame of a rig; caches the cameras.
 
     Args:
-        rig: the cameras in the internal world. source: the cameras at the size of the incoming images, if these are
-            resized.
+        rig: cameras in the internal world.
+        source: cameras at the size of the incoming images, if the images are resized.
 
     Attributes:
-        posed: the rig with current poses, which the views use.
+        rig: cameras in the internal world.
+        posed: cameras with their current poses, which the views use.
     """
 
     def __init__(self, rig: Rig, source: Rig | None = None) -> None:
@@ -32,7 +33,7 @@ class ViewFactory:
         """Returns the frame with its images resized to the rig's cameras.
 
         Raises:
-            ValueError: an image or mask does not have the expected size.
+            ValueError: if an image or mask does not have the expected size.
         """
         if self._source is None:
             return frame
@@ -50,10 +51,12 @@ class ViewFactory:
         """Returns the views of a frame in rig order, without cameras that have no image.
 
         Args:
-            exposures: [3, 2] gain and offset by camera; 1 and 0 for missing cameras.
+            frame: frame with images at the size of the rig's cameras.
+            exposures: [3, 2] gain and offset of each camera; 1 and 0 for missing cameras.
+            use_masks: whether the views include masks.
 
         Raises:
-            ValueError: an image does not have its camera's size, or the frame has no camera of the rig.
+            ValueError: if an image does not have its camera's size, or the frame has no camera of the rig.
         """
         views = []
         for name in self.rig.names:
@@ -90,7 +93,7 @@ class ViewFactory:
         return TrainingView(view.name, view.camera, target, view.exposure)
 
     def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:
-        """Returns the part of a view in a rectangle of whole pixels, without ``right`` and ``bottom``."""
+        """Returns the part of a view in a rectangle of pixels, excluding column ``right`` and row ``bottom``."""
         lens = view.camera.lens.copy()
         lens[2:] = lens[2] - left, lens[3] - top, right - left, bottom - top
         camera = view.camera._replace(lens=lens, width=right - left, height=bottom - top)
@@ -104,15 +107,15 @@ def pictures_of(
     """Returns a camera's image [H, W, 3] and mask [H, W] (or None), and checks their size (width, height).
 
     Raises:
-        ValueError: they have a different size.
+        ValueError: if the image or the mask has a different size.
     """
     width, height = size
     image = frame.images[name]
     mask = frame.masks[name] if use_masks and name in frame.masks else None
-    for what, array, shape in (("picture", image, (height, width, 3)), ("mask", mask, (height, width))):
+    for what, array, shape in (("image", image, (height, width, 3)), ("mask", mask, (height, width))):
         if array is not None and array.shape != shape:
             raise ValueError(
                 f"frame {frame.index}, camera {name!r}: {what} is {'x'.join(map(str, array.shape[1::-1]))} "
-                f"(array {array.shape}), the rig says {width}x{height} (array {shape})"
+                f"(array {array.shape}), but the rig expects {width}x{height} (array {shape})"
             )
     return image, mask

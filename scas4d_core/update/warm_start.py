@@ -1,6 +1,6 @@
-"""The start of an update: the motion of the previous frame is extrapolated (paper, Optimization Pipeline).
+"""Warm start of an update: the motion of the previous frame is extrapolated (paper, Optimization Pipeline).
 
-A cluster keeps its twist in its own axes: its displacement and rotation axis turn with it. A point on a circle thus
+A cluster keeps its twist in its own axes: its displacement and rotation axis rotate with it. A point on a circle thus
 continues along the circle, and so do the clusters of finer layers inside it.
 """
 
@@ -21,10 +21,10 @@ Float = NDArray[np.float64]
 
 
 WARM_START = 1.0
-"""Share of the previous deformation at the start (paper: all of it; without it, `robot` loses 0.6 dB)."""
+"""Share of the previous deformation from which an update starts (paper: 1; with 0, `robot` loses 0.6 dB)."""
 
 LEAST_COSINE = 0.5
-"""Minimum cosine of half the mean rotation of a cluster's Gaussians for a reliable mean."""
+"""Minimum cosine of half the mean rotation angle of a cluster's Gaussians for a reliable mean."""
 
 LONGEST_PREDICTION = 3.0
 """Maximum extrapolation of a motion, in multiples of the interval in which it was found."""
@@ -42,10 +42,12 @@ class Motion:
     """The motion that an update found, from which the next one starts.
 
     Attributes:
-        turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
-            in the rotated axes of the cluster.
-        own_shifts: [M, 3] metres, Δp minus the part that belongs to the finest clusters. own_turns: [M, 3] Δr. seconds:
-            duration of the motion.
+        turns: [K, 3] rotations of the clusters in each layer: axis · tan(angle/2), in the rotated axes of the cluster.
+        shifts: [K, 3] translations of the clusters in each layer relative to the layer above, in metres in the rotated
+            axes of the cluster.
+        own_shifts: [M, 3] displacements Δp minus the part that belongs to the finest clusters, in metres.
+        own_turns: [M, 3] rotations Δr.
+        seconds: duration of the motion, in seconds.
     """
 
     turns: list[Float]
@@ -56,7 +58,7 @@ class Motion:
 
     @property
     def finite(self) -> bool:
-        """True if all values are finite; other motions cannot start an update."""
+        """True if all values are finite; otherwise the motion cannot start an update."""
         return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.own_shifts, self.own_turns))
 
     def after(self, first: Motion) -> Motion:
@@ -97,12 +99,16 @@ def motion_between(
 ) -> Motion:
     """Returns the motion between two states for a hierarchy that was built in between.
 
-    It is entirely in the finest layer, whose clusters rotate and translate like the mean of their known Gaussians.
+    The motion is entirely in the finest layer, whose clusters rotate and translate like the mean of their known
+    Gaussians.
 
     Args:
-        before: its rows are the first rows of ``after``. known: [M] in hierarchy order, true for Gaussians whose motion
-            is known. These have a row in ``before``; the others follow their cluster.
-        seconds: between the states.
+        hierarchy: hierarchy of the moving Gaussians in ``after``.
+        before: first state; its rows are the first rows of ``after``.
+        after: second state.
+        known: [M] mask, in hierarchy order, of Gaussians whose motion is known. These have a row in ``before``; the
+            others follow their cluster.
+        seconds: time between the states, in seconds.
     """
     layers = [np.zeros((count, 3)) for count in hierarchy.sizes]
     turns, shifts = layers, [array.copy() for array in layers]
@@ -131,7 +137,7 @@ def motion_between(
 
 
 def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_], count: int) -> Float:
-    """Returns the [count, C] mean of the chosen rows of each cluster; 0 if there are none."""
+    """Returns the [count, C] mean of the chosen rows of each cluster; 0 for a cluster without chosen rows."""
     own = labels[chosen]
     sums = np.stack([np.bincount(own, weights=column, minlength=count) for column in values[chosen].T], axis=1)
     means: Float = sums / np.maximum(np.bincount(own, minlength=count), 1)[:, None]
@@ -139,7 +145,7 @@ def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_
 
 
 def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
-    """Returns a motion without parameters that are not free in the next update; None for no motion.
+    """Returns the motion without the parameters that are not free in the next update; None for no motion.
 
     >>> motion = Motion([np.ones((1, 3))], [np.ones((1, 3))], np.ones((2, 3)), np.ones((2, 3)), 0.1)
     >>> predicted(motion, Freedom(cluster_rotation=True, prediction=True)).shifts
@@ -162,8 +168,10 @@ def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, mome
     """Returns the initial deformation from the previous motion; scaling (c, s) and Δs start at the identity.
 
     Args:
-        motion: motion of the previous update; None for no motion. seconds: since it was measured.
-        momentum: share of the residual motion, beyond the layers', from which Δp and ΔR start.
+        hierarchy: hierarchy of the moving Gaussians.
+        motion: motion of the previous update; None for no motion.
+        seconds: time since that motion was measured, in seconds.
+        momentum: share of the individual motion of Gaussians, beyond that of the layers, from which Δp and ΔR start.
     """
     tables = Tables.identity(hierarchy)
     if motion is None:

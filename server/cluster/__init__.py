@@ -1,4 +1,4 @@
-"""Execution of scenes' processes on the nodes of a Ray cluster."""
+"""Execution of scene processes on the nodes of a Ray cluster."""
 
 import os
 

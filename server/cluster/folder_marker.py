@@ -1,6 +1,6 @@
 """Marker file of a service in its data folder.
 
-The marker lets a node verify that it sees the shared folder and not a local folder at the same path.
+With the marker, a node verifies that it sees the shared folder and not a local folder at the same path.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from server.storage.fencing import PART
 
 MARKER_NAME = ".service"
 VISIBLE_S = 10.0
-"""Seconds to wait for a new file to become visible, since NFS shows it to other machines with a delay."""
+"""Seconds to wait for a new file to become visible, since NFS shows new files to other machines with a delay."""
 
 
 def write_marker(data: Path, word: str) -> None:
@@ -31,7 +31,7 @@ def has_marker(data: Path, word: str) -> bool:
 
 
 def wait_for_content(path: Path, word: str) -> bool:
-    """Returns whether a file contains `word`, waiting up to `VISIBLE_S` for the file to become visible. Blocking."""
+    """Returns whether a file's content is `word`, waiting up to `VISIBLE_S` for it to become visible. Blocking."""
     until = time.monotonic() + VISIBLE_S
     while True:
         try:

@@ -1,6 +1,6 @@
 """Membership of the service in a Ray cluster.
 
-The service joins through the Ray node on its machine, and joins again after that node is lost.
+The service joins through the Ray node on its machine, and rejoins if that node is lost.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ CONNECT_S = 5.0
 SILENT_S = 3.0
 """Seconds after which a head that does not respond is reported in the log."""
 JOIN_S = 60.0
-"""Maximum seconds for an attempt to join again; without a node on this machine it fails after about 10 s."""
+"""Maximum seconds for an attempt to rejoin; without a node on this machine, it fails after about 10 s."""
 LEAVE_S = 10.0
-"""Maximum seconds for leaving the cluster, during which the head may not respond."""
+"""Maximum seconds for leaving the cluster, since the head may not respond."""
 CHECK_S = 2.0
-"""Seconds between two checks of this machine's node, and between two attempts to join again."""
+"""Seconds between checks of this machine's node, and between attempts to rejoin."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -36,8 +36,8 @@ log = logging.getLogger("scas4d.server")
 class Membership:
     """Membership in a Ray cluster that is restored after a loss.
 
-    When a node is lost, all actors that a service started through it are lost too, wherever they run. The node of the
-    head is lost each time its supervisor restarts it.
+    When a node is lost, all actors that a service started through it are lost too, wherever they run. The head node is
+    lost each time its supervisor restarts it.
 
     Args:
         address: address of the cluster's head; None selects the cluster on this machine or the one in RAY_ADDRESS.
@@ -48,10 +48,10 @@ class Membership:
         self._silent = False
         self._said = ""
         self._thread = ThreadPoolExecutor(1, "membership")
-        """Dedicated thread, because its calls may wait indefinitely for the head of the cluster."""
+        """Dedicated thread for calls that may wait indefinitely for the head of the cluster."""
 
     def join(self) -> None:
-        """Joins the cluster, unless this process is already a member. Blocking.
+        """Joins the cluster unless this process is already a member. Blocking.
 
         Raises:
             RuntimeError: there is no cluster, or this machine has no node in it.
@@ -59,7 +59,7 @@ class Membership:
         if not ray.is_initialized():
             try:
                 if self._address is not None:
-                    _check_head(self._address)  # Ray would end this process if nothing listens there
+                    _check_head(self._address)  # if nothing listened there, Ray would end this process
             except (OSError, ValueError) as error:
                 raise _no_cluster_error(f"at {self._address}", error) from None
             try:
@@ -75,31 +75,31 @@ class Membership:
                 ) from None
 
     async def watch(self, on_loss: Callable[[], Awaitable[None]], on_return: Callable[[], Awaitable[None]]) -> None:
-        """Monitors the node of this machine until cancelled, and joins the cluster again when the node is lost.
+        """Monitors the node of this machine until cancelled, and rejoins the cluster if the node is lost.
 
         Args:
             on_loss: called when the node, and thus every actor of this service, is lost. After it returns, nothing in
                 this process may call Ray or release a Ray handle or result until `on_return` is called.
-            on_return: called when the service is a member again; retried if it fails.
+            on_return: called when the service has rejoined; retried if it fails.
         """
         announced = True
         while True:
             await asyncio.sleep(CHECK_S)
             if await self._is_lost():
-                log.error("the Ray node of this machine and all processes of its scenes are lost; joining again")
+                log.error("the Ray node of this machine and all scene processes are lost; rejoining the cluster")
                 await _exit_on_failure(on_loss())
                 while not await self._is_done(self._rejoin_or_exit):
                     await asyncio.sleep(CHECK_S)
-                log.info("the service has joined the cluster again")
+                log.info("the service has rejoined the cluster")
                 announced = False
             if not announced:  # the node may be lost again before `on_return` succeeds
                 announced = await self._is_done(on_return)
 
     def leave(self) -> None:
-        """Leaves the cluster after any pending attempt to join; remaining actors end. Blocking.
+        """Leaves the cluster after any pending attempt to join, which ends the remaining actors. Blocking.
 
-        If Ray does not shut down in time, this process exits at once, because the interpreter would wait for Ray's
-        threads.
+        If Ray does not shut down in time, this process exits immediately, because the interpreter would otherwise wait
+        for Ray's threads.
         """
         leaving = self._thread.submit(ray.shutdown)
         self._thread.shutdown(wait=False)
@@ -112,7 +112,7 @@ class Membership:
     async def _is_lost(self) -> bool:
         """Asks the head whether this machine's node is lost.
 
-        Logs when the head stops responding and when it responds again.
+        Also logs when the head stops responding and when it responds again.
         """
         answer = self._call(own_node_is_lost)
         done, _ = await asyncio.wait({answer}, timeout=SILENT_S)
@@ -120,8 +120,8 @@ class Membership:
             if not self._silent:
                 self._silent = True
                 log.warning(
-                    "the head of the Ray cluster does not respond: frames continue, but no process is placed; without "
-                    "Redis, Ray ends this process after a minute"
+                    "the head of the Ray cluster does not respond: updates continue, but no process can be started; "
+                    "without Redis, Ray will end this process after a minute"
                 )
             await asyncio.wait({answer})  # at most one pending request
         if answer.exception() is not None:
@@ -132,11 +132,11 @@ class Membership:
         return bool(answer.result())
 
     async def _rejoin_or_exit(self) -> None:
-        """Joins the cluster again; if Ray hangs, exits this process so that its supervisor restarts it."""
+        """Rejoins the cluster; if Ray hangs, exits this process so that its supervisor restarts it."""
         joining = self._call(self._rejoin)
         if not (await asyncio.wait({joining}, timeout=JOIN_S))[0]:
-            log.critical("Ray did not let the service join again within %g s; the service ends, start it again", JOIN_S)
-            os._exit(1)  # acknowledged frames are on disk; a clean shutdown would wait for Ray
+            log.critical("cannot rejoin the Ray cluster within %g s; exiting, restart the service", JOIN_S)
+            os._exit(1)  # acknowledged frames are on disk, and a clean shutdown would wait for Ray
         joining.result()
 
     def _rejoin(self) -> None:
@@ -149,21 +149,21 @@ class Membership:
     async def _is_done(self, call: Callable[[], Awaitable[None]]) -> bool:
         try:
             await call()
-        except Exception as error:  # whatever Ray raises: the service must not hang
+        except Exception as error:  # whatever Ray raises, the service must not hang
             if str(error) != self._said:
                 self._said = str(error)
-                log.warning("not a member of the cluster yet: %s", error)
+                log.warning("the service has not rejoined the cluster yet: %s", error)
             return False
         self._said = ""
         return True
 
 
 async def _exit_on_failure(losing: Awaitable[None]) -> None:
-    """Awaits the handling of a loss; on failure, exits so that the supervisor restarts the service."""
+    """Awaits `losing`; if it fails, exits this process so that its supervisor restarts it."""
     try:
         await losing
     except Exception:
-        log.critical("what ran on the cluster cannot be given up; the service ends, start it again", exc_info=True)
+        log.critical("cannot clean up after the loss of the cluster; exiting, restart the service", exc_info=True)
         os._exit(1)
 
 
@@ -175,7 +175,7 @@ def _no_cluster_error(where: str, error: Exception) -> RuntimeError:
 
 
 def _check_head(address: str) -> None:
-    """Connects to the cluster's head and disconnects.
+    """Checks that the head of the cluster accepts a connection.
 
     Raises:
         OSError: nothing accepts a connection at the address.

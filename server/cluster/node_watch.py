@@ -1,6 +1,6 @@
 """Monitoring of the cluster's nodes.
 
-The monitor polls Ray at a limited rate, and requests wait for the head of the cluster only briefly.
+Ray is polled at a limited rate, and requests wait only briefly for the head of the cluster.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from typing import Any
 AllNodes = Sequence[Mapping[str, Any]]
 
 POLL_S = 2.0
-"""Minimum seconds between two requests to the head."""
+"""Minimum seconds between requests to the head."""
 TIMEOUT_S = 2.0
-"""Maximum seconds that a request waits for the head before it uses the previous answer."""
+"""Maximum seconds to wait for the head before the previous answer is used."""
 LOST_KEPT_S = 900.0
 """Seconds for which a lost node is reported, so that scrapers and operators do not miss it."""
 MOST_LOST = 16
-"""Maximum number of lost nodes that are reported."""
+"""Maximum number of lost nodes to report."""
 EXPECTED_REASON = (1, 4)
-"""Ray's codes for nodes that do not count as lost: stopped by `ray stop`, or removed as idle by the autoscaler."""
+"""Ray's codes for nodes that do not count as lost: stopped by `ray stop`, or removed by the autoscaler when idle."""
 
 
 class NodeWatch:
     """Latest node list from the head of the cluster, and the recently lost nodes. For use on the event loop.
 
     Args:
-        ask: requests the list of all current and former nodes from the head, in Ray's format, and returns a future.
-        now: monotonic clock in seconds.
+        ask: requests the list of all current and former nodes, in Ray's format, from the head, and returns a future.
+        now: monotonic clock that returns seconds.
 
     Attributes:
-        nodes: node list of the latest answer.
+        nodes: node list in the latest answer.
         head_responds: whether the head answered the latest request within `TIMEOUT_S`.
     """
 
@@ -47,12 +47,12 @@ class NodeWatch:
 
     @property
     def lost(self) -> list[str]:
-        """Ids of recently lost nodes whose machine has not joined again."""
+        """Ids of recently lost nodes whose machines have not rejoined."""
         since = self._now() - LOST_KEPT_S
         return [id for id, when in self._lost.items() if when >= since]
 
     async def poll(self) -> None:
-        """Requests the node list, unless it was requested just before, and waits for it up to `TIMEOUT_S`."""
+        """Requests the node list unless it was just requested, and waits for it for up to `TIMEOUT_S`."""
         now = self._now()
         if self._answer is None and now - self._asked >= POLL_S:
             self._asked = now
@@ -70,7 +70,7 @@ class NodeWatch:
             self.record(answer.result())
 
     def record(self, nodes: AllNodes) -> None:
-        """Stores a node list and notes which nodes were lost since the previous one."""
+        """Stores a node list and records which nodes were lost since the previous list."""
         self.nodes = nodes
         hosts = {node["NodeID"]: node["NodeManagerHostname"] for node in nodes}
         alive = {node["NodeID"] for node in nodes if node["Alive"]}

@@ -1,4 +1,4 @@
-"""Nodes of the cluster as Ray lists them, with the resources that this service reserves on each."""
+"""Nodes of the cluster as reported by Ray, with the resources that this service reserves on each."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from client.wire import Cluster, Node, WaitingProcess
 from server.cluster.resource_needs import ResourceNeeds
 
 RAY_LABEL_PREFIX = "ray.io/"
-"""Prefix of the labels that Ray itself assigns to a node."""
+"""Prefix of the labels that Ray itself assigns to nodes."""
 CONNECT_S = 3.0
-"""Seconds within which a live node accepts a connection."""
+"""Maximum seconds for a live node to accept a connection."""
 
 
 @dataclass(frozen=True)
 class PlacedProcess:
-    """Resource needs and node of a process.
+    """Process that was requested, with its resource needs and its node.
 
     Attributes:
         needs: resources reserved for the process.
-        node: id of its node; None while the process waits for one.
-        since: time of `time.monotonic` at which this entry was created, in seconds.
+        node: id of the node that runs the process; None while the process is waiting for a node.
+        since: value of `time.monotonic` when the process was requested, in seconds.
     """
 
     needs: ResourceNeeds
@@ -41,7 +41,7 @@ def all_nodes() -> list[dict[str, Any]]:
 
 
 def living_nodes() -> list[dict[str, Any]]:
-    """Returns the nodes that are alive. Blocking."""
+    """Returns the live nodes in Ray's format. Blocking."""
     return [node for node in all_nodes() if node["Alive"]]
 
 
@@ -49,15 +49,15 @@ def is_lost(id: str) -> bool:
     """Returns whether a node is lost. Blocking.
 
     A node is lost if it is dead, nothing listens at its address, or the head of the cluster does not respond. The
-    address is checked because the head needs some seconds to notice a dead node, whereas the loss of an actor is
-    noticed at once. If this machine's own node is dead, every node counts as lost, because all actors of this service
-    are lost.
+    address is checked because the head takes several seconds to notice a dead node, whereas the loss of an actor is
+    noticed immediately. If this machine's own node is dead, every node counts as lost, because all actors of this
+    service are lost.
     """
     try:
         living = living_nodes()
         own = [node for node in living if node["NodeID"] == id] if _includes_own_node(living) else []
         return not any(_accepts_connections(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in own)
-    except Exception:  # any exception that Ray raises without its head
+    except Exception:  # Ray may raise any exception if its head does not respond
         return True
 
 
@@ -71,7 +71,7 @@ def own_node_is_lost() -> bool:
 
 
 def own_node() -> str:
-    """Returns the id of the local node through which this process joined the cluster."""
+    """Returns the id of the node on this machine through which this process joined the cluster."""
     return str(ray.get_runtime_context().get_node_id())
 
 
@@ -105,11 +105,11 @@ def describe_cluster(
 ) -> Cluster:
     """Returns a description of the cluster: its nodes with their resources, and the processes waiting for a node.
 
-    Includes nodes that are alive, were lost recently, or have a process of this service.
+    It includes the nodes that are alive, were lost recently, or run a process of this service.
 
     Args:
         nodes: nodes in Ray's format.
-        places: the service's processes with their nodes.
+        places: processes of this service with their nodes.
         lost: ids of recently lost nodes.
         head_responds: whether the head of the cluster responds.
     """

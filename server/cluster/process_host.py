@@ -1,7 +1,7 @@
-"""Ray actor that hosts one process of a scene on the node that Ray chose.
+"""Ray actor that hosts one process of a scene on the node that Ray has chosen.
 
-The process is a child of the actor. It therefore runs as it does without a cluster (signals, niceness, threads),
-and its exit code is available, which Ray does not report. The process ends with its actor.
+The process is a child of the actor. It therefore runs as it does without a cluster (signals, niceness, threads), and
+its exit code is available, which Ray does not report for actors. The process ends when its actor ends.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from server.processes.placement import Entry, Placement, ProcessExit, ProcessHan
 
 @dataclass(frozen=True)
 class StartResult:
-    """Result of starting a process; `fault` is the reason if the process did not start, else None."""
+    """Result of starting a process; `fault` is the reason if the process did not start, otherwise None."""
 
     node: str
     pid: int | None = None
@@ -32,7 +32,7 @@ class StartResult:
 
 @dataclass(frozen=True)
 class UnexpectedExit:
-    """Message that the process ended without a request to stop; see `ProcessExit` for the attributes."""
+    """Message that the process exited without being asked to; see `ProcessExit` for the attributes."""
 
     exit_code: int | None
     out_of_memory: bool = False
@@ -40,11 +40,11 @@ class UnexpectedExit:
 
 @dataclass(frozen=True)
 class ProcessScheduling:
-    """Thread count and niceness of processes, to be the same on every node as on the machine of the service.
+    """Thread count and niceness that processes have on every node, equal to those on the service's machine.
 
     Attributes:
         threads: value of OMP_NUM_THREADS, which Ray would set to the number of CPUs of the actor.
-        nice: niceness, which Ray would raise by 15, so that a worker would yield to every other process on its node.
+        nice: niceness, which Ray would raise by 15, making a worker yield to every other process on its node.
     """
 
     threads: str | None = None
@@ -56,20 +56,20 @@ class ProcessScheduling:
         return cls(os.environ.get("OMP_NUM_THREADS"), os.getpriority(os.PRIO_PROCESS, 0))
 
     def apply(self) -> None:
-        """Applies both to this thread and the processes that it starts.
+        """Applies both settings to this thread and the processes that it starts.
 
-        Lowers the niceness only if the user has permission to do so.
+        The niceness is lowered only if the user is permitted to do so.
         """
         os.environ.pop("OMP_NUM_THREADS", None)
         if self.threads is not None:
             os.environ["OMP_NUM_THREADS"] = self.threads
-        with contextlib.suppress(PermissionError):  # docs/cluster.md describes the alternative
+        with contextlib.suppress(PermissionError):  # docs/cluster.md describes a workaround
             os.setpriority(os.PRIO_PROCESS, 0, self.nice)
 
 
 @contextlib.contextmanager
 def _without_main_module() -> Iterator[None]:
-    """Keeps processes spawned inside the context from importing the main module of this process.
+    """Prevents processes spawned inside the context from importing this process's main module.
 
     Ray's main module takes 40 MB.
     """
@@ -90,13 +90,13 @@ def _node_id() -> str:
 
 
 class ProcessHost:
-    """Actor that starts a process, forwards its messages in order, and reports how it ended.
+    """Actor that starts a process, forwards its messages in order, and reports how it exited.
 
     Args:
-        prepare: see `Placement`.
+        prepare: function that is called first in the process; see `Placement`.
         data: data folder of the service, which must be visible on this node.
         word: content of the service's marker file in that folder.
-        priority: priority of the service's process; None keeps the priority of this process.
+        priority: scheduling of the service's process; None keeps the scheduling of this process.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class ProcessHost:
         self._oom_kills = oom_kills()
 
     async def start(self, entry: Entry, spec: Any) -> StartResult:
-        """Starts the process, if this node sees the data folder and can write to it."""
+        """Starts the process if this node sees the data folder and can write to it."""
         node = _node_id()
         if not await asyncio.to_thread(has_marker, self._data, self._word):
             fault = f"node {socket.gethostname()} does not see the data folder {self._data}; mount it there"
@@ -123,13 +123,13 @@ class ProcessHost:
             self._priority.apply()  # in this thread: the process inherits the niceness of the thread that starts it
         with _without_main_module():
             self._process = self._placement.start(entry, spec, self._received.put_nowait, self._on_end)
-        self._deliver()  # messages posted before the start
+        self._deliver()  # delivers messages that were posted before the start
         return StartResult(node, self._process.pid)
 
     async def post(self, number: int, message: Any) -> None:
         """Sends a message to the process.
 
-        Messages are delivered in the order of their numbers, because Ray may reorder calls.
+        Messages are delivered in the order of `number`, because Ray may reorder calls.
         """
         self._out_of_order[number] = message
         self._deliver()
@@ -140,7 +140,7 @@ class ProcessHost:
             self._next += 1
 
     async def receive(self) -> list[Any]:
-        """Returns the next messages of the process, at least one. `UnexpectedExit` is always the last."""
+        """Waits for messages from the process and returns at least one; `UnexpectedExit` is always the last."""
         messages = [await self._received.get()]
         while not self._received.empty():
             messages.append(self._received.get_nowait())

@@ -11,24 +11,24 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 THREADS = 8
-"""Maximum number of calls that run, or wait for the head of the cluster, at the same time."""
+"""Maximum number of calls that run or wait for the head of the cluster at the same time."""
 
 T = TypeVar("T")
 
 
 class RayCalls:
-    """Runner for blocking calls to Ray, for use on the event loop.
+    """Runs blocking calls to Ray in threads. For use on the event loop.
 
-    Calls can be suspended because Ray ends the process if a call overlaps with `ray.shutdown` ("the core worker has
+    Calls can be suspended, because Ray ends the process if a call overlaps with `ray.shutdown` ("the core worker has
     already been shutdown").
 
     Attributes:
-        running: calls that have started or wait for a thread.
+        running: calls that have started or are waiting for a thread.
     """
 
     def __init__(self) -> None:
         self.running: set[Future[Any]] = set()
-        # A separate pool: the event loop's own pool writes the journals, and must not be blocked by a silent head.
+        # A separate pool, since the event loop's own pool writes the journals and must not wait for a silent head.
         self._threads = ThreadPoolExecutor(THREADS, "ray")
         self._enabled = asyncio.Event()
         self._enabled.set()
@@ -51,10 +51,10 @@ class RayCalls:
             except asyncio.CancelledError:
                 task = asyncio.current_task()
                 if task is None or task.cancelling():
-                    raise  # otherwise `suspend` was called before a thread was free
+                    raise  # otherwise, `suspend` was called before a thread was free
 
     def suspend(self) -> None:
-        """Suspends calls: new calls, and calls that wait for a thread, start after `resume`."""
+        """Suspends calls; new calls and those that are waiting for a thread start after `resume`."""
         self._enabled.clear()
         for call in tuple(self.running):
             call.cancel()
@@ -64,7 +64,7 @@ class RayCalls:
         self._enabled.set()
 
     async def wait(self, seconds: float) -> bool:
-        """Waits up to `seconds` for the running calls and returns whether all have finished."""
+        """Waits up to `seconds` for the running calls to finish and returns whether all have."""
         return not (await asyncio.to_thread(wait, tuple(self.running), seconds)).not_done
 
     def close(self) -> None:

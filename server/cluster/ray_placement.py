@@ -1,6 +1,6 @@
-"""Placement of scenes' processes as actors on a Ray cluster.
+"""Placement of scene processes as actors on a Ray cluster.
 
-Ray chooses the node of each process and reports the loss of a node.
+Ray chooses the node of each process and reports lost nodes.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from server.processes.placement import STOP_SECONDS, Entry, Placement, ProcessEx
 from server.settings import ServerSettings
 
 WAIT_S = 3.0
-"""Seconds after which a worker that is not placed yet reports the resources that it waits for."""
+"""Seconds after which a worker without a node reports the resources for which it is waiting."""
 LOST_S = 10.0
 """Maximum seconds to wait for the head to report whether a node is lost."""
 LOSE_S, CLOSE_S = 20.0, 3.0
-"""Maximum seconds to wait for pending Ray calls before leaving: after the loss of the cluster, and at shutdown."""
+"""Maximum seconds to wait for pending Ray calls before leaving, after the loss of the cluster and at shutdown."""
 STOPPED_S = 5.0
-"""Additional seconds, beyond those of its process, within which an actor must report that the process ended."""
+"""Seconds within which an actor must report that its process has exited, in addition to those of the process."""
 
 T = TypeVar("T")
 
@@ -48,15 +48,15 @@ log = logging.getLogger("scas4d.server")
 
 
 class RayPlacement(Placement):
-    """Placement that starts scenes' processes on a Ray cluster and the service's own processes on its machine.
+    """Placement that runs scene processes on a Ray cluster and the service's own processes on its machine.
 
     Args:
-        prepare: see `Placement`.
+        prepare: function that is called first in every process; see `Placement`.
         address: address of the cluster's head; None selects the cluster on this machine or the one in RAY_ADDRESS.
         server: settings of the service; its data folder must be visible on every node at the same path.
 
     Attributes:
-        placed: processes that have been requested and have not ended, keyed by the name of their actor.
+        placed: processes that were requested and have not exited, keyed by the names of their actors.
     """
 
     fenced = True
@@ -76,9 +76,9 @@ class RayPlacement(Placement):
         self._listens: tuple[str, int] | None = None
         self._announced: Any = None
         self._kept: list[Any] = []
-        """Objects that hold Ray handles or results, kept alive while the service leaves the cluster.
+        """Objects with references to Ray handles or results, kept alive while the service leaves the cluster.
 
-        If one were released during that time, Ray would hang or end this process.
+        If one were released in the meantime, Ray would hang or end this process.
         """
         self._keeping: asyncio.Task[None] | None = None
         self._peers: Mapping[str, str] | None = None
@@ -90,13 +90,13 @@ class RayPlacement(Placement):
             RuntimeError: there is no cluster, or a node does not see the folder.
         """
         data = self._server.data.resolve()
-        before = ray.is_initialized()  # `serve` first opens it in a separate event loop to report errors
+        before = ray.is_initialized()  # `serve` first opens the placement in another event loop to report errors
         await asyncio.to_thread(self._membership.join)
         if not before:
             await asyncio.to_thread(check_folder, data)
             await asyncio.to_thread(write_marker, data, self._token)
-            self._watch.record(await asyncio.to_thread(all_nodes))  # `poll` would tie the answer to this event loop
-            log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
+            self._watch.record(await asyncio.to_thread(all_nodes))  # `poll` would bind the answer to this event loop
+            log.info("running scenes on a Ray cluster with %d nodes", sum(node["Alive"] for node in self._watch.nodes))
         self._keeping = asyncio.get_running_loop().create_task(
             self._membership.watch(on_loss=self._lose_all, on_return=self._on_return)
         )
@@ -107,18 +107,18 @@ class RayPlacement(Placement):
             try:
                 process.mark_lost()
             except Exception:  # an error in one scene must not stop the other scenes or the service
-                log.exception("a process was lost with its cluster")
+                log.exception("error while handling a process that was lost with the cluster")
         await self._detach(processes, LOSE_S)
 
     async def _detach(self, processes: Sequence[RayProcess], seconds: float) -> None:
-        """Stops all calls to Ray and keeps all Ray handles and results alive."""
+        """Stops all calls to Ray, and keeps all Ray handles and results alive."""
         self._calls.suspend()
         self._kept += [self._announced, *processes, *self._calls.running]
         for process in processes:
             await process.detach()
         if not await self._calls.wait(seconds):
-            log.warning("Ray has not answered within %g s; the service leaves the cluster anyway", seconds)
-        gc.collect()  # a collection while the service leaves would release Ray objects in reference cycles
+            log.warning("Ray has not responded within %g s; leaving the cluster anyway", seconds)
+        gc.collect()  # a later collection could release Ray objects while the service leaves
 
     async def _on_return(self) -> None:
         self._kept.clear()
@@ -132,7 +132,7 @@ class RayPlacement(Placement):
         return describe_cluster(watch.nodes, self.placed.values(), lost=watch.lost, head_responds=watch.head_responds)
 
     async def announce(self, host: str, port: int) -> None:
-        """Announces the service through an actor that holds its address and ends with it; see `Placement`."""
+        """Announces the service through an actor that provides its address and ends with it; see `Placement`."""
         self._listens = host, port
         await self._announce()
 
@@ -141,7 +141,7 @@ class RayPlacement(Placement):
             self._announced = await self.call_ray(register_service, self._token, *self._listens)
 
     async def peers(self) -> Sequence[str]:
-        """Returns the addresses of the other services, or the last known ones if the head does not respond.
+        """Returns the addresses of the other services, or the last known addresses if the head does not respond.
 
         See `Placement`.
         """
@@ -149,11 +149,11 @@ class RayPlacement(Placement):
         return list(self._peers.values())
 
     def call_ray(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
-        """Calls a function that uses Ray in a thread, while the service is a member of the cluster."""
+        """Calls a function that uses Ray in a thread, as soon as the service is a member of the cluster."""
         return self._calls.call(function, *arguments)
 
     async def close(self) -> None:
-        """Leaves the cluster; remaining actors end."""
+        """Leaves the cluster, which ends the remaining actors."""
         if self._keeping is not None:
             self._keeping.cancel()
         await self._detach(tuple(self._processes), CLOSE_S)
@@ -176,7 +176,7 @@ class RayPlacement(Placement):
         return process
 
     def create_actor(self, name: str, needs: ResourceNeeds) -> Any:
-        """Returns a new actor for a process. Blocking, since the head registers the actor's name."""
+        """Creates the actor of a process. Blocking, since the head registers the actor's name."""
         made: Any = ray.remote(ProcessHost)
         return made.options(name=name, **needs.actor_options()).remote(
             self.prepare, self._server.data.resolve(), self._token, ProcessScheduling.current()
@@ -184,7 +184,7 @@ class RayPlacement(Placement):
 
 
 class RayProcess:
-    """Process of a scene on a node of the cluster, which exchanges messages through its actor.
+    """Process of a scene on a node of the cluster, with which messages are exchanged through its actor.
 
     For use on the event loop, which never waits for Ray.
     """
@@ -206,14 +206,14 @@ class RayProcess:
         self._node: str | None = None
         self._pid: int | None = None
         self._early: list[Any] | None = []
-        """Messages sent before the actor exists; None after that."""
+        """Messages sent before the actor exists; None afterwards."""
         self._sent = 0
         self._over = False
         self._lost = False
         self._actor: Any = None
         self._making: asyncio.Future[Any] = placement.call_ray(placement.create_actor, name, needs)
         self._answers: set[Any] = set()
-        """Results that are awaited now, or were awaited when the cluster was lost."""
+        """Results that are being awaited, or were when the cluster was lost."""
         self._tasks: set[asyncio.Task[Any]] = set()
         self._task = self._start_task(self._run(*runs))
 
@@ -239,10 +239,10 @@ class RayProcess:
         self._placement.placed.pop(self._name, None)
         if started and not over:
             await asyncio.wait({self._start_task(self._ask_to_stop(seconds))})
-        await asyncio.wait({self._start_task(self._kill())}, timeout=STOPPED_S)  # may continue after the timeout
+        await asyncio.wait({self._start_task(self._kill())}, timeout=STOPPED_S)  # continues after a timeout
 
     def mark_lost(self) -> None:
-        """Gives up the process because the cluster on which it ran is lost."""
+        """Gives up the process because the cluster on which it was running is lost."""
         self._lost = True
         self._give_up("the Ray node of the service's machine is lost", lost=True)
 
@@ -278,7 +278,7 @@ class RayProcess:
             self._give_up(f"its {role} was given up: {type(error).__name__}: {error}")
 
     async def _begin(self, entry: Entry, spec: Any) -> None:
-        """Starts the process; a worker reports the resources that it waits for if no node has room within `WAIT_S`."""
+        """Starts the process; a worker without a node after `WAIT_S` reports the resources for which it is waiting."""
         self._actor = await asyncio.shield(self._making)
         starting = self._start_task(self._result(self._actor.start.remote(entry, spec)))
         starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # avoids a warning after `stop`
@@ -289,12 +289,12 @@ class RayProcess:
         while not (await asyncio.wait([starting], timeout=WAIT_S))[0]:
             if self._needs.role == "worker" and not said:
                 said = True
-                self._notify(WaitsForNode(f"its worker is not placed on a node yet; it needs {self._needs.describe()}"))
+                self._notify(WaitsForNode(f"its worker is waiting for a node with {self._needs.describe()}"))
         started: StartResult = starting.result()
         if started.fault is not None:
             raise _StartFailedError(started.fault)
         self._pid, self._node = started.pid, started.node
-        if self._over:  # it was given up in the meantime
+        if self._over:  # the process was given up in the meantime
             return
         self._placement.placed[self._name] = PlacedProcess(self._needs, started.node)
 
@@ -308,7 +308,7 @@ class RayProcess:
         try:
             self._on_message(message)
         except Exception:  # an error in the service must not affect the next message
-            log.exception("a message of actor %s", self._name)
+            log.exception("error while handling a message of actor %s", self._name)
 
     async def _ask_to_stop(self, seconds: float) -> None:
         with contextlib.suppress(RayError, TimeoutError):
@@ -327,8 +327,8 @@ class RayProcess:
             await self._result(sending)
         except RayActorError:
             pass  # `_run` receives the same error and handles it
-        except RayError as error:  # the process missed a message, so it must not continue
-            self._give_up(f"a message did not reach its {self._needs.role}: {_first_line(error)}")
+        except RayError as error:  # the process has missed a message, so it must not continue
+            self._give_up(f"its {self._needs.role} did not receive a message: {_first_line(error)}")
 
     def _give_up(self, why: str, *, lost: bool = False) -> None:
         self._end(ProcessExit(None, why, lost=lost, out_of_memory=False))
@@ -354,9 +354,9 @@ class RayProcess:
 
 
 def _first_line(error: BaseException) -> str:
-    """Returns the first line of an error message; the rest of Ray's messages, for cluster operators, is in the log."""
+    """Returns the first line of an error message; the rest of Ray's messages is for cluster operators, in the log."""
     return str(error).strip().partition("\n")[0]
 
 
 class _StartFailedError(RuntimeError):
-    """Error raised if the node could not start the process."""
+    """Error for a process that its node could not start."""

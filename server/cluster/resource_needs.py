@@ -1,6 +1,6 @@
-"""Resource needs of scenes' processes, which Ray's scheduler uses to choose a node.
+"""Resource needs of scene processes, from which Ray's scheduler chooses their nodes.
 
-The needs are derived from the resource estimate of the scene.
+The needs are derived from the memory estimate of the scene.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from server.processes.placement import Entry
 from server.settings import ServerSettings
 
 READER_CPUS = 0.25
-"""CPUs of a reader, which works only while clients view the scene and then has priority over updates."""
+"""CPUs reserved for a reader, which works only while clients view the scene and then has priority over updates."""
 BACKGROUND_CPUS = 0.1
-"""CPUs of a replay or an export, which use the remaining CPU time."""
+"""CPUs reserved for a replay or an export, which use the remaining CPU time."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class ResourceNeeds:
     """Resource needs of one process.
 
     Attributes:
-        role: role of the process, one word.
-        scene: name of its scene.
-        cpus: number of CPUs, may be fractional.
-        memory: bytes.
+        role: role of the process, in one word.
+        scene: name of the scene.
+        cpus: number of CPUs, which may be fractional.
+        memory: memory in bytes.
         labels: labels that the node must have.
     """
 
@@ -59,7 +59,7 @@ class ResourceNeeds:
 
 
 def resource_needs(entry: Entry, spec: Any, server: ServerSettings) -> ResourceNeeds | None:
-    """Returns the needs of a process, or None if it belongs to no scene and runs on the service's machine."""
+    """Returns the needs of a process, or None for a process without a scene, which runs on the service's machine."""
     scene = spec if isinstance(spec, SceneSpec) else getattr(spec, "scene", None)
     if not isinstance(scene, SceneSpec):
         return None

@@ -1,6 +1,6 @@
 """Registry through which the services of a cluster find each other.
 
-Each service has an actor that holds its address. Ray ends the actor together with the service.
+Each service has an actor that provides its address. Ray ends the actor when the service exits.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from server.cluster.nodes import own_machine, own_node
 from server.settings import is_loopback
 
 PREFIX = "service."
-"""Prefix of the names of these actors; it is followed by the identifier of the service."""
+"""Prefix of the names of these actors, followed by the identifier of the service."""
 ASK_S = 2.0
-"""Maximum seconds to wait for the addresses of other services."""
+"""Maximum seconds to wait for the addresses of the other services."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -31,14 +31,14 @@ class ServiceAddress:
 
     Args:
         url: URL of the service.
-        machine: the only machine from which the service is reachable; None if it is reachable from all machines.
+        machine: address of the only machine from which the service is reachable; None if all machines can reach it.
     """
 
     def __init__(self, url: str, machine: str | None) -> None:
         self._address = url, machine
 
     def get(self) -> tuple[str, str | None]:
-        """Returns the URL and the machine."""
+        """Returns the URL of the service and `machine`."""
         return self._address
 
 
@@ -47,14 +47,14 @@ def register_service(word: str, host: str, port: int) -> Any:
 
     Args:
         word: identifier of this service.
-        host: host at which the service listens; a wildcard address is announced as the address of this machine.
-        port: port at which the service listens.
+        host: host on which the service listens; a wildcard address is announced as the address of this machine.
+        port: port on which the service listens.
     """
     machine = own_machine()
     if host in ("0.0.0.0", "::", ""):
         host = machine
     elif is_loopback(host):
-        log.warning("other machines of the cluster cannot reach this service at %s; give it an address: --host", host)
+        log.warning("other machines of the cluster cannot reach this service at %s; set another address: --host", host)
     url = f"http://{_authority(host, port)}"
     made: Any = ray.remote(ServiceAddress)
     here = NodeAffinitySchedulingStrategy(own_node(), soft=True)
@@ -63,7 +63,7 @@ def register_service(word: str, host: str, port: int) -> Any:
 
 
 def _authority(host: str, port: int) -> str:
-    """Returns host and port with a numeric address, since a service refuses unknown host names."""
+    """Returns host and port with a numeric address, because a service refuses unknown host names."""
     addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     number = str(addresses[0][4][0])
     return f"[{number}]:{port}" if ":" in number else f"{number}:{port}"
@@ -72,8 +72,8 @@ def _authority(host: str, port: int) -> str:
 def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
     """Returns the addresses of the other services, keyed by the names of their actors. Blocking.
 
-    A service that does not respond, because it is starting or ending, has its actor's name as a placeholder address. A
-    request to the placeholder always fails.
+    For a service that does not respond because it is starting or stopping, the name of its actor is used as a
+    placeholder. Requests to a placeholder always fail.
 
     Args:
         word: identifier of this service.
@@ -87,8 +87,8 @@ def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]
         machine = own_machine()
     except (RayError, RuntimeError, ConnectionError) as error:
         if known is None:
-            raise RuntimeError(f"the head of the cluster does not say which services there are: {error}") from error
-        log.warning("the head of the cluster does not say which services there are: %s", error)
+            raise RuntimeError(f"cannot get the list of services from the head of the cluster: {error}") from error
+        log.warning("cannot get the list of services from the head of the cluster: %s", error)
         return dict(known)
     before = {name: url for name, url in (known or {}).items() if name in names and url != name}
     asked = _fetch_addresses([name for name in names if name not in before])
@@ -96,16 +96,16 @@ def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]
 
 
 def _fetch_addresses(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
-    """Returns the addresses of services; a service that does not respond has its name as its address."""
+    """Returns the addresses of services; for a service that does not respond, the name stands for the address."""
     addresses: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
     asked: dict[Any, str] = {}
     for name in names:
-        with contextlib.suppress(ValueError, RayError):  # it has ended in the meantime
+        with contextlib.suppress(ValueError, RayError):  # the actor has ended in the meantime
             actor: Any = ray.get_actor(name)
             asked[actor.get.remote()] = name
     for answer in ray.wait(list(asked), num_returns=len(asked), timeout=ASK_S)[0] if asked else ():
         try:
             addresses[asked[answer]] = ray.get(answer)
-        except RayError as error:  # the service is starting or ending
-            log.info("service %s does not give its address: %s", asked[answer], error)
+        except RayError as error:  # the service is starting or stopping
+            log.info("cannot get the address of service %s: %s", asked[answer], error)
     return addresses

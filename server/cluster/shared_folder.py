@@ -1,4 +1,4 @@
-"""Startup check of the data folder, which all nodes must share and which must support certain file operations."""
+"""Check at startup that all nodes share the data folder and that it supports the necessary file operations."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from server.storage.fencing import PART
 
 PROBE_NAME = ".probe"
 TIMEOUT_S = 180.0
-"""Maximum seconds for a node to respond; its first task starts a Python process, which is slow on a busy node."""
+"""Maximum seconds for a node to respond; a node's first task starts a Python process, which is slow on a busy node."""
 
 
 def check_folder(data: Path) -> None:
-    """Checks that every node can read a file that this process wrote, and that this process can read theirs.
+    """Checks that this process and every node can read files that the other has written to the data folder.
 
     Each node also syncs, renames and links its file.
 
@@ -48,18 +48,21 @@ def check_folder(data: Path) -> None:
             try:
                 fault = ray.get(answer, timeout=TIMEOUT_S)
             except RayError as error:
-                raise RuntimeError(f"{name} does not answer: {error}") from None
+                raise RuntimeError(f"{name} does not respond: {error}") from None
             if fault is not None:
                 raise RuntimeError(f"{name} {fault}; mount the data folder {data} there, at the same path")
             if not wait_for_content(data / f"{PROBE_NAME}-{word}-{id[:8]}", word):
-                raise RuntimeError(f"files that {name} writes to {data} do not appear here; is it the same folder?")
+                raise RuntimeError(f"files that {name} writes to {data} are not visible here; is it the same folder?")
     finally:
-        for path in data.glob(f"{PROBE_NAME}-{word}*"):  # includes files of nodes that failed midway
+        for path in data.glob(f"{PROBE_NAME}-{word}*"):  # including those of nodes that failed midway
             path.unlink(missing_ok=True)
 
 
 def probe_from_node(data: Path, word: str, id: str) -> str | None:
-    """Checks the folder on this node; returns None or the fault, worded to follow the node's name. Blocking."""
+    """Checks the folder on this node; returns None, or a fault that completes a sentence after the node's name.
+
+    Blocking.
+    """
     try:
         if not wait_for_content(data / f"{PROBE_NAME}-{word}", word):
             return f"does not see what the service writes to {data}"

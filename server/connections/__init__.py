@@ -1,1 +1,1 @@
-"""Connection limits that apply before the application sees a request: sizes, deadlines, connections per address."""
+"""Limits enforced before a request reaches the application: sizes, deadlines and connections per address."""

@@ -1,4 +1,4 @@
-"""Configuration of uvicorn with guarded connections and with forwarded headers from trusted proxies only."""
+"""Configuration of uvicorn with guarded connections, accepting forwarded headers from trusted proxies only."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from server.connections.websocket import GuardedWebSocket
 
 
 def uvicorn_config(app: FastAPI, **more: Any) -> uvicorn.Config:
-    """Returns the uvicorn configuration for an application made by `server.app.create_app`.
+    """Returns the uvicorn configuration for an application created by `server.app.create_app`.
 
     Args:
-        app: the application, with its guard in `app.state.guard`.
-        more: additional options of uvicorn, such as `port`.
+        app: application with its connection guard in `app.state.guard`.
+        more: additional uvicorn options, such as `port`.
     """
     guard: ConnectionGuard = app.state.guard
     proxies = [str(network) for network in guard.limits.proxies]
@@ -26,10 +26,10 @@ def uvicorn_config(app: FastAPI, **more: Any) -> uvicorn.Config:
         "http": type("GuardedConnection", (GuardedConnection,), of_service),
         "ws": type("GuardedSocket", (GuardedWebSocket,), of_service),
         "server_header": False,
-        # Only the configured proxies are trusted; by default, uvicorn trusts FORWARDED_ALLOW_IPS and the loopback.
+        # Trust only the configured proxies; by default, uvicorn trusts FORWARDED_ALLOW_IPS and loopback addresses.
         "proxy_headers": bool(proxies),
         "forwarded_allow_ips": proxies,
         "timeout_keep_alive": guard.limits.keep_alive_seconds,
-        "ws_per_message_deflate": False,  # images are compressed; 100 subscribers would cost a core
+        "ws_per_message_deflate": False,  # images are already compressed; for 100 subscribers it would take a core
     }
     return uvicorn.Config(app, **{**options, **more})

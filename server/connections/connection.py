@@ -1,8 +1,8 @@
-"""HTTP connections of uvicorn with limits on headers and bodies before the application is called.
+"""HTTP connections of uvicorn, with limits on headers and bodies that apply before the application is called.
 
-uvicorn and httptools accept any input: headers of any length (which are concatenated in quadratic time), and any number
-of trailers and pipelined requests, without a time limit. All of that happens before a token is checked. This module
-limits sizes as bytes arrive; `server.connections.guard` enforces deadlines.
+uvicorn and httptools accept headers of any length (concatenating them in quadratic time) and any number of trailers and
+pipelined requests, without a time limit. All of this happens before a token is checked. This module limits sizes as
+bytes arrive; `server.connections.guard` enforces deadlines.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from server.http.authentication import HEADERS
 
 END_OF_HEAD = b"\r\n\r\n"
 CHUNKED_BYTES = 64 << 10
-"""Maximum bytes of a chunked body that are parsed at once; the overhead is checked after each block."""
+"""Maximum bytes of a chunked body to parse at once; the overhead is checked after each block."""
 CHUNK_OVERHEAD_BYTES = 64 << 10
-"""Bytes of chunk headers, extensions and trailers that may exceed the bytes of content."""
+"""Bytes by which chunk headers, extensions and trailers may exceed the content."""
 LARGE_READ = 16 << 10
-"""Size in bytes from which a piece of a body is passed on without a copy."""
+"""Minimum size in bytes of a piece of a body that is passed on without a copy."""
 PIPELINED = 16
 """Maximum number of pipelined requests.
 
-After these, the connection is closed, and the client must resend the rest. Each request costs some kilobytes, and a
-single read can contain thousands.
+If there are more, the connection is closed after these, and the client must resend the rest. Each request takes a few
+kilobytes, and a single read can contain thousands of them.
 """
 DROPPED_BYTES = 1 << 20
-"""Maximum bytes that are read and discarded after a refusal, so that the peer can read the response."""
+"""Maximum bytes to read and discard after a refusal, so that the peer can read the response."""
 
 
 class GuardedConnection(HttpToolsProtocol):
-    """HTTP connection of uvicorn with limits, and without uvicorn's two copies of each body.
+    """HTTP connection of uvicorn with limits, and without the two copies that uvicorn makes of each body.
 
-    A frame has about 30 MB, and each copy would cost as much as reading it.
+    A frame has about 30 MB, and copying it takes as long as reading it.
 
     Attributes:
-        guard: the guard of the service, set by `server.connections.config`.
+        guard: connection guard of the service, set by `server.connections.config`.
     """
 
     guard: ClassVar[ConnectionGuard]
@@ -50,7 +50,7 @@ class GuardedConnection(HttpToolsProtocol):
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self._fault: Refusal | None = None
-        """Fault found while parsing; uvicorn would answer an exception like any other bad request."""
+        """Fault found while parsing. Not raised, because uvicorn would respond to any exception as to a bad request."""
         self._head_bytes = 0
         self._left: int | None = None
         """Bytes of the body that have not arrived yet; None if it is chunked."""
@@ -59,10 +59,10 @@ class GuardedConnection(HttpToolsProtocol):
         self._dropping = False
         self._dropped = 0
         self._closes = False
-        """True if the connection is to be closed after the current body."""
+        """True if the connection must be closed after the current body."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Registers the connection with the guard, and refuses it if a limit is reached."""
+        """Registers the connection with the guard and refuses it if a limit is reached."""
         super().connection_made(transport)
         address = self.client[0] if self.client else ""
         self._record, refusal = self.guard.admit(self, transport, self.loop, address)
@@ -76,7 +76,7 @@ class GuardedConnection(HttpToolsProtocol):
 
     @property
     def waiting_for_service(self) -> bool:
-        """True if no bytes can arrive because the service is not reading or has not requested the body yet."""
+        """Whether no bytes can arrive because the service is not reading or has not requested the body yet."""
         return self.flow.read_paused or (self._record.phase is Phase.BODY and self.cycle.waiting_for_100_continue)
 
     def data_received(self, data: bytes) -> None:
@@ -119,8 +119,8 @@ class GuardedConnection(HttpToolsProtocol):
             if self._head_bytes >= self.guard.limits.header_bytes:
                 self._fault = self._too_large()
         elif self._fault is None and not in_head and self._left is None:
-            # Content offsets overhead, but its credit is capped. Otherwise, a large body would permit an endless
-            # trailer, which is concatenated in quadratic time, as headers are.
+            # Content offsets overhead up to a cap. Without the cap, a large body would permit an endless trailer, which
+            # is concatenated in quadratic time like headers.
             self._credit = min(CHUNK_OVERHEAD_BYTES, self._credit + self._delivered) - (size - self._delivered)
             if self._credit < 0:
                 self._fault = Refusal.BODY_OVERHEAD
@@ -143,9 +143,9 @@ class GuardedConnection(HttpToolsProtocol):
             self._begin_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Stores a line of the header.
+        """Stores a header line.
 
-        Trailers are discarded, because they are unused and must not be taken for headers.
+        Trailers are discarded, because they are unused and must not be mistaken for headers.
         """
         if self._record.phase is not Phase.HEAD:
             return
@@ -164,7 +164,7 @@ class GuardedConnection(HttpToolsProtocol):
             return
         before = self.cycle
         super().on_headers_complete()
-        if self.cycle is before:  # this is the handshake of a WebSocket
+        if self.cycle is before:  # the request is the handshake of a WebSocket
             return
         self._left, chunked = 0, False
         for name, value in self.headers:
@@ -178,7 +178,7 @@ class GuardedConnection(HttpToolsProtocol):
             self._credit = CHUNK_OVERHEAD_BYTES
             if chunked:
                 self._left = None
-            # The task that runs the application starts after this call, and then sees this transport.
+            # The task that runs the application starts after this call and therefore uses this transport.
             self.cycle.transport = _DelayedClose(self)
         self.guard.set_phase(self._record, phase, self.loop.time())
 
@@ -198,15 +198,15 @@ class GuardedConnection(HttpToolsProtocol):
             self._left -= len(body)
         cycle = self.cycle
         if not cycle.body:
-            # The buffer is empty. Adding a piece to empty bytes returns the piece itself, without a copy, as does
-            # `bytes` of it. Small pieces are collected in a bytearray, which grows without being copied each time.
+            # The buffer is empty. Adding a piece to empty bytes returns the piece itself without a copy, and so does
+            # calling `bytes` on it. Small pieces are collected in a bytearray, which is not copied at each addition.
             cycle.body = b"" if len(body) >= LARGE_READ else bytearray()  # type: ignore[assignment]
         elif isinstance(cast("bytes | bytearray", cycle.body), bytes):
             cycle.body = bytearray(cycle.body)
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Ends a request, whose response may be in progress or already sent."""
+        """Ends a request, whose response may still be in progress or already sent."""
         if self._fault is not None:
             return
         super().on_message_complete()
@@ -231,9 +231,9 @@ class GuardedConnection(HttpToolsProtocol):
             self.guard.set_phase(record, Phase.IDLE, self.loop.time())
 
     def close_after_body(self) -> None:
-        """Closes the connection after the current body has ended or has taken too long.
+        """Closes the connection after the current body has ended or taken too long.
 
-        Closing it earlier, with unread bytes, would reset the connection, and the response would be lost.
+        Closing it while bytes are unread would reset the connection, and the response would be lost.
         """
         if self._record.phase in (Phase.BODY, Phase.LINGER) and not self._dropping:
             self._closes = True
@@ -258,7 +258,7 @@ class GuardedConnection(HttpToolsProtocol):
             cycle.disconnected = True
             cycle.waiting_for_100_continue = False
             cycle.message_event.set()
-        elif answering:  # earlier requests are answered first; the last of them closes the connection
+        elif answering:  # earlier requests are answered first, and the last of them closes the connection
             cycle.keep_alive = False
             self.guard.set_phase(record, Phase.ANSWER, now)
             return
@@ -284,8 +284,8 @@ class GuardedConnection(HttpToolsProtocol):
     def _upgrade(self) -> None:
         """Switches the connection to a WebSocket.
 
-        If another protocol is requested, the request is answered without an upgrade. The data that follows it
-        belongs to that protocol and is discarded, so that it is not taken for further requests.
+        A request for any other protocol is answered without an upgrade. The data after it belongs to that protocol and
+        is discarded, so that it is not mistaken for further requests.
         """
         if not self._should_upgrade():
             self.cycle.keep_alive = False
@@ -293,7 +293,7 @@ class GuardedConnection(HttpToolsProtocol):
         elif self.cycle is not None and not self.cycle.response_complete:
             self._fault = Refusal.MALFORMED  # the pending response would be written into the WebSocket
         else:
-            self._dropping = True  # applies to data received with the handshake; the WebSocket reads later data
+            self._dropping = True  # discards data received with the handshake; the WebSocket reads later data
             self.handle_websocket_upgrade()
 
     def pause_writing(self) -> None:
@@ -308,7 +308,7 @@ class GuardedConnection(HttpToolsProtocol):
 
 
 class _DelayedClose(asyncio.Transport):
-    """Transport of a response whose request body is still arriving; closing it waits for the end of the body."""
+    """Transport of a response whose request body is still arriving; closing is delayed until the end of the body."""
 
     def __init__(self, connection: GuardedConnection) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Guard that closes connections which exceed the limits: deadlines, connection counts, and unread responses.
+"""Guard that closes connections that exceed the limits on time, connection counts and unread responses.
 
 Connections need no timers of their own, because a sweep checks all of them about once per second.
 """
@@ -19,21 +19,21 @@ from server.counters import CONNECTIONS_REFUSED
 from server.settings import ServerSettings
 
 HEADER_LINES = 100
-"""Maximum number of header lines; more are answered with 431.
+"""Maximum number of header lines; requests with more get 431.
 
 Browsers send about twenty, proxies add about ten, and WebSockets accept at most 128.
 """
 
 SWEEP_S = 1.0
-"""Maximum seconds between two sweeps."""
+"""Maximum seconds between sweeps."""
 LINGER_S = 5.0
-"""Seconds within which `PROGRESS_BYTES` of a body must arrive while it is discarded."""
+"""Seconds within which each `PROGRESS_BYTES` of a body must arrive while the body is being discarded."""
 LINGER_LONGEST_S = 60.0
-"""Maximum seconds for which a body is discarded."""
+"""Maximum seconds for which a body is read and discarded."""
 LINGER_BYTES = 64 << 20
-"""Maximum bytes of a body that are read and discarded after the response.
+"""Maximum bytes of a body to read and discard after the response.
 
-If the connection were closed at once, it would be reset, and the sender would lose the response.
+Closing the connection immediately would reset it, and the sender would lose the response.
 """
 REFUSED_S = 2.0
 """Seconds for which data from a refused connection is read and discarded."""
@@ -48,13 +48,24 @@ SUMMARY_S = 10.0
 
 log = logging.getLogger("scas4d.server")
 
-for refusal in Refusal:  # export reasons that have not occurred yet as 0
+for refusal in Refusal:  # exports reasons that have not occurred yet as 0
     CONNECTIONS_REFUSED.labels(refusal.value)
 
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """Limits of connections, in seconds, bytes and counts."""
+    """Limits of connections.
+
+    Attributes:
+        header_seconds: maximum seconds to send a header.
+        header_bytes: maximum size of a header in bytes.
+        body_seconds: maximum seconds for each `PROGRESS_BYTES` of a body.
+        keep_alive_seconds: seconds until an idle connection is closed.
+        unread_seconds: maximum seconds for a peer to read `PROGRESS_BYTES`.
+        connections: maximum number of connections in total.
+        per_peer: maximum number of connections per peer.
+        proxies: networks of the trusted proxies.
+    """
 
     header_seconds: float
     header_bytes: int
@@ -67,7 +78,7 @@ class ConnectionLimits:
 
     @classmethod
     def of(cls, settings: ServerSettings) -> ConnectionLimits:
-        """Returns the limits from the settings of a service."""
+        """Returns the limits defined by the settings of a service."""
         return cls(
             header_seconds=settings.header_seconds,
             header_bytes=settings.header_kb << 10,
@@ -80,7 +91,7 @@ class ConnectionLimits:
         )
 
     def of_refusal(self, refusal: Refusal) -> float:
-        """Returns the limit that belongs to a refusal, in the unit of its setting; 0 if there is none."""
+        """Returns the limit that caused a refusal, in the unit of its setting; 0 if there is none."""
         return {
             Refusal.HEAD_SIZE: self.header_bytes / 1024,
             Refusal.URL_SIZE: self.header_bytes / 1024,
@@ -102,7 +113,7 @@ class ConnectionLimits:
 
 
 def peer_key(address: str) -> str:
-    """Returns the key under which a peer's connections are counted.
+    """Returns the key by which the connections of a peer are counted.
 
     For an IPv6 address, this is its /64 network, which typically belongs to one customer.
     """
@@ -138,13 +149,13 @@ class ConnectionGuard:
     ) -> tuple[OpenConnection, Refusal | None]:
         """Registers a new connection; returns its record, and the refusal if it must be refused.
 
-        If a limit is reached, the new connection replaces another that has not sent a complete header, is idle, or has
-        stopped sending its body. An idle peer must not block a peer that has a request. If the total limit is reached,
-        connections of any peer may be replaced, because a peer with many addresses has few connections per address.
+        At a limit, the new connection replaces one that has not sent a complete header, is idle, or has stopped sending
+        its body, since an idle peer must not block a peer with a request. At the limit on all connections, those of any
+        peer may be replaced, because a peer with many addresses has few connections per address.
         """
         now = loop.time()
         proxy = self.limits.is_proxy(address)
-        key = address if proxy else peer_key(address)  # neighbors of a proxy are not proxies
+        key = address if proxy else peer_key(address)  # other addresses in the network of a proxy are not proxies
         peer = self._peers.get(key)
         if peer is None:
             peer = self._peers[key] = Peer(key, proxy)
@@ -154,7 +165,7 @@ class ConnectionGuard:
         elif self._counted >= self.limits.connections and not self._evict(self._peers.values(), now):
             refusal = Refusal.CONNECTIONS
         record = self._records[transport] = OpenConnection(handler, transport, peer, now, now)
-        self._peers[key] = peer  # the peer was removed if its last connection was evicted
+        self._peers[key] = peer  # it was removed if its last connection was evicted
         peer.count += 1
         self._counted += 1
         self.set_phase(record, Phase.NEW, now)
@@ -164,7 +175,7 @@ class ConnectionGuard:
         return record, refusal
 
     def set_phase(self, record: OpenConnection, phase: Phase, now: float) -> None:
-        """Sets the phase of a connection, starting at `now` (loop time)."""
+        """Sets the phase of a connection, which begins at `now` (loop time)."""
         if record.closed:
             return
         record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
@@ -206,12 +217,12 @@ class ConnectionGuard:
         self._stop_counting(record)
 
     def count_refusal(self, refusal: Refusal) -> None:
-        """Counts a refusal, which the sweep includes in its log summary."""
+        """Counts a refusal, which the sweep includes in its log message."""
         CONNECTIONS_REFUSED.labels(refusal.value).inc()
         self._pending[refusal.value] += 1
 
     def counts(self) -> dict[str, int]:
-        """Returns the number of open connections per kind."""
+        """Returns the number of open connections of each kind."""
         totals = dict.fromkeys(KINDS.values(), 0)
         for record in self._records.values():
             totals[KINDS[record.phase]] += 1
@@ -226,8 +237,8 @@ class ConnectionGuard:
     def _make_room_for_headers(self, new: OpenConnection) -> None:
         """Closes the oldest upload without progress if uploads occupy more than half of a limit.
 
-        The other half then consists of connections that can be replaced at once. A client with a request can therefore
-        connect at any time, and need not wait until stalled uploads can be distinguished from new ones.
+        The other half then consists of connections that can be replaced immediately. A client with a request can
+        therefore connect at any time, without waiting until stalled uploads can be distinguished from new ones.
         """
         peers: Iterable[Peer] = [new.peer]
         if new.peer.proxy or 2 * len(new.peer.bodies) <= self.limits.per_peer:
@@ -247,13 +258,13 @@ class ConnectionGuard:
             self._end(most[0], new.since)
 
     def _end(self, record: OpenConnection, now: float) -> None:
-        """Aborts a connection to make room, without a response."""
+        """Aborts a connection without a response, to make room for another."""
         self.count_refusal(Refusal.DISPLACED)
         self.set_phase(record, Phase.REFUSED, now)
         record.transport.abort()
 
     def _stop_counting(self, record: OpenConnection) -> None:
-        """Stops counting a connection towards the limits, because it is refused or gone."""
+        """Stops counting a connection towards the limits, because it was refused or closed."""
         if not record.counted:
             return
         record.counted = False
@@ -264,11 +275,11 @@ class ConnectionGuard:
             self._peers.pop(peer.address, None)
 
     def _evict(self, peers: Collection[Peer], now: float) -> bool:
-        """Closes the most dispensable connection of these peers; returns False if there is none."""
+        """Closes the most dispensable connection of these peers; returns False if all are needed."""
         for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
             oldest = [(len(queue), next(iter(queue))) for queue in queues if queue]
             if oldest:
-                # Among peers with equally many connections, the longest wait decides: a new client has a request.
+                # Among peers with equally many connections, the longest wait decides, since a new client has a request.
                 _, record = max(oldest, key=lambda one: (one[0], -one[1].since))
                 self._end(record, now)
                 return True
@@ -300,7 +311,7 @@ class ConnectionGuard:
         self._timer = loop.call_later(self._every, self._sweep, loop) if go_on else None
 
     def _check_deadline(self, record: OpenConnection, now: float, passed: float) -> None:
-        """Closes a connection whose phase exceeds its deadline."""
+        """Closes a connection that has exceeded the deadline of its phase."""
         limits, phase = self.limits, record.phase
         if phase is Phase.REFUSED:
             if now - record.since > REFUSED_S:
@@ -331,10 +342,10 @@ class ConnectionGuard:
                 record.handler.refuse(Refusal.BODY_TIME)
 
     def _check_unread(self, record: OpenConnection, now: float) -> bool:
-        """Aborts a connection whose peer does not read the response; returns whether it did.
+        """Aborts a connection whose peer does not read the response; returns whether it was aborted.
 
-        Checks only connections to which nothing is written at the moment, because writing is paused or the connection
-        is closing. A decrease in unread bytes then means that the peer has read them.
+        Only connections to which nothing is being written are checked, because writing is paused or the connection is
+        closing. A decrease in unread bytes then means that the peer has read them.
         """
         closing = record.transport.is_closing()
         size = unread_bytes(record.transport) if closing or record.write_paused else 0

@@ -1,4 +1,4 @@
-"""Records of open connections and of the peers that hold them."""
+"""Records of open connections and their peers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol
 from server.connections.refusals import Refusal
 
 PROGRESS_BYTES = 16 << 10
-"""Minimum bytes that must be transferred within `body_seconds` or `unread_seconds`; less suggests an attack."""
+"""Minimum bytes to transfer within `body_seconds` or `unread_seconds`; slower peers are probably attackers."""
 
 
 class Phase(Enum):
@@ -25,13 +25,13 @@ class Phase(Enum):
     ANSWER = auto()
     """The request is complete, and the service is processing it."""
     IDLE = auto()
-    """The connection is kept alive between two requests."""
+    """The connection is being kept alive between two requests."""
     LINGER = auto()
-    """The response was sent before the body was complete; the rest of the body is discarded."""
+    """The response was sent before the body was complete; the rest of the body is being discarded."""
     SOCKET = auto()
-    """A WebSocket, which may idle indefinitely because pings check that its peer is alive."""
+    """The connection is a WebSocket, which may be idle indefinitely because pings check that its peer is alive."""
     REFUSED = auto()
-    """The connection was refused, and the bytes that still arrive are discarded."""
+    """The connection was refused, and bytes that still arrive are discarded."""
 
 
 KINDS = {
@@ -52,7 +52,7 @@ class Handler(Protocol):
 
     @property
     def waiting_for_service(self) -> bool:
-        """True if no bytes can arrive because the service is not reading at the moment."""
+        """Whether no bytes can arrive because the service is not reading at the moment."""
 
     def refuse(self, refusal: Refusal) -> None:
         """Sends the refusal as a response, if possible, and closes the connection."""
@@ -63,25 +63,25 @@ class OpenConnection:
     """Record of one open connection.
 
     Attributes:
-        handler: the protocol that handles the connection.
-        transport: the transport of the connection.
-        peer: the peer that holds the connection.
+        handler: protocol that handles the connection.
+        transport: transport of the connection.
+        peer: peer at the other end of the connection.
         since: loop time at which the phase, or its current time window, began.
         quiet_since: loop time of the last sweep that found received bytes.
         phase: current phase.
-        queue: queue of the peer in which the connection is, or None.
+        queue: queue of the peer that contains the connection, or None.
         counted: whether the connection counts towards the limits.
-        closed: whether the connection is gone.
+        closed: whether the connection is closed.
         entered: loop time at which the phase began.
-        body: bytes of the body in the current window; in all windows if the body is discarded.
-        dropped: value of `body` at the start of the current window, if the body is discarded.
-        moved: whether the current body has had `PROGRESS_BYTES` in one window.
+        body: bytes of the body received in the current window, or in all windows if the body is being discarded.
+        dropped: value of `body` at the start of the current window if the body is being discarded.
+        moved: whether `PROGRESS_BYTES` of the current body have arrived in one window.
         received: bytes received since the last sweep.
         served: whether at least one request was answered.
-        write_paused: whether the data waiting to be sent exceeds the high-water mark of the transport.
+        write_paused: whether the unsent data exceeds the high-water mark of the transport.
         unsent: bytes that the peer had not acknowledged at the last sweep.
-        unsent_since: loop time at which the current window for reading them began.
-        sent: bytes that the peer acknowledged in that window.
+        unsent_since: loop time at which the current window for reading these bytes began.
+        sent: bytes that the peer has acknowledged in that window.
     """
 
     handler: Handler
@@ -106,7 +106,7 @@ class OpenConnection:
 
     @property
     def is_begun(self) -> bool:
-        """True if the body has had less than `PROGRESS_BYTES` in every window, or is discarded."""
+        """Whether less than `PROGRESS_BYTES` of the body arrived in every window, or the body is being discarded."""
         return self.phase is Phase.LINGER or not self.moved
 
     @property
@@ -117,7 +117,7 @@ class OpenConnection:
 
 @dataclass(eq=False, slots=True)
 class Peer:
-    """Connections of one address. Those that may be closed to make room are in queues, oldest first."""
+    """Connections of one address; those that may be closed to make room are in queues, oldest first."""
 
     address: str
     proxy: bool
@@ -125,6 +125,6 @@ class Peer:
     strangers: dict[OpenConnection, None] = field(default_factory=dict)
     """Connections that have never completed a header."""
     idle: dict[OpenConnection, None] = field(default_factory=dict)
-    """Connections that have been served before and are idle or sending their next header."""
+    """Connections that were served before and are idle or sending their next header."""
     bodies: dict[OpenConnection, None] = field(default_factory=dict)
-    """Connections whose body is arriving or being discarded."""
+    """Connections with a body that is arriving or being discarded."""

@@ -1,4 +1,4 @@
-"""Process-wide resources for many connections: retained memory and the limit on open files."""
+"""Process-wide limits for many connections: memory that is retained after use, and open files."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ else:
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 RETAINED_BYTES = 32 << 20
-"""Bytes of freed memory that glibc retains."""
+"""Maximum bytes of freed memory that glibc retains."""
 OTHER_FILES = 256
-"""Open files in addition to those of connections: pipes to scenes' processes, journals, temporary files."""
+"""Number of open files other than those of connections: pipes to scenes' processes, journals, temporary files."""
 FILES_EACH = 2
-"""Open files per connection: its socket, and the record file of an upload."""
+"""Number of open files per connection: its socket, and the record file of an upload."""
 
 
 def retain_freed_memory() -> None:
     """Configures glibc to retain up to `RETAINED_BYTES` of freed memory.
 
     Sockets are read in blocks of 256 kB. By default, glibc requests new memory from the kernel for each block, which
-    takes longer than filling it. The function has no effect with other C libraries.
+    takes longer than filling the block. This function has no effect with other C libraries.
     """
     with contextlib.suppress(AttributeError, OSError):
         mallopt = ctypes.CDLL(None).mallopt
@@ -38,11 +38,11 @@ def retain_freed_memory() -> None:
 
 
 def raise_open_file_limit(asked: int) -> int:
-    """Raises the limit on open files to fit `asked` connections, as far as the system permits.
+    """Raises the limit on open files for `asked` connections, as far as the system permits.
 
     Returns:
-        Number of connections that fit the limit, at most `asked`. A service without free file descriptors cannot
-        respond to any client.
+        The number of connections that the limit allows, at most `asked`. A service that has run out of file descriptors
+        cannot respond to any client.
     """
     if not UNIX:
         return asked
@@ -59,9 +59,9 @@ def raise_open_file_limit(asked: int) -> int:
 def unread_bytes(transport: asyncio.Transport) -> int:
     """Returns the number of bytes that were written but not acknowledged.
 
-    Counts the buffer of the transport and, on systems that report it, of the kernel. The kernel accepts data in batches
-    of up to a megabyte. Between two batches, the transport's buffer alone does not reveal whether a slow peer is
-    reading.
+    This includes the buffer of the transport and, on systems that report it, of the kernel. The kernel accepts data in
+    batches of up to a megabyte. Between two batches, the transport's buffer alone does not reveal whether a slow peer
+    is reading.
     """
     unread = transport.get_write_buffer_size()
     socket = transport.get_extra_info("socket")

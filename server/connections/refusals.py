@@ -9,7 +9,7 @@ from server import problems
 from server.problems import Problem
 
 RETRY_SECONDS = 5
-"""Value of `Retry-After` if there are too many connections; by then, incomplete headers have timed out."""
+"""Value of `Retry-After` in seconds if there are too many connections; by then, incomplete headers have timed out."""
 
 
 class Refusal(StrEnum):
@@ -34,8 +34,8 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
     """Returns the problem for a refused connection or request.
 
     Args:
-        refusal: the reason.
-        limit: the limit that was exceeded, in the unit of its setting.
+        refusal: reason for the refusal.
+        limit: limit that was exceeded, in the unit of its setting.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)}
     match refusal:
@@ -60,7 +60,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.BODY_TIME:
             return Problem(
                 408,
-                f"hardly any of the body arrived in {limit:g} s",
+                f"less than 16 kB of the body arrived in {limit:g} s",
                 field="body",
                 value=f"less than 16 kB in {limit:g} s",
                 remedy="send the request again, without a pause (SCAS4D_BODY_SECONDS)",
@@ -71,12 +71,12 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
                 "the body has more chunk headers, extensions or trailers than content",
                 field="Transfer-Encoding",
                 value="chunked",
-                remedy="send chunks of at least some hundred bytes, or a Content-Length",
+                remedy="send chunks of at least a few hundred bytes, or a Content-Length",
             )
         case Refusal.PEER_CONNECTIONS | Refusal.CLIENT_REQUESTS:
             return Problem(
                 429,
-                f"the address already has {limit:g} open connections or requests",
+                f"this address already has {limit:g} open connections or requests",
                 field="client",
                 value=f"more than {limit:g}",
                 remedy="close some of them, or raise SCAS4D_MAX_CONNECTIONS_PER_PEER",
@@ -97,7 +97,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
                 "the request is not HTTP/1.1",
                 field="request",
                 value="bytes that cannot be parsed",
-                remedy="send a request of RFC 9112, over plain HTTP",
+                remedy="send a valid HTTP/1.1 request (RFC 9112), without TLS",
             )
 
 
@@ -105,8 +105,8 @@ def response(refused: Problem, headers: dict[str, str]) -> bytes:
     """Returns the problem as a complete HTTP/1.1 response with `Connection: close`.
 
     Args:
-        refused: the problem.
-        headers: headers that every response of the service has.
+        refused: problem to report.
+        headers: default headers of every response of the service.
     """
     status = HTTPStatus(refused.status_code)
     answer = problems.problem_response(refused.document, {**headers, **(refused.headers or {}), "Connection": "close"})

@@ -1,4 +1,4 @@
-"""WebSockets of uvicorn with protection against large messages, malformed handshakes and peers that do not read."""
+"""WebSockets of uvicorn, protected against large messages, malformed handshakes and peers that do not read."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from server.connections.refusals import Refusal, problem, response
 from server.http.authentication import HEADERS
 
 EARLY_BYTES = 1 << 16
-"""Maximum message size in bytes before the handshake is answered; no client needs to send messages that early."""
+"""Maximum message size in bytes until the handshake is answered; no client needs to send messages that early."""
 SMALL_FRAGMENT = 4096
-"""Maximum size in bytes of fragments that are joined with the previous fragment."""
+"""Maximum size in bytes of a fragment that is joined with the previous one."""
 PONG = b"\x8a"
 """First byte of a pong frame."""
 LIMIT = "scas4d.message_limit"
@@ -26,21 +26,21 @@ LIMIT = "scas4d.message_limit"
 
 
 class GuardedWebSocket(WebSocketsSansIOProtocol):
-    """WebSocket of uvicorn whose maximum message size is set by the application.
+    """WebSocket of uvicorn with a maximum message size that the application sets.
 
     A larger message is rejected with close code 1009 without being read.
 
     Attributes:
-        guard: the guard of the service, set by `server.connections.config`.
+        guard: connection guard of the service, set by `server.connections.config`.
     """
 
     guard: ClassVar[ConnectionGuard]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Takes over the connection from the HTTP request that asked for the upgrade."""
+        """Takes over the connection from the HTTP request that requested the upgrade."""
         super().connection_made(transport)
         self._pong = b""
-        """Pong for the newest ping, held back while the peer does not read."""
+        """Pong for the newest ping, held back while the peer is not reading."""
         self._fell_behind = False
         """True if writing was paused at any time since the last ping was sent."""
         self._record = self.guard.upgrade(transport, self, self.loop.time())
@@ -52,7 +52,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
 
     @property
     def waiting_for_service(self) -> bool:
-        """Always False: a WebSocket has a deadline only while it is being closed, and then the service reads."""
+        """Always False, because a WebSocket has a deadline only while it is closing, when the service reads."""
         return False
 
     def refuse(self, refusal: Refusal) -> None:
@@ -62,7 +62,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.transport.close()
 
     def data_received(self, data: bytes) -> None:
-        """Handles received data, and refuses an invalid handshake, for which uvicorn would wait forever."""
+        """Handles received data, and refuses an invalid handshake, after which uvicorn would wait forever."""
         self._record.received += len(data)
         if self._record.phase is Phase.LINGER:
             self._record.body += len(data)
@@ -86,7 +86,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def handle_cont(self, event: Frame) -> None:
         """Appends a fragment of a message.
 
-        Small fragments are joined, because one object each would take up to forty times their size.
+        Small fragments are joined, because an object for each would take up to forty times its size.
         """
         if event.fin or len(event.data) > SMALL_FRAGMENT:
             super().handle_cont(event)
@@ -100,8 +100,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def handle_parser_exception(self) -> None:
         """Closes a connection that violates the protocol or whose message is too large (1009).
 
-        Data that the peer continues to send is read and discarded for a while. uvicorn would close at once,
-        which resets the connection, so that the peer would not receive the reason.
+        Data that the peer continues to send is read and discarded for a while. uvicorn would close the connection
+        immediately, which would reset it, so that the peer would not receive the reason.
         """
         sent = self.conn.close_sent
         if sent is None:  # the handshake is not answered yet
@@ -111,8 +111,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.transport.write(b"".join(self.conn.data_to_send()))
         self.close_sent = True
         self.guard.set_phase(self._record, Phase.LINGER, self.loop.time())
-        # The application ends now. While this timer exists, uvicorn does not close the connection after the
-        # application. The guard closes it before the timer expires.
+        # The application returns now. While this timer exists, uvicorn does not close the connection after that. The
+        # guard closes it before the timer expires.
         self.close_timer = self.loop.call_later(LINGER_LONGEST_S, self.transport.close)
         if self.transport.can_write_eof():
             self.transport.write_eof()
@@ -123,7 +123,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def handle_ping(self) -> None:
         """Responds to a ping.
 
-        While the peer does not read, only the response to the newest ping is kept, as RFC 6455 (5.5.3) permits.
+        While the peer is not reading, only the response to the newest ping is kept, as RFC 6455 (5.5.3) permits.
         Otherwise, each ping would add a response to the write buffer. Data from the peer is still read, since its pongs
         show that it is alive.
         """
@@ -133,7 +133,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         for frame in self.conn.data_to_send():
             if frame[:1] == PONG:
                 self._pong = frame
-            else:  # the response to a close frame after the pings; nothing may follow it
+            else:  # the response to a close frame, after which nothing may be sent
                 self._pong = b""
                 self.transport.write(frame)
 
@@ -158,8 +158,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def keepalive_timeout(self) -> None:
         """Closes a connection that has not answered a ping, unless the peer may not have read the ping yet.
 
-        Megabytes may be queued before the ping, including in the kernel. If the peer does not read them, the guard
-        closes the connection.
+        Megabytes of data may be queued ahead of the ping, including in the kernel. If the peer does not read them, the
+        guard closes the connection.
         """
         if self._fell_behind and self.ping_timeout is not None:
             self._fell_behind = self._record.write_paused
@@ -169,7 +169,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
 
 
 def limit_messages(scope: Scope, size: int) -> None:
-    """Sets the maximum message size of a WebSocket to `size` bytes; call it before accepting the WebSocket."""
+    """Sets the maximum message size of a WebSocket to `size` bytes; call this before accepting the WebSocket."""
     extension = scope.get("extensions", {}).get(LIMIT)
     if extension is not None:  # other servers have their own limit
         extension["set"](size)

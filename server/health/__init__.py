@@ -1,1 +1,1 @@
-"""State of the service for operators: readiness, resource estimates, Prometheus gauges and logs."""
+"""Health of the service for operators: readiness, resource estimates, Prometheus gauges and logs."""

@@ -1,4 +1,4 @@
-"""Estimates of the memory and disk needs of a scene; `scripts/bench memory` measured the constants."""
+"""Estimates of the memory and disk space that a scene needs; `scripts/bench memory` measured the constants."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ from server.problems import Problem, count_noun
 from server.settings import ServerSettings
 
 PROCESS = 280e6
-"""Bytes for the interpreter, libraries and compiled kernels of a worker or reader process."""
+"""Bytes of the interpreter, libraries and compiled kernels in a worker or reader process."""
 PIXEL = 8
-"""Bytes per input pixel: the decoded image and its mask, for the current and the previous frame."""
+"""Bytes per input pixel: the decoded image and mask of the current and the previous frame."""
 SCALED_PIXEL = 112
 """Bytes per scaled pixel for the images of an update.
 
 These are the target image (3 or 4 channels of float32) and the image of the static Gaussians. The box around the moving
-Gaussians has a copy of the target and SSIM's two moments. Without masks, the targets and moments of two frames are
-held.
+Gaussians also has a copy of the target and SSIM's two moments. Without masks, the targets and moments of two frames are
+kept.
 """
 NOVEL_PIXEL = 38
 """Additional bytes per scaled pixel if Gaussians may be added.
 
-Of these, 21 hold the new content that each camera detects (an image, an error map and five masks). The other 17 hold
-the distance maps for carving, or the image crops to which the new Gaussians are fitted.
+Of these, 21 are for detecting new content in each camera (an image, an error map and five masks). The other 17 are for
+the distance maps for carving, or for the image crops to which the new Gaussians are fitted.
 """
 VOXELS = 150e6
-"""Maximum bytes of the voxels for carving a new object and of the grid that separates objects."""
+"""Maximum bytes of the voxels that carve a new object and of the grid that separates objects."""
 GAUSSIAN = 2200
-"""Bytes per Gaussian in the worker: state, layers, Adam moments, neighbors and render buffers."""
+"""Bytes per Gaussian in the worker: state, deformation layers, Adam moments, neighbors and render buffers."""
 READ_GAUSSIAN = 500
 """Bytes per Gaussian in a reader."""
 STATE = 81
 """Bytes on disk per Gaussian and frame."""
 HISTORY = 28
-"""Bytes per Gaussian and frame of a query: position and material rotation."""
+"""Bytes per Gaussian and queried frame: position and material rotation."""
 LARGEST_BUDGET, MOST_PER_PIXEL = 100_000, 0.61
 """Limits of `scas4d_core.first_frame.static_scene.budget` for an image without background."""
 BEARING = ("entering", "uncovered")
-"""Effects that add Gaussians and therefore search the images for new content."""
+"""Effects that add Gaussians and therefore detect new content in the images."""
 SCALES = (0.75, 0.5, 0.35, 0.25, 0.125)
-"""Image scales that are suggested for a scene that does not fit, in order of preference."""
+"""Image scales to suggest for a scene that does not fit into memory, in order of preference."""
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 
 def machine_mb() -> float:
-    """Returns the memory of the machine in MB, or of the container if that is smaller."""
+    """Returns the memory of the machine or, if smaller, the limit of the container, in MB."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         return min(total, int(CGROUP.read_text())) / 1e6
@@ -58,7 +58,7 @@ def machine_mb() -> float:
 
 
 def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: float | None = None) -> SceneEstimate:
-    """Returns the estimate for a scene with this rig and these settings; `scale` overrides their image_scale."""
+    """Returns the estimate for a scene with this rig and these settings; `scale` overrides `scene.image_scale`."""
     scale = settings.scene.image_scale if scale is None else scale
     sizes = [camera.width * camera.height for camera in rig.cameras]
     pixels = sum(sizes)
@@ -89,10 +89,10 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
 
 
 def refuse_if_too_large(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
-    """Checks that the estimated memory of a scene is within the limit.
+    """Refuses a scene whose estimated memory exceeds the limit.
 
     Raises:
-        Problem: 422 if it is not; the remedy suggests an image scale that fits, if there is one.
+        Problem: 422 if it does; the remedy suggests an image scale that fits, if there is one.
     """
     needed = estimate(rig, settings, server)
     if needed.memory_mb <= needed.limit_mb:

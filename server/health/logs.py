@@ -1,6 +1,6 @@
-"""Log formatting for every process: one JSON object per line on stderr, or plain text in a terminal.
+"""Log formatting for all processes: one JSON object per line on stderr, or plain text in a terminal.
 
-Log lines never contain secrets.
+Secrets are masked.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.(?:ticket|read)\.|(?:token|ticket)=)[^\s\"',;&]+")
-"""Pattern of the text before a secret. Secrets are masked everywhere, since any log message may quote a request."""
+"""Pattern of secrets with the text before them. They are masked in all messages, since any may quote a request."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
 
@@ -24,7 +24,7 @@ def redact(text: str) -> str:
 
 
 class JsonFormatter(logging.Formatter):
-    """Formatter for JSON logs with time, level, logger, message, process id, `extra` fields and any traceback."""
+    """JSON formatter with time, level, logger, message, process id, `extra` fields and traceback, if any."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Returns the record as one line of JSON."""
@@ -42,13 +42,13 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Formatter for human readers: the time of day, the level if it is at least warning, and the message."""
+    """Formatter for human readers, with time of day, message, and the level if it is warning or higher."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
-        """Returns the record as one line, or as several lines if it has a traceback."""
+        """Returns the record as one line, or several lines if it has a traceback."""
         said = super().format(record)
         if record.levelno > logging.INFO:
             moment, _, message = said.partition(" ")
@@ -57,18 +57,18 @@ class TextFormatter(logging.Formatter):
 
 
 def is_worth_showing(record: logging.LogRecord) -> bool:
-    """Returns False for successful read requests, since a viewer or a waiting rig sends several per second."""
+    """Returns False for successful read requests, because a viewer or a waiting rig sends several per second."""
     return record.levelno > logging.INFO or not (
         getattr(record, "method", "") in ("GET", "HEAD") and getattr(record, "status", 500) < 400
     )
 
 
 def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "info") -> None:
-    """Configures logging of this process to stderr; call it first in the service and in each of its processes.
+    """Configures logging to stderr; call it first in the service and in each of its processes.
 
     Args:
         format: log format; auto selects text if stderr is a terminal, otherwise json.
-        level: lowest level that is logged: debug, info, warning or error.
+        level: minimum level to log: debug, info, warning or error.
     """
     text = format == "text" or (format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler()
@@ -80,7 +80,7 @@ def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "in
         logging.getLogger(name).setLevel(level.upper())
     if text:
         handler.addFilter(is_worth_showing)
-        # uvicorn logs its start and end at INFO; the service logs both itself.
+        # uvicorn logs its startup and shutdown at INFO, but the service logs both itself.
         logging.getLogger("uvicorn").setLevel(max(logging.WARNING, logging.getLogger("uvicorn").level))
-    # uvicorn logs the full URL of a WebSocket, including the query; `AccessLog` logs it without the query.
+    # uvicorn logs the URL of a WebSocket including its query; `AccessLog` logs it without the query.
     logging.getLogger("uvicorn.error").addFilter(lambda record: '"WebSocket %s"' not in str(record.msg))

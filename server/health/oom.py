@@ -1,4 +1,4 @@
-"""Count of processes that the kernel killed because memory was exhausted."""
+"""Count of the processes killed by the kernel's out-of-memory killer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def oom_kills() -> int:
-    """Returns the number of processes that the out-of-memory killer has killed in this control group."""
+    """Returns the number of processes in this control group that the out-of-memory killer has killed."""
     try:
         for line in Path("/proc/self/cgroup").read_text().splitlines():
             number, _, path = line.partition("::")

@@ -1,8 +1,8 @@
 """Readiness of the service, which depends on the compilation of its kernels.
 
-A separate process compiles the kernels that are not in the cache. The service is ready when the kernels for a first
-frame are compiled; the kernels for updates are compiled while frame 0 is reconstructed. The process that handles
-requests never loads the kernels. Workers load them from the cache and wait for those for updates.
+A separate process compiles the kernels that are not in the cache. The service is ready once the kernels for a first
+frame are compiled; the kernels for updates are compiled while frame 0 is being reconstructed. The process that handles
+requests never loads the kernels. Workers load them from the cache, and wait for the update kernels if necessary.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from server.settings import ServerSettings
 log = logging.getLogger("scas4d.server")
 
 LOG_S = 5.0
-"""Seconds between two log lines about the progress of the compilation."""
+"""Seconds between log lines about the progress of the compilation."""
 
 
 @dataclass(frozen=True)
 class CompileProgress:
-    """Progress of the compilation: `done` of `total` kernels for a first frame are compiled."""
+    """Progress of the compilation: `done` of `total` kernels for a first frame have been compiled."""
 
     done: int
     total: int
@@ -38,18 +38,18 @@ class CompileProgress:
 
 @dataclass(frozen=True)
 class WarmUpResult:
-    """Result of compiling the kernels for a first frame; `fault` is the reason of a failure, else None."""
+    """Result of compiling the kernels for a first frame; `fault` is the reason for a failure, or None."""
 
     fault: str | None = None
 
 
 def main(spec: None, connection: Connection[Any, Any]) -> None:
-    """Entry point of the process: compiles the kernels for a first frame, reports, then compiles those for updates."""
+    """Entry point of the process: compiles the first-frame kernels, reports the result, and compiles the others."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     with contextlib.suppress(EOFError, OSError):
         try:
-            from scas4d_core.warm_up import warm_up, warm_up_updates  # keeps the service itself small
+            from scas4d_core.warm_up import warm_up, warm_up_updates  # imported lazily: keeps the service process small
 
             warm_up(lambda done, total: connection.send(CompileProgress(done, total)))
             connection.send(WarmUpResult())
@@ -57,20 +57,20 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
         except (EOFError, OSError):
             raise
         except Exception as error:
-            log.exception("the kernels could not be compiled")
+            log.exception("cannot compile the kernels")
             connection.send(WarmUpResult(f"{type(error).__name__}: {message_of(error)}"))
-        connection.recv()  # returns on a request to exit or when the service is gone; the report has been read by then
+        connection.recv()  # returns when asked to exit or when the service is gone; by then, the result was read
     os._exit(0)
 
 
 class Readiness:
-    """Readiness state of the service, which starts to warm up the kernels on construction.
+    """Readiness of the service; its construction starts to warm up the kernels.
 
     Attributes:
         after: seconds from the start until the service was ready; None if it is not ready yet.
         fault: reason why the kernels could not be compiled, or None. The service continues without the warm-up, and
             its first frame reports the error.
-        compiled: progress of the compilation of the kernels for a first frame; None if it is not known.
+        compiled: progress of the compilation of the kernels for a first frame; None if unknown.
         stopping: whether the service is shutting down.
     """
 
@@ -83,7 +83,7 @@ class Readiness:
         self._logged_at = self._began
         self._process: ProcessHandle | None = None
         if settings.warm_up:
-            log.info("loading the kernels; the first start compiles them, which takes half a minute")
+            log.info("loading the kernels; on the first start they are compiled, which takes half a minute")
             self._process = placement.start(main, None, self._on_message, self._on_end)
         else:
             self.after = 0.0
@@ -96,12 +96,12 @@ class Readiness:
         """
         waited = time.monotonic() - self._began
         if self.stopping:
-            raise Problem(503, "the service ends", remedy="wait until it is restarted", seconds=waited)
+            raise Problem(503, "the service is shutting down", remedy="wait until it is restarted", seconds=waited)
         if self.fault is not None:
             raise Problem(
                 503,
                 f"the kernels could not be compiled: {self.fault}",
-                remedy="the service's log has the traceback; SCAS4D_WARM_UP=false skips this",
+                remedy="see the traceback in the service's log; SCAS4D_WARM_UP=false skips the compilation",
                 seconds=waited,
             )
         if self.after is None:
@@ -110,8 +110,8 @@ class Readiness:
             so_far = "" if now is None else f": {now.done} of {now.total}"
             raise Problem(
                 503,
-                f"kernels are being loaded, for {waited:.1f} s so far; the first start compiles them{so_far}",
-                remedy="ask again",
+                f"kernels have been loading for {waited:.1f} s; on the first start they are compiled{so_far}",
+                remedy="try again",
                 headers={"Retry-After": "1"},
                 seconds=waited,
                 warming_up=True,
@@ -124,7 +124,7 @@ class Readiness:
         self.stopping = True
         if self._process is not None:
             process, self._process = self._process, None
-            await process.stop(0.0)  # no grace period: the process holds no data to save
+            await process.stop(0.0)  # no grace period: the process has no data to save
 
     def _on_message(self, message: CompileProgress | WarmUpResult) -> None:
         if isinstance(message, CompileProgress):
@@ -144,4 +144,4 @@ class Readiness:
         self._process = None
         if self.after is None and self.fault is None:
             self.fault = str(how)
-            log.error("the kernels could not be compiled: %s", self.fault)
+            log.error("cannot compile the kernels: %s", self.fault)

@@ -1,1 +1,1 @@
-"""Middleware for all requests: authentication, permissions, origin checks, body limits, compression and errors."""
+"""HTTP middleware and helpers: authentication, permissions, origin checks, body limits, compression and errors."""

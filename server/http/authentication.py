@@ -1,7 +1,7 @@
 """Authentication of requests and WebSockets by tokens, tickets and share links.
 
-The token of the service permits everything, a read-only token permits reading, and a share link permits reading one
-scene until the link expires. A share link is signed with the token of the service and is not stored; changing the token
+The service's token grants full access, a read-only token grants read access, and a share link grants read access to one
+scene until the link expires. A share link is signed with the service's token and is not stored; changing the token
 revokes all links.
 """
 
@@ -23,13 +23,13 @@ from server.problems import Problem
 from server.settings import ServerSettings, is_loopback
 
 PROBES = frozenset({"/health/live", "/health/ready", "/health/ingest"})
-"""Paths that an orchestrator probes without a token; their responses reveal at most the number of scenes."""
+"""Paths that orchestrators probe without a token; their responses reveal at most the number of scenes."""
 OPEN = PROBES | {"/", "/viewer", "/favicon.ico", "/docs", "/redoc", "/openapi.json"}
-"""Paths that expose no data and need no token: the probes, the viewer page and the description of the API."""
+"""Paths that expose no data and need no token: the probes, the viewer page and the API description."""
 OPEN_FOLDERS = ("/viewer/", "/docs/")
-"""Path prefixes of the files of the viewer page and the API reference, which need no token."""
+"""Path prefixes of the viewer's and the API reference's files, which need no token."""
 IN_URL = frozenset({"token", "access_token", "api_key", "ticket", "authorization"})
-"""Query parameters that are rejected because their value may be a secret."""
+"""Query parameters that are rejected because their values may be secrets."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -40,7 +40,7 @@ HEADERS = {
 }
 """Default headers of every response.
 
-They prevent framing by other sites, guessing of media types by browsers, and responses from outdated caches.
+They prevent framing by other sites, media type sniffing by browsers, and outdated responses from caches.
 """
 
 
@@ -82,9 +82,9 @@ class AuthMiddleware:
         if self._token is None and not all(map(is_loopback, ends)):
             raise Problem(
                 403,
-                "the service is reachable from other machines and has no token",
+                "the service is reachable from other machines but has no token",
                 field="SCAS4D_TOKEN",
-                remedy="set a token and restart it, or listen at 127.0.0.1",
+                remedy="set a token and restart the service, or listen on 127.0.0.1",
             )
 
     def _refuse_token_in_url(self, scope: Scope) -> None:
@@ -93,10 +93,10 @@ class AuthMiddleware:
             if name.lower() in IN_URL:
                 raise Problem(
                     400,
-                    "a secret in a URL ends up in logs and browser histories",
+                    "a secret must not be sent in a URL, which ends up in logs and browser histories",
                     field=name,
-                    remedy="send the token as `Authorization: Bearer`, a ticket as WebSocket subprotocol; if this "
-                    "was the real one, replace it",
+                    remedy="send the token as `Authorization: Bearer`, or a ticket as a WebSocket subprotocol; if this "
+                    "was a real secret, replace it",
                 )
 
     def _is_open(self, scope: Scope) -> bool:
@@ -105,10 +105,10 @@ class AuthMiddleware:
         return path in OPEN or path.startswith(OPEN_FOLDERS) or (scope["method"] == "OPTIONS" and bool(self.origins))
 
     def _bearer(self, scope: Scope) -> Permission:
-        """Returns the permission of the bearer.
+        """Returns the permission granted by the request's token.
 
         Raises:
-            Problem: 401 if the token is missing, wrong or expired.
+            Problem: 401 if the token is missing, invalid or expired.
         """
         if self._token is None or self._sharing is None:
             return ALL
@@ -121,9 +121,9 @@ class AuthMiddleware:
                 return permission
         raise Problem(
             401,
-            "the token is wrong" if given else "the service requires a token",
+            "the token is invalid" if given else "the service requires a token",
             field="Authorization",
-            remedy="send `Authorization: Bearer` and the token that the service was started with",
+            remedy="send `Authorization: Bearer` with the token that the service was started with",
             headers={"WWW-Authenticate": 'Bearer realm="scas4d"' + (', error="invalid_token"' if given else "")},
         )
 
@@ -133,16 +133,16 @@ class AuthMiddleware:
         scope[PERMISSION] = permission
 
     def _ticket(self, scope: Scope, send: Send) -> Send:
-        """Checks the ticket or token of a WebSocket, and returns the sender that accepts the ticket's subprotocol."""
+        """Checks the ticket or token of a WebSocket; returns a `send` that accepts the ticket's subprotocol."""
         shown = take_offered(scope)
         if self._token is not None and len(shown) == 1:
             permission = self.tickets.redeem(shown[0].removeprefix(SUBPROTOCOL))
             if permission is None:
                 raise Problem(
                     401,
-                    "the ticket was used before, has expired, or was never issued",
+                    "the ticket was already used, has expired, or was never issued",
                     field="Sec-WebSocket-Protocol",
-                    remedy="request another one with POST /v1/tickets and use it at once",
+                    remedy="request a new one with POST /v1/tickets and use it immediately",
                     headers={"WWW-Authenticate": 'Bearer realm="scas4d"'},
                 )
         else:
@@ -154,15 +154,15 @@ class AuthMiddleware:
 def _refuse_control_characters(scope: Scope) -> None:
     """Rejects control characters in a path.
 
-    A route pattern may match a path that ends with a line break when a permission rule does not.
+    A route pattern may match a path that ends with a line break even if a permission rule does not.
     """
     if any(character < " " or character == "\x7f" for character in scope["path"]):
         raise Problem(
             400,
-            "the path has a control character",
+            "the path contains a control character",
             field="path",
             value=scope["path"],
-            remedy="see /openapi.json for the addresses",
+            remedy="see /openapi.json for all paths",
         )
 
 
@@ -182,18 +182,18 @@ def _add_headers(send: Send) -> Send:
 
 
 def _answer_closed_handshake(scope: Scope, receive: Receive, send: Send) -> Send:
-    """Returns a sender that responds with a 404 problem if the application closes a WebSocket before accepting it.
+    """Wraps `send` to respond with a 404 problem if the application closes a WebSocket before accepting it.
 
-    In that case, there is no WebSocket at the path.
+    In that case, the path has no WebSocket endpoint.
     """
     accepted = False
 
     async def sending(message: Message) -> None:
         nonlocal accepted
         if message["type"] == "websocket.close" and not accepted:
-            detail = message.get("reason") or f"there is no WebSocket at {scope['path']}"
+            detail = message.get("reason") or f"there is no WebSocket endpoint at {scope['path']}"
             problem = Problem(
-                404, detail, field="path", value=scope["path"], remedy="the streams are in docs/stream.md"
+                404, detail, field="path", value=scope["path"], remedy="see docs/stream.md for the endpoints"
             )
             await problems.refuse(problem, scope, receive, send)
             return

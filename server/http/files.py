@@ -1,4 +1,4 @@
-"""Static files of the service's pages, served with a content security policy and an entity tag."""
+"""Static files of the service's web pages, served with a content security policy and an entity tag."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def security_headers(**changes: str) -> dict[str, str]:
     The default policy forbids content from other sites, inline scripts and styles, and framing.
 
     Args:
-        changes: directives of the policy to override, with underscores instead of hyphens.
+        changes: policy directives to override, with underscores instead of hyphens in their names.
     """
     directives = {"default_src": "'none'"}
     directives |= dict.fromkeys(("script_src", "style_src", "img_src", "connect_src"), "'self'")
@@ -29,24 +29,24 @@ def security_headers(**changes: str) -> dict[str, str]:
         "Content-Security-Policy": "; ".join(f"{name.replace('_', '-')} {value}" for name, value in directives.items()),
         "X-Content-Type-Options": "nosniff",
         "Referrer-Policy": "no-referrer",
-        "Cache-Control": "no-cache",  # revalidated by ETag, so updates appear at once
+        "Cache-Control": "no-cache",  # revalidated by ETag, so that updates appear immediately
     }
 
 
 def serve_file(
     request: Request, files: Mapping[str, Path], name: str, headers: Mapping[str, str], page: str
 ) -> Response:
-    """Returns a response with one of the files, or 304 if the client has it already.
+    """Returns a response with a static file, or 304 if the client already has it.
 
     Args:
-        request: the request.
+        request: HTTP request.
         files: paths of the available files, keyed by name.
         name: name of the requested file.
-        headers: headers of the response.
-        page: path of the page that uses the files, quoted in the remedy.
+        headers: response headers.
+        page: URL path of the page that uses the files, quoted in the remedy.
 
     Raises:
-        Problem: 404 if there is no such file.
+        Problem: 404 if there is no file of that name.
     """
     file = files.get(name)
     if file is None:

@@ -1,4 +1,4 @@
-"""Exception handlers that turn every error of the application into a problem document."""
+"""Exception handlers that convert every error of the application into a problem document."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def install_handlers(app: FastAPI) -> None:
         given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if first["loc"][0] == "body" and given and not JSON.fullmatch(given):
             problem = Problem(
-                415, f"the body is {given}", field="Content-Type", value=given, remedy="send application/json"
+                415, f"the body has type {given}", field="Content-Type", value=given, remedy="send application/json"
             )
             return problem_response(problem.document)
         route = request.scope.get("route")
@@ -83,7 +83,7 @@ def _framework_problem(request: Request, status: int, detail: str, headers: Mapp
     if status == 404:
         field, value, remedy = "path", request.url.path, "GET /openapi.json lists all paths"
     elif status == 405:
-        field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another'}"
+        field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another method'}"
     elif status == 400:
-        field, remedy = "body", "send the body that Content-Type says; the schema is at /openapi.json"
+        field, remedy = "body", "send a body that matches its Content-Type; the schema is at /openapi.json"
     return Problem(status, detail, field=field, value=value, remedy=remedy).document

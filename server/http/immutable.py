@@ -1,4 +1,4 @@
-"""Responses with immutable content: entity tags, byte ranges and file names."""
+"""Responses with immutable content, including entity tags, byte ranges and file names."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ TAG_BYTES = 16
 PIECE = 256 * 1024
 """Size in bytes of the blocks in which a file is read."""
 KEEP = "private, no-cache"
-"""Cache-Control value. Caches must revalidate a stored response, since a damaged state may be recomputed."""
+"""Cache-Control value; caches must revalidate a stored response, because a damaged state may be recomputed."""
 
 
 def content_disposition(name: str, *, inline: bool = False) -> str:
-    """Returns a Content-Disposition header (RFC 6266) for a file name with arbitrary characters.
+    """Returns the value of a Content-Disposition header (RFC 6266) for a file name with arbitrary characters.
 
     >>> content_disposition("front.png", inline=True)
     'inline; filename="front.png"'
@@ -46,18 +46,18 @@ def immutable_response(
     inline: bool = False,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Returns a response with bytes that never change for this URL.
+    """Returns a response whose body never changes for this URL.
 
-    The status is 304 if `If-None-Match` has the tag, and 206 for a single byte range (`If-Range` must have the tag).
-    The response to multiple ranges or to other units has the whole body (RFC 9110, 13.1 and 14.2).
+    The status is 304 if `If-None-Match` contains the tag, and 206 for a single byte range (`If-Range`, if present, must
+    match the tag). Requests for multiple ranges or other units get the whole body (RFC 9110, 13.1 and 14.2).
 
     Args:
-        request: the request with its conditional headers.
-        body: the complete body.
+        request: HTTP request with its conditional headers.
+        body: complete body.
         media_type: media type of the body.
         name: file name for clients that save the body.
         inline: whether browsers display the body instead of saving it.
-        headers: additional headers.
+        headers: additional response headers.
 
     Raises:
         Problem: 416 if the range starts at or after the end of the body.
@@ -81,10 +81,10 @@ def immutable_response(
 
 
 async def immutable_file_response(request: Request, path: Path, *, tag: str, media_type: str, name: str) -> Response:
-    """Returns a response with an immutable file, like `immutable_response`, but streams it in blocks.
+    """Returns a response that streams an immutable file in blocks; otherwise like `immutable_response`.
 
     Args:
-        request: the request with its conditional headers.
+        request: HTTP request with its conditional headers.
         path: path of the file.
         tag: entity tag of the file's contents, without quotes.
         media_type: media type of the file.
@@ -92,7 +92,7 @@ async def immutable_file_response(request: Request, path: Path, *, tag: str, med
 
     Raises:
         Problem: 416 if the range starts at or after the end of the file.
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
     """
     opened = await asyncio.to_thread(path.open, "rb")
     kept = {
@@ -122,7 +122,7 @@ async def immutable_file_response(request: Request, path: Path, *, tag: str, med
 
 
 def _pieces(opened: BinaryIO, start: int, end: int) -> Iterator[bytes]:
-    """Yields the bytes from `start` to `end` of an open file and closes it; Starlette runs it in threads."""
+    """Yields the bytes from `start` to `end` of an open file, then closes it; Starlette iterates over it in threads."""
     with opened:
         opened.seek(start)
         while start < end and (piece := opened.read(min(PIECE, end - start))):
@@ -131,7 +131,7 @@ def _pieces(opened: BinaryIO, start: int, end: int) -> Iterator[bytes]:
 
 
 def matches_etag(request: Request, tag: str) -> bool:
-    """Returns whether `If-None-Match` contains the tag, by weak comparison."""
+    """Returns whether `If-None-Match` contains the tag, using weak comparison."""
     given = request.headers.get("if-none-match")
     if given is None or request.method not in ("GET", "HEAD"):
         return False
@@ -141,7 +141,7 @@ def matches_etag(request: Request, tag: str) -> bool:
 
 
 def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
-    """Returns start and end of the requested byte range, or None for the whole body.
+    """Returns the start and end of the requested byte range, or None for the whole body.
 
     Raises:
         Problem: 416 if the range is not satisfiable.
@@ -162,10 +162,10 @@ def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
     if start >= size or start >= end:
         raise Problem(
             416,
-            f"there are {size} bytes",
+            f"the range is outside the {size} bytes available",
             field="Range",
             value=given,
-            remedy="ask for a range that begins before the end, or for the whole without Range",
+            remedy="request a range that starts before the end, or omit Range to get the whole body",
             headers={"Content-Range": f"bytes */{size}"},
         )
     return start, end

@@ -17,17 +17,17 @@ HEAD = "scas4d.head"
 access = logging.getLogger("scas4d.access")
 
 MIN_BYTES = 1000
-"""Minimum size of a response in bytes for compression; shorter responses do not benefit."""
+"""Minimum size in bytes of a response to compress; shorter responses do not benefit."""
 LEVEL = 4
-"""Compression level of gzip; Starlette's default of 9 takes several times as long and saves only a few percent."""
+"""Gzip compression level; Starlette's default of 9 takes several times as long and saves only a few percent."""
 COMPRESSED_TYPES = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/vnd.numpy.npz")
-"""Media types that are not compressed, because they are compressed already (images) or gain little (floats)."""
+"""Media types that are not compressed, because they are already compressed (images) or gain little (floats)."""
 
 
 class AccessLog:
     """Middleware that logs one line per request and per WebSocket.
 
-    A line has the method, path, status, duration, sizes and client address, but no query and no headers.
+    A line has the method, path, status, duration, sizes and client address, but neither the query nor the headers.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -60,7 +60,7 @@ class AccessLog:
             await self.app(scope, receiving, sending)
         finally:
             method = scope.get("method", "WEBSOCKET")
-            # Percent-encoded as it was sent, so that a path cannot contain a line break.
+            # The path is logged percent-encoded, as sent, so that it cannot contain a line break.
             path = scope.get("raw_path", scope["path"].encode()).decode("latin-1")
             known = {
                 "method": method,
@@ -75,9 +75,9 @@ class AccessLog:
 
 
 class BodyLimit:
-    """Middleware that responds with 413 to a body of more than `limit` bytes.
+    """Middleware that responds with 413 to bodies of more than `limit` bytes.
 
-    A body with a Content-Length is rejected at once, and any other body while it is being read.
+    A body with a Content-Length is rejected immediately, any other body while it is being read.
     """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
@@ -85,7 +85,7 @@ class BodyLimit:
         self.limit = limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on and counts the bytes of its body."""
+        """Passes the request on while counting the bytes of its body."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -111,17 +111,17 @@ class BodyLimit:
             f"the body is larger than {self.limit} bytes",
             field="Content-Length",
             value=value,
-            remedy="send smaller or more compressed pictures, or raise SCAS4D_MAX_BODY_MB",
+            remedy="send smaller or more strongly compressed pictures, or raise SCAS4D_MAX_BODY_MB",
         )
 
 
 def compress_responses(app: ASGIApp) -> GZipMiddleware:
-    """Returns the application wrapped in gzip compression of JSON and page files, for clients that accept it."""
+    """Wraps an application so that JSON and page files are compressed with gzip for clients that accept it."""
     return GZipMiddleware(app, MIN_BYTES, LEVEL, exclude_content_types=COMPRESSED_TYPES)
 
 
 class HeadAsGet:
-    """Middleware that responds to HEAD as to GET, but without the body (RFC 9110, 9.3.2)."""
+    """Middleware that responds to HEAD like GET, but without the body (RFC 9110, 9.3.2)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app

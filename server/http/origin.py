@@ -1,9 +1,9 @@
 """Checks of the Host and Origin headers, which prevent pages of other sites from using the service.
 
-Any web page can send requests to a server on the loopback interface of the machine on which it is displayed. Two
-headers, which no page can forge, reveal such requests. `Origin` names the site of the requesting page; `Sec-Fetch-Site`
-serves the same purpose for images and forms, which omit Origin. `Host` is the name under which the client found the
-service. An unknown name indicates DNS rebinding, which makes a foreign page look like a page of the service.
+Any web page can send requests to a server on the loopback interface of the machine on which it is displayed. Headers
+that no page can forge reveal such requests. `Origin` is the site of the requesting page; `Sec-Fetch-Site` serves the
+same purpose for images and forms, whose requests omit Origin. `Host` is the name by which the client addresses the
+service. An unknown name indicates DNS rebinding, which makes a foreign page appear to belong to the service.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ def check_origin(scope: Scope, allowed_hosts: Sequence[str], allowed_origins: Se
 
     Args:
         scope: ASGI scope of type http or websocket.
-        allowed_hosts: names (`host` or `host:port`) allowed in addition to loopback names and the address of the
-            connection.
-        allowed_origins: origins of other allowed sites, `scheme://host[:port]`.
+        allowed_hosts: host names (`host` or `host:port`) allowed in addition to loopback names and the server address
+            of the connection.
+        allowed_origins: origins of other sites that are allowed, as `scheme://host[:port]`.
 
     Raises:
-        Problem: 400 for a missing or invalid Host, 421 for an unknown Host, 403 for a page of another site.
+        Problem: 400 for a missing or invalid Host; 421 for an unknown Host; 403 for a page of another site.
     """
     headers = Headers(scope=scope)
     host = _host(headers)
     if not _is_allowed_host(scope, host, allowed_hosts):
         raise Problem(
             421,
-            "the service is not known by this name",
+            "the service does not accept this host name",
             field="Host",
             value=host,
-            remedy="address it as 127.0.0.1 or localhost, or add the name to SCAS4D_ALLOWED_HOSTS",
+            remedy="use 127.0.0.1 or localhost, or add the name to SCAS4D_ALLOWED_HOSTS",
         )
     origin = headers.get("origin")
     if origin is not None:
@@ -58,7 +58,7 @@ def check_origin(scope: Scope, allowed_hosts: Sequence[str], allowed_origins: Se
 def _foreign_problem(field: str, value: str) -> Problem:
     return Problem(
         403,
-        "pages of other sites must not use the service",
+        "pages of other sites are not allowed to use the service",
         field=field,
         value=value,
         remedy="use the service's own page, or add the site to SCAS4D_ALLOWED_ORIGINS",
@@ -70,10 +70,10 @@ def _host(headers: Headers) -> str:
     if len(hosts) != 1 or split_authority(hosts[0]) is None:
         raise Problem(
             400,
-            "a request needs one Host header, host or host:port",
+            "a request needs exactly one Host header, host or host:port",
             field="Host",
             value=", ".join(hosts),
-            remedy="send the address that you connect to",
+            remedy="send the address to which you connect",
         )
     return hosts[0]
 
@@ -81,7 +81,7 @@ def _host(headers: Headers) -> str:
 def split_authority(authority: str) -> tuple[str, int | None] | None:
     """Splits `host[:port]` into host and port; returns None if it is invalid.
 
-    The host is in lower case, without the brackets of IPv6 addresses and without a final dot.
+    The host is in lower case, without the brackets of an IPv6 address and without a trailing dot.
     """
     try:
         parts = urlsplit(f"//{authority}")

@@ -1,4 +1,4 @@
-"""Permissions of token bearers; a read-only bearer cannot change anything or send frames."""
+"""Permissions granted by tokens; read-only permissions allow neither changes nor sending frames."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from starlette.types import Scope
 from server.problems import Problem
 
 READS = re.compile(r"/v1/(tickets|estimate|scenes/[^/]+/(render|tracks/query))")
-"""Paths for which POST is a read operation with the query in the body."""
+"""Pattern of the paths at which POST is a read operation with the query in the body."""
 READ_SOCKETS = re.compile(r"/v1/scenes/[^/]+/stream")
-"""Paths of WebSockets that only send data to the client."""
+"""Pattern of the WebSocket paths that only send data to the client."""
 
 
 class Permission(NamedTuple):
-    """Permission of a bearer.
+    """Permission granted by a token.
 
     Attributes:
-        write: whether the bearer may write; otherwise it may only read.
+        write: whether writing is allowed; reading always is.
         scene: id of the only accessible scene; None for all scenes.
-        end: expiry in seconds since the epoch; None if the permission does not expire.
+        end: expiry time in seconds since the epoch; None if the permission does not expire.
     """
 
     write: bool = False
@@ -31,15 +31,15 @@ class Permission(NamedTuple):
 
 ALL = Permission(write=True)
 PERMISSION = "scas4d.permission"
-"""Key of the permission in the scope of a request."""
+"""Key of the permission in the ASGI scope of a request."""
 
 
 def check(permission: Permission, scope: Scope) -> None:
     """Checks that the permission allows the request.
 
     Raises:
-        Problem: 403 for a write with a read-only permission; 404 for a path outside the permitted scene. A 404 does not
-            reveal whether another scene exists.
+        Problem: 403 for a write with a read-only permission; 404 for a path outside the permitted scene, so that the
+            response does not reveal whether another scene exists.
     """
     path, reading = scope["path"], _reads(scope)
     if permission.scene is not None:
@@ -50,7 +50,7 @@ def check(permission: Permission, scope: Scope) -> None:
                 "this link gives access to one scene only",
                 field="path",
                 value=path,
-                remedy=f"ask for {own}, or send the token of the service",
+                remedy=f"request {own}, or send the token of the service",
             )
     if not (permission.write or reading):
         raise Problem(

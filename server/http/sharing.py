@@ -1,8 +1,8 @@
 """Read-only tokens with an expiry time, for one scene (as in share links) or for all scenes.
 
-A token has the form `scas4d.read.<scene or *>.<end>.<signature>`. The end is in seconds since the epoch, and the
-signature is an HMAC-SHA256 of the text before it. The service stores no tokens; changing its own token revokes them
-all.
+A token has the form `scas4d.read.<scene or *>.<end>.<signature>`. `end` is the expiry time in seconds since the epoch,
+and `signature` is an HMAC-SHA256 of the text before it. The service does not store these tokens; changing its own token
+revokes all of them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from server.problems import Problem
 PREFIX = "scas4d.read."
 ALL_SCENES = "*"
 LONGEST_SECONDS = 10 * 366 * 86_400
-"""Longest validity of a token, ten years, for the tokens of monitoring systems."""
+"""Maximum lifetime of a token in seconds; ten years, for the tokens of monitoring systems."""
 
 
 class Sharing:
@@ -37,7 +37,7 @@ class Sharing:
         return self._signer.sign(f"{PREFIX}{ALL_SCENES if scene is None else scene}.{end}")
 
     def read(self, token: str) -> Permission | None:
-        """Returns the permission of a token's bearer, or None if the token was not signed by this service.
+        """Returns the permission granted by a token, or None if the token was not signed by this service.
 
         Raises:
             Problem: 401 if the token has expired.
@@ -51,7 +51,7 @@ class Sharing:
                 401,
                 "the link or read-only token has expired",
                 field="Authorization",
-                remedy="ask its sender for a new link: POST /v1/shares, or scas4d scenes share",
+                remedy="ask its sender for a new one: POST /v1/shares, or scas4d scenes share",
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
             )
         return Permission(scene=None if scene == ALL_SCENES else scene, end=int(end))

@@ -1,4 +1,4 @@
-"""Signatures of short texts with the token of the service.
+"""Signing of short texts with the token of the service.
 
 Every service with the same token can verify a signed text. Nothing is stored, so changing the token invalidates all
 signatures.
@@ -12,10 +12,10 @@ import hmac
 
 
 class Signer:
-    """Signer and verifier of texts that uses HMAC-SHA256.
+    """Signer and verifier of texts, using HMAC-SHA256.
 
     Args:
-        secret: the token of the service.
+        secret: token of the service.
         purpose: purpose of the signatures; a signature for one purpose is invalid for any other.
 
     >>> signer = Signer("a-token-of-the-service", "an example")

@@ -1,9 +1,9 @@
 """Tickets with which browsers authenticate WebSockets.
 
-A browser cannot send a bearer token with a WebSocket, so it fetches a ticket and offers it as a subprotocol. A ticket
-is valid for some seconds and opens one WebSocket per service. It is offered as `scas4d.ticket.<ticket>` in
+A browser cannot send a bearer token when it opens a WebSocket, so it fetches a ticket and offers it as a subprotocol.
+A ticket is valid for a few seconds and opens one WebSocket per service. It is sent as `scas4d.ticket.<ticket>` in
 Sec-WebSocket-Protocol and never in a URL, which would end up in logs and browser histories. Tickets are signed with the
-token, so that every service of a cluster accepts them: a load balancer decides which service a browser reaches.
+service's token, so every service of a cluster accepts them, no matter to which one a load balancer routes the browser.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ SUBPROTOCOL = "scas4d.ticket."
 TICKET_SECONDS = 30.0
 """Lifetime of a ticket in seconds; even on a slow link, a browser opens its WebSocket within a few seconds."""
 MOST_TICKETS = 1024
-"""Maximum number of tickets used during one lifetime. Each takes about 100 bytes, and a page needs only a few."""
+"""Maximum number of tickets used within one lifetime. Each takes about 100 bytes, and a page needs only a few."""
 ALWAYS, WRITE, READ = "0", "w", "r"
 
 
 class Tickets:
-    """Issuer of tickets, which remembers the tickets that have been used.
+    """Issuer and verifier of tickets, which remembers used tickets until they expire.
 
     Args:
-        secret: the token of the service. If it is None, only this service accepts its tickets.
-        clock: returns seconds since the epoch; the clocks of a cluster must agree to within a few seconds.
+        secret: token of the service. If None, only this service accepts its tickets.
+        clock: returns the time in seconds since the epoch; the clocks of a cluster must agree to within a few seconds.
     """
 
     def __init__(self, secret: str | None = None, clock: Callable[[], float] = time.time) -> None:
@@ -42,14 +42,14 @@ class Tickets:
         self._used: dict[str, float] = {}
 
     def issue(self, permission: Permission = ALL) -> str:
-        """Returns a new ticket that carries the permission of the client that requested it."""
+        """Returns a new ticket with the permission of the client that requested it."""
         may = WRITE if permission.write else READ
         scene, end = permission.scene or ALL_SCENES, str(permission.end or ALWAYS)
         until = self._clock() + TICKET_SECONDS
         return self._signer.sign(".".join((secrets.token_urlsafe(12), may, scene, end, str(round(until)))))
 
     def redeem(self, ticket: str) -> Permission | None:
-        """Uses a ticket and returns its permission, or None if it is unknown, expired or already used.
+        """Consumes a ticket and returns its permission, or None if it is unknown, expired or already used.
 
         Raises:
             Problem: 429 if `MOST_TICKETS` were used recently.
@@ -76,7 +76,7 @@ class Tickets:
 
 
 def take_offered(scope: Scope) -> list[str]:
-    """Removes the tickets from the subprotocols that a WebSocket offers, and returns them."""
+    """Removes the tickets from the subprotocols offered by a WebSocket, and returns them."""
     offered = scope.get("subprotocols", [])
     shown = [name for name in offered if name.startswith(SUBPROTOCOL)]
     scope["subprotocols"] = [name for name in offered if name not in shown]
@@ -87,7 +87,7 @@ def take_offered(scope: Scope) -> list[str]:
 
 
 def accept_subprotocol(subprotocol: str, send: Send) -> Send:
-    """Returns a sender that accepts the ticket's subprotocol if the application accepts none.
+    """Wraps `send` to accept the ticket's subprotocol if the application accepts none.
 
     A browser closes a WebSocket if the server accepts none of the offered subprotocols.
     """

@@ -1,4 +1,4 @@
-"""Conversion of pydantic's validation errors into problems with field, value and remedy.
+"""Conversion of pydantic validation errors into problems with field, value and remedy.
 
 Pydantic's messages describe the fault ("Input should be less than or equal to 100"); this module adds the remedy.
 """
@@ -16,13 +16,13 @@ from scas4d_core.errors import InputError
 from server.problems import Problem, count_noun
 
 MISSING = "nothing"
-"""Text quoted as the value of a missing field."""
+"""Text reported as the value of a missing field."""
 EXCERPT = 20
-"""Number of characters quoted on either side of a JSON syntax error."""
+"""Number of characters to quote on either side of a JSON syntax error."""
 
 BOUNDS = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
 UNION = re.compile(r"constrained-\w+|(function|literal|lax-or-strict|nullable).*|.*\[.*\]|str|int|float|[A-Z]\w+")
-"""Pattern of the parts of pydantic's `loc` that name a member of a union and not a field."""
+"""Pattern of the parts of pydantic's `loc` that name a member of a union instead of a field."""
 
 KINDS = {
     "int": "a whole number",
@@ -37,7 +37,7 @@ KINDS = {
     "model": "an object: {…}",
     "mapping": "an object: {…}",
 }
-"""Description of the expected type, keyed by the first word of the name of a type error."""
+"""Description of the expected type, keyed by the first word of pydantic's error type."""
 
 
 def validation_problem(
@@ -52,13 +52,13 @@ def validation_problem(
     """Returns the problem for one validation error.
 
     Args:
-        error: an entry of `ValidationError.errors()`.
-        model: the model that was validated, which is used to suggest field names. It corresponds to `loc` without a
-            leading "body".
+        error: entry of `ValidationError.errors()`.
+        model: model that was validated, used to suggest field names. The error's `loc`, without a leading "body", is
+            relative to it.
         prefix: prefix of the field name in the problem.
         others: number of further errors.
-        text: the text that was sent, if it may be malformed JSON.
-        schema: a reference to the list of all fields, for the remedy.
+        text: text that was sent, if it may be malformed JSON.
+        schema: hint where all fields are listed, for the remedy.
     """
     loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))
     fault, ours = fault_and_remedy(error)
@@ -86,7 +86,7 @@ def first_problem(
 
 
 def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
-    """Returns the field names of the model at `loc` inside `model`, or an empty list if there is none."""
+    """Returns the field names of the model at `loc` within `model`, or an empty list if there is no model."""
     here = list(_models(model))
     for part in loc:
         if isinstance(part, str):
@@ -120,7 +120,7 @@ def _json_problem(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, t
 
 
 def fault_and_remedy(error: Mapping[str, Any]) -> tuple[str, str]:
-    """Returns fault and remedy of an error; the remedy is empty for errors that pydantic itself raised."""
+    """Returns the fault and the remedy of an error; the remedy is empty for pydantic's own errors."""
     raised = error.get("ctx", {}).get("error") if error["type"] == "value_error" else None
     if isinstance(raised, InputError):
         return raised.fault, raised.remedy
@@ -134,8 +134,8 @@ def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str)
         return f"add {name!r}; {schema}"
     if kind == "extra_forbidden":
         near = difflib.get_close_matches(name, known, 1)
-        meant = f"it may be {near[0]!r} that is meant; " if near else ""
-        return f"{meant}leave it out, or take one of {', '.join(known)}" if known else f"leave it out; {schema}"
+        meant = f"did you mean {near[0]!r}? " if near else ""
+        return f"{meant}leave it out, or use one of {', '.join(known)}" if known else f"leave it out; {schema}"
     if bounds := [f"{words} {context[bound]:g}" for bound, words in BOUNDS.items() if bound in context]:
         return f"give a number {' and '.join(bounds)}"
     if kind in ("literal_error", "enum"):

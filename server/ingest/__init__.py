@@ -1,1 +1,1 @@
-"""Frame ingest: receives, validates, stores, orders and acknowledges frames."""
+"""Ingest of frames: receives, validates, stores, orders and acknowledges them."""

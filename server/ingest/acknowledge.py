@@ -1,4 +1,4 @@
-"""Acceptance of frames in order: admission, journal entry and acknowledgement. Acknowledged frames are on disk."""
+"""Acceptance of frames in order: admission, journalling and acknowledgement. Acknowledged frames are on disk."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from server.updates.updates import Updates
 T = TypeVar("T")
 
 MAX_SOCKETS = 64
-"""Maximum number of WebSockets that send frames to one scene; there may be one per camera."""
+"""Maximum number of WebSockets that send frames to one scene; clients may use one per camera."""
 MAX_RETRY_S = 60.0
-"""Maximum retry delay in seconds sent to clients, because longer predictions are unreliable."""
+"""Maximum retry delay in seconds to send to clients; longer predictions are unreliable."""
 PAUSED_RETRY_S = 5.0
-"""Retry delay in seconds for a paused scene, whose resumption cannot be predicted."""
+"""Retry delay in seconds for a paused scene, since it cannot be predicted when the scene is resumed."""
 
 
 @dataclass(eq=False)
 class ReceivedFiles:
-    """Received files of a frame or of one camera.
+    """Received files of a whole frame or of one camera.
 
-    `file` names their record on disk, or is None if they were only hashed for comparison with a known frame.
+    `file` is the name of their record on disk, or None if they were only hashed for comparison with a known frame.
     """
 
     hashes: Hashes
@@ -48,13 +48,13 @@ class IngestRules:
     """Rules for accepting frames of a scene, with the service's defaults filled in.
 
     Attributes:
-        rig: cameras of the scene.
-        frames_per_second: frame rate that determines the time of frames sent without one.
-        queue_frames: maximum number of acknowledged frames that are not finished.
-        when_full: whether a full queue refuses the next frame or skips the waiting ones.
+        rig: rig of the scene.
+        frames_per_second: frame rate from which the time of a frame is computed if the client sends none.
+        queue_frames: maximum number of acknowledged but unfinished frames.
+        when_full: whether a full queue refuses the next frame or skips the waiting frames.
         minimum_cameras: minimum number of cameras per frame.
-        open_frame_seconds: seconds after its first part at which a frame sent camera by camera is closed, or None for
-            no deadline.
+        open_frame_seconds: seconds from the first upload until a frame sent camera by camera is closed; None for no
+            deadline.
     """
 
     rig: Rig
@@ -66,7 +66,7 @@ class IngestRules:
 
     @classmethod
     def of(cls, request: SceneCreate, settings: ServerSettings) -> IngestRules:
-        """Returns the rules of a scene's request, with missing values taken from the service settings."""
+        """Returns the rules in a request to create a scene, with missing values taken from the service's settings."""
         rig, ingest = request.rig.rig(), request.ingest
         least = ingest.minimum_cameras
         return cls(
@@ -85,9 +85,9 @@ class Ingest:
     Args:
         log: journal, ledger and frame log of the scene.
         rules: rules for accepting frames.
-        updates: updates of the scene, triggered when a frame is accepted.
+        updates: scheduler of the scene's updates, triggered when a frame is accepted.
         publisher: publisher of the scene's events.
-        can_begin: called before the first frame is accepted; raises Problem if the scene cannot start.
+        can_begin: called before the first frame is accepted; raises `Problem` if the scene cannot start.
     """
 
     def __init__(
@@ -107,21 +107,21 @@ class Ingest:
         self._can_begin = can_begin
         self._sockets = 0
         self._receiving: dict[int, asyncio.Event] = {}
-        """Complete frames being received, each with an event that is set at its end.
+        """Complete frames that are being received, each with an event that is set at the end of the transfer.
 
-        The next frame may already arrive before then.
+        The next frame may start to arrive before then.
         """
 
     def add_socket(self) -> None:
         """Registers a WebSocket that sends frames; call `remove_socket` when it closes.
 
         Raises:
-            Problem: 429, the maximum number of WebSockets is reached.
+            Problem: 429 if the maximum number of WebSockets is reached.
         """
         if self._sockets >= MAX_SOCKETS:
             raise Problem(
                 429,
-                f"{count_noun(self._sockets, 'WebSocket')} are already sending frames to this scene",
+                f"this scene already has {count_noun(self._sockets, 'WebSocket')} for sending frames, the maximum",
                 field="id",
                 value=self.ledger.scene,
                 remedy="close one of them, or send over HTTP",
@@ -136,10 +136,10 @@ class Ingest:
     # Complete frames.
 
     def needs_files(self, head: FrameHead) -> bool:
-        """Returns whether a complete frame must be written; a known frame is only compared.
+        """Returns whether a complete frame must be written to disk; a known frame is only compared.
 
         Raises:
-            Problem: the frame will be refused regardless of its content.
+            Problem: the frame would be refused regardless of its content.
         """
         next_frame = self.ledger.next_frame
         if head.index < next_frame:
@@ -151,12 +151,12 @@ class Ingest:
             self.admit(head.index, self.time_of(head.index, head.time))
         elif head.index > awaited:
             raise self.gap_problem(head.index)
-        else:  # earlier frames are still arriving; this one is checked after them
+        else:  # earlier frames are still arriving; this frame is checked after them
             self.refuse_if_stopped()
         return True
 
     def is_receiving(self, index: int) -> bool:
-        """Returns whether the complete frame is being received."""
+        """Returns whether the frame is being received as a whole."""
         return index in self._receiving
 
     def begin_receiving(self, index: int) -> None:
@@ -164,7 +164,7 @@ class Ingest:
         self._receiving.setdefault(index, asyncio.Event())
 
     def end_receiving(self, index: int) -> None:
-        """Marks the frame as accepted or refused and wakes up the waiting next frame."""
+        """Marks the frame as accepted or refused and wakes up the next frame, if it is waiting."""
         if (event := self._receiving.pop(index, None)) is not None:
             event.set()
 
@@ -172,8 +172,8 @@ class Ingest:
         """Acknowledges and queues a frame whose images are on disk; a known frame gets the same receipt again.
 
         Raises:
-            Problem: 409 for a gap, for different content under a known index and for a failed scene; 422 for a time
-                that does not increase; 429 if the queue is full; 507 if the disk is full.
+            Problem: 409 for a gap, different content under a known index, or a failed scene; 422 for a time that is not
+                later than the previous one; 429 if the queue is full; 507 if the disk is full.
         """
         while (before := self._receiving.get(head.index - 1)) is not None and head.index > self.ledger.next_frame:
             await before.wait()
@@ -186,7 +186,7 @@ class Ingest:
             if head.index < self.ledger.next_frame:
                 return self._existing_receipt(head.index, identity)
             self.admit(head.index, seconds)
-            if received.file is None:  # only a known frame has no file, and a scene never forgets one
+            if received.file is None:  # only known frames have no file, and a scene never forgets them
                 raise AssertionError(f"frame {head.index} was not written")
             event = FrameAccepted(index=head.index, time=seconds, identity=identity, files=(received.file,))
             receipt = await self.acknowledge(event)
@@ -197,17 +197,17 @@ class Ingest:
         return receipt
 
     async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
-        """Journals a frame and the frames skipped for it; the caller must hold the log's lock.
+        """Journals a frame and the frames that are skipped for it; the caller must hold the log's lock.
 
         Raises:
-            Problem: 507, the disk is full.
+            Problem: 507 if the disk is full.
         """
         skipped = self._skip_event(event.index)
         await self.log.append(*skipped, event)
         for index in (index for one in skipped for index in one.frames):
             self.publish_ended(index)
         counters.FRAMES.labels("acknowledged").inc()
-        if self.ledger.frames[event.index].finished:  # it precedes the reconstruction's first frame
+        if self.ledger.frames[event.index].finished:  # the frame precedes the first frame of the reconstruction
             self.publish_ended(event.index)
         receipt = self.ledger.frames[event.index].receipt
         assert receipt is not None
@@ -217,14 +217,14 @@ class Ingest:
         """Publishes a frame that finished without an update: skipped, missing or before the first frame."""
         self._publisher.publish_frame(self.ledger.frames[index].report)
 
-    # Rules, which do not change any state.
+    # Rules. These methods do not change any state.
 
     def time_of(self, index: int, time: float | None) -> float:
-        """Returns the time of a frame in seconds: the given one, or one computed from the scene's frame rate."""
+        """Returns `time` if it is given, otherwise the time in seconds that follows from the scene's frame rate."""
         return index / self.rules.frames_per_second if time is None else time
 
     def admit(self, index: int, seconds: float) -> None:
-        """Raises Problem if a frame cannot be accepted as the next one."""
+        """Raises `Problem` if a frame cannot be accepted as the next one."""
         self.refuse_if_stopped()
         if index != self.ledger.next_frame:
             raise self.gap_problem(index)
@@ -242,7 +242,7 @@ class Ingest:
             raise self.queue_full_problem(index)
 
     def refuse_if_stopped(self) -> None:
-        """Raises Problem for a scene that cannot start (422), has failed or is archived (409)."""
+        """Raises `Problem` if the scene cannot start (422), has failed or is archived (409)."""
         if self.ledger.next_frame == 0:
             self._can_begin()
         self.refuse_if_failed()
@@ -256,7 +256,7 @@ class Ingest:
             )
 
     def refuse_if_failed(self) -> None:
-        """Raises Problem (409) if the scene has failed."""
+        """Raises `Problem` (409) if the scene has failed."""
         if self.ledger.fatal is not None:
             raise Problem(
                 409,
@@ -269,11 +269,11 @@ class Ingest:
             )
 
     def gap_problem(self, index: int) -> Problem:
-        """Returns the 409 response for a frame that is not the next, with the expected index."""
+        """Returns the 409 problem for a frame that is not the next one, with the expected index."""
         expected = self.ledger.next_frame
         return Problem(
             409,
-            f"frame {index} would leave a gap: frame t is reconstructed from frame t−1",
+            f"frame {index} would leave a gap, but each frame is reconstructed from the previous one",
             field="n",
             value=index,
             remedy=f"send frame {expected} first, or declare it missing: POST …/frames/{expected}/missing",
@@ -281,7 +281,7 @@ class Ingest:
         )
 
     def check_time(self, index: int, seconds: float) -> None:
-        """Raises Problem (422) if a frame's time is not after the previous one."""
+        """Raises `Problem` (422) if the time of a frame is not later than that of the previous frame."""
         before = self.ledger.last_time()
         if not (math.isfinite(seconds) and (before is None or seconds > before)):
             raise Problem(
@@ -289,30 +289,30 @@ class Ingest:
                 f"the time of frame {index} is not later than that of the previous frame",
                 field="time",
                 value=seconds,
-                remedy="give finite seconds" if before is None else f"give seconds above {before:g}",
+                remedy="give a finite time" if before is None else f"give a time above {before:g} s",
             )
 
     def has_room(self) -> bool:
-        """Returns whether the queue accepts another frame, if necessary by skipping others."""
+        """Returns whether the queue accepts another frame, skipping others if necessary."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return True
         return self.rules.when_full == "skip" and bool(self._skippable())
 
     def queue_full_problem(self, index: int) -> Problem:
-        """Returns the 429 response for a full queue, with the predicted time until the current update ends.
+        """Returns the 429 problem for a full queue, with the predicted time until the current update ends.
 
         ``Retry-After`` is in whole seconds; ``retry_after_seconds`` in the body has millisecond precision.
         """
         ledger = self.ledger
         if ledger.paused:
-            seconds, remedy = PAUSED_RETRY_S, f"let the scene go on: POST /v1/scenes/{ledger.scene}/resume"
+            seconds, remedy = PAUSED_RETRY_S, f"resume the scene: POST /v1/scenes/{ledger.scene}/resume"
         else:
             seconds = min(self.updates.clock.remaining(), MAX_RETRY_S)
             remedy = f"send the same frame again in {count_noun(math.ceil(seconds), 'second')}"
         return Problem(
             429,
-            f"{count_noun(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} are waiting"
-            + (" and the scene is paused" if ledger.paused else ""),
+            f"the queue is full: {count_noun(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} waiting"
+            + (", and the scene is paused" if ledger.paused else ""),
             field="n",
             value=index,
             remedy=remedy,
@@ -322,13 +322,13 @@ class Ingest:
         )
 
     def _skip_event(self, index: int) -> list[FramesSkipped]:
-        """Returns the event that skips waiting frames in favour of a new one if the queue is full."""
+        """Returns the event that skips waiting frames in favour of frame `index`, or none if the queue has room."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return []
         return [FramesSkipped(frames=self._skippable(), by=index)]
 
     def _skippable(self) -> tuple[int, ...]:
-        """Returns the waiting frames, except the explicitly requested first frame of a reconstruction."""
+        """Returns the waiting frames, except the first frame of a reconstruction if it was requested explicitly."""
         ledger = self.ledger
         asked_for = None if ledger.begun is None or ledger.committed else ledger.begun.index
         return tuple(index for index in ledger.waiting() if index != asked_for)
@@ -337,13 +337,13 @@ class Ingest:
         """Returns the receipt of a known frame with the same content.
 
         Raises:
-            Problem: 409, the content differs or the frame has no receipt.
+            Problem: 409 if the content differs or the frame has no receipt.
         """
         entry = self.ledger.frames[index]
         receipt = entry.receipt
         if receipt is not None and receipt.identity == identity:
             return receipt
-        known = "known with other content or another time"
+        known = "already known with different content or another time"
         if receipt is None:
             missing = entry.state == FrameState.MISSING
             known = "declared missing" if missing else f"{entry.state}: {entry.error or RECORD_LOST}"
@@ -361,6 +361,6 @@ class Ingest:
 async def shield_and_wait(coroutine: Coroutine[Any, Any, T]) -> T:
     """Runs a coroutine to completion even if the caller is cancelled.
 
-    Otherwise a cancellation could leave the ledger behind the journal.
+    A cancellation between journalling and updating the ledger would make them inconsistent.
     """
     return await asyncio.shield(asyncio.ensure_future(coroutine))

@@ -1,4 +1,4 @@
-"""Receivers for frames that do not arrive as one S4DF body: multipart forms and single-camera uploads."""
+"""Receivers of frames that are not sent as one S4DF body: multipart forms and single-camera uploads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from server.storage.disk import full_disk, no_room
 
 async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameReceipt:
     """Receives a complete frame as multipart/form-data, which is easy to send but slow to parse."""
-    # An image sent as a plain field (without a file name) would be parsed as text, so plain fields are limited in size.
+    # An image sent as a plain field (without a file name) would be parsed as text, so plain fields have a size limit.
     async with request.form(max_files=2 * len(ingest.rules.rig) + 8, max_fields=8, max_part_size=4096) as form:
         given: dict[str, UploadFile] = {}
         time: float | None = None
@@ -34,7 +34,7 @@ async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameRec
                         f"{name!r} is given twice",
                         field=name,
                         value=value.filename,
-                        remedy="send one file per camera",
+                        remedy="send one file per camera and kind",
                     )
                 given[name] = value
             else:
@@ -45,7 +45,7 @@ async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameRec
                     value=value,
                     remedy="send it as a form field with a file name",
                 )
-        # Checked before `FrameFile` is built, because its validation would raise for an invalid camera name.
+        # Checked before creating a `FrameFile`, whose validation would raise for an invalid camera name.
         for name in given:
             _check_camera(ingest.rules.rig, name.removeprefix(MASK), name)
         head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
@@ -65,9 +65,9 @@ async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameRec
 async def receive_camera(
     frames: OpenFrames, index: int | None, camera: str | None, body: AsyncIterator[bytes], length: int | None
 ) -> CameraReceipt:
-    """Receives one camera's image and mask as S4DF.
+    """Receives the image and mask of one camera as S4DF.
 
-    `index` and `camera` come from the URL and are None if the URL does not contain them.
+    `index` and `camera` are taken from the URL and are None if the URL does not contain them.
     """
     ingest = frames.ingest
     names: list[str] = []
@@ -96,7 +96,7 @@ async def receive_file(
     body: AsyncIterator[bytes],
     length: int | None,
 ) -> CameraReceipt:
-    """Receives one camera's image or mask as a plain file."""
+    """Receives the image or mask of one camera as a plain file."""
     ingest = frames.ingest
     _check_camera(ingest.rules.rig, camera, "c")
     data = await _read(ingest.rules.rig[camera], camera, body, length)
@@ -108,7 +108,7 @@ async def receive_file(
 
 
 async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: int | None) -> bytearray:
-    """Reads a file of a camera and refuses it once it exceeds the maximum size for that camera."""
+    """Reads a file of a camera, and refuses it as soon as it exceeds the maximum size for that camera."""
     data = bytearray()
     try:
         check_size(camera, field, length or 0)
@@ -121,7 +121,7 @@ async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: 
 
 
 def _check_camera(rig: Rig, camera: str, field: str) -> None:
-    """Raises Problem (422) for a camera that is not in the rig."""
+    """Raises `Problem` (422) if the camera is not in the rig."""
     if camera not in rig.names:
         raise Problem(
             422,
@@ -136,10 +136,10 @@ def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: b
     if not files:
         raise Problem(
             422,
-            "there is no picture",
+            "the frame has no pictures",
             field="body",
             value="nothing",
-            remedy="send one file per camera, named like the camera",
+            remedy="send one file per camera, with the camera's name as its field name",
         )
     return FrameHead(index=index, time=time, files=list(files), single_camera=part)
 
@@ -165,7 +165,7 @@ def _only_camera(head: FrameHead, camera: str | None) -> str:
     if len(names) != 1 or camera not in (None, names[0]):
         raise Problem(
             422,
-            f"the files are of {count_noun(len(names), 'camera')}: {', '.join(names)}",
+            f"the files belong to {count_noun(len(names), 'camera')}: {', '.join(names)}",
             field="head.files",
             value=", ".join(names),
             remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as in the URL"),

@@ -1,7 +1,7 @@
-"""Acceptance of frames sent camera by camera.
+"""Acceptance of frames that are sent camera by camera.
 
-Such a frame is open until all cameras have arrived, a client closes it, or its deadline passes. This module also
-declares frames missing that never arrived.
+Such a frame is open until the images of all cameras have arrived, a client closes it, or its deadline passes. This
+module also declares frames missing if they never arrived.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from server.storage.journal import replay
 from server.storage.ledger import frame_identity
 
 MAX_FRAMES_AHEAD = 8
-"""Maximum number of simultaneously open frames, which limits how far one camera may be ahead of another."""
+"""Maximum number of simultaneously open frames, which limits how far one camera can be ahead of another."""
 
 
 class OpenFrames:
@@ -44,17 +44,23 @@ class OpenFrames:
             self._set_deadline(index)
 
     def check_head(self, head: FrameHead, camera: str) -> None:
-        """Refuses a single-camera upload early if it cannot be accepted regardless of its content.
+        """Refuses a single-camera upload early if it would be refused regardless of its content.
 
         Raises:
-            Problem: 409 for a frame that is too far ahead or being sent as a whole, 422 for its time, 429 if the queue
-                is full.
+            Problem: 409 if the frame is too far ahead or is being sent as a whole; 422 if its time is invalid; 429 if
+                the queue is full.
         """
         ledger, index = self._ledger, head.index
         if index < ledger.next_frame:
             return
         if self.ingest.is_receiving(index):
-            raise Problem(409, f"frame {index} is being sent whole", field="n", value=index, remedy="wait for its end")
+            raise Problem(
+                409,
+                f"frame {index} is already being sent as a whole",
+                field="n",
+                value=index,
+                remedy="wait until it has been received",
+            )
         self._admit(head, camera)
 
     def _admit(self, head: FrameHead, camera: str) -> None:
@@ -70,17 +76,17 @@ class OpenFrames:
             if frame is not None and frame.time is not None and frame.time != head.time:
                 raise Problem(
                     422,
-                    f"camera {camera!r} gives frame {index} another time than the previous cameras",
+                    f"the time that camera {camera!r} gives for frame {index} differs from the previous cameras' time",
                     field="time",
                     value=head.time,
-                    remedy=f"give {frame.time!r}, or none; the first time given applies to the frame",
+                    remedy=f"give {frame.time!r} or none; the first time that was given applies to the frame",
                 )
 
     async def accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
         """Acknowledges one camera's files of a frame.
 
         Raises:
-            Problem: as for `Ingest.accept`; also 409 if the camera sent different content before, or if the frame was
+            Problem: see `Ingest.accept`; also 409 if the camera sent different content before, or if the frame was
                 closed without this file.
         """
         return await shield_and_wait(self._accept(head, camera, received))
@@ -96,7 +102,7 @@ class OpenFrames:
             if any(before.get(kind, value) != value for kind, value in kinds.items()):
                 raise Problem(
                     409,
-                    f"camera {camera!r} has sent other content for frame {index}",
+                    f"camera {camera!r} has already sent different content for frame {index}",
                     field=camera,
                     value=index,
                     remedy="send the next frame; an acknowledged frame cannot be changed",
@@ -146,7 +152,7 @@ class OpenFrames:
             except FrameDamage:
                 return None
             self._ledger.frames.rare_properties(index).parts = known = parts
-        if known is None and entry.receipt is not None:  # its images are deleted, but the journal still has the uploads
+        if known is None and entry.receipt is not None:  # its images are deleted; the journal has the uploads
             return await asyncio.to_thread(_camera_events_in_journal, self._log.journal.path, index)
         return known
 
@@ -160,7 +166,7 @@ class OpenFrames:
         self._background.run(self.close_due())
 
     async def close_due(self) -> None:
-        """Closes frames in order if all cameras have arrived or the deadline has passed, while the queue has room."""
+        """Closes complete and overdue frames in order, as long as the queue has room."""
         await shield_and_wait(self._close_due())
 
     async def _close_due(self) -> None:
@@ -172,16 +178,16 @@ class OpenFrames:
                     break
                 try:
                     await self._close(frame, "complete" if complete else "deadline")
-                except Problem:  # the disk is full; the next call retries
+                except Problem:  # the disk is full; the next call will retry
                     break
         self.ingest.updates.begin()
 
     async def close(self, index: int) -> FrameReceipt:
-        """Closes a frame on request with the cameras that have arrived; a closed frame gets the same receipt again.
+        """Closes a frame on request with the images received so far; a closed frame gets the same receipt again.
 
         Raises:
-            Problem: 404 if no camera has arrived; 409 if an earlier frame is not closed or fewer cameras than the
-                scene's minimum have arrived; 429 and 507 as for `Ingest.accept`.
+            Problem: 404 if no image has arrived; 409 if an earlier frame is not closed or fewer than the scene's
+                minimum number of cameras have sent an image; 429 and 507 as for `Ingest.accept`.
         """
         return await shield_and_wait(self._close_on_request(index))
 
@@ -216,7 +222,7 @@ class OpenFrames:
             if len(frame.cameras) < least:
                 raise Problem(
                     409,
-                    f"{count_noun(len(frame.cameras), 'camera')} of the required {least} sent a picture",
+                    f"only {count_noun(len(frame.cameras), 'camera')} of the required {least} sent a picture",
                     field="n",
                     value=index,
                     remedy="send pictures of more cameras, or declare the frame missing",
@@ -242,7 +248,7 @@ class OpenFrames:
         """Permanently declares the next frame missing; a repeated declaration gets the same response.
 
         Raises:
-            Problem: 409 for a gap, for an accepted frame and for a failed scene; 507 if the disk is full.
+            Problem: 409 for a gap, an accepted frame or a failed scene; 507 if the disk is full.
         """
         return await shield_and_wait(self._declare_missing(index, reason))
 
@@ -254,10 +260,10 @@ class OpenFrames:
                 if report.state != FrameState.MISSING:
                     raise Problem(
                         409,
-                        f"frame {index} is {report.state}: it was accepted",
+                        f"frame {index} is {report.state}, so it was accepted",
                         field="n",
                         value=index,
-                        remedy=f"only frames that never arrived can be missing; the next frame is {ledger.next_frame}",
+                        remedy=f"declare only frames missing that never arrived; the next frame is {ledger.next_frame}",
                         expected=ledger.next_frame,
                     )
                 return report
@@ -291,9 +297,9 @@ class OpenFrames:
 
 
 def _camera_events_in_journal(journal: Path, index: int) -> OpenFrame | None:
-    """Returns the single-camera uploads of a closed frame from the journal, or None if it has none.
+    """Returns the single-camera uploads of a closed frame from the journal, or None if there are none.
 
-    This is slow, but only needed if a camera resends a frame whose images are already deleted.
+    This is slow, but only needed if a camera resends a frame whose images were already deleted.
     """
     parts = OpenFrame(index)
 

@@ -1,7 +1,7 @@
 """Validation of a frame's image files without decoding pixels: names, sizes and file structure.
 
-The checks cover the segments of a JPEG up to its end marker, the chunks and checksums of a PNG, and the RIFF chunks of
-a WebP.
+The structure checks cover the segments of a JPEG up to its end marker, the chunks and checksums of a PNG, and the RIFF
+chunks of a WebP.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ MASK = "mask."
 EXIF_ORIENTATION = 0x0112
 
 PIXEL_BYTES = 5
-"""Maximum bytes per pixel in one file; RGBA noise in a PNG needs slightly more than 4."""
+"""Maximum bytes per pixel of a file; RGBA noise in a PNG needs slightly more than 4."""
 METADATA_BYTES = 1_000_000
-"""Maximum bytes of metadata in one file, such as a colour profile or a preview."""
+"""Maximum bytes of metadata in a file, such as a colour profile or a preview."""
 
 
 def field_of(file: FrameFile) -> str:
-    """Returns the field name of a file in forms and responses: `<camera>` or `mask.<camera>`."""
+    """Returns the name of a file in forms and responses: `<camera>` or `mask.<camera>`."""
     return MASK + file.camera if file.kind == FileKind.MASK else file.camera
 
 
 def largest_file(camera: Camera) -> int:
-    """Returns the maximum size in bytes of an encoded image or mask of the camera."""
+    """Returns the maximum size in bytes of an encoded image or mask of a camera."""
     return camera.width * camera.height * PIXEL_BYTES + METADATA_BYTES
 
 
 def largest_frame(rig: Rig) -> int:
-    """Returns the maximum size in bytes of an S4DF frame with masks."""
+    """Returns the maximum size in bytes of an S4DF frame with images and masks of all cameras."""
     return PREFIX.size + MAX_HEAD + 2 * sum(largest_file(camera) for camera in rig.cameras)
 
 
 def check_size(camera: Camera, field: str, size: int) -> None:
-    """Refuses a file by its announced size before it is received.
+    """Refuses a file by its announced size, before it is received.
 
     Raises:
-        Problem: 413, the file is larger than any image of the camera can be.
+        Problem: 413 if the file is larger than an image of the camera can be.
     """
     if size > (most := largest_file(camera)):
         raise Problem(
             413,
-            f"{field}: a file of {size} bytes; a picture of {camera.width}x{camera.height} has {most} at most",
+            f"{field}: the file has {size} bytes; a picture of {camera.width}x{camera.height} has at most {most}",
             field=field,
             value=size,
-            remedy="send the picture alone, encoded as JPEG, PNG or WebP",
+            remedy="send only the picture, encoded as JPEG, PNG or WebP",
         )
 
 
@@ -68,7 +68,7 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
     A whole frame must contain an image from every camera, and masks for all cameras or none.
 
     Raises:
-        Problem: 422 with the name of the invalid file; 413 if the announced size is too large.
+        Problem: 422 with the name of the invalid file; 413 if an announced size is too large.
     """
     names = set(rig.names)
     seen: dict[FileKind, set[str]] = {FileKind.IMAGE: set(), FileKind.MASK: set()}
@@ -100,7 +100,7 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
             image = kind == FileKind.IMAGE
             raise Problem(
                 422,
-                f"no {'picture' if image else 'mask'} of {count_noun(len(missing), 'camera')}: {', '.join(missing)}",
+                f"no {'picture' if image else 'mask'} from {count_noun(len(missing), 'camera')}: {', '.join(missing)}",
                 field=missing[0] if image else MASK + missing[0],
                 value="nothing",
                 remedy=f"add {'one' if len(missing) == 1 else 'one each'}"
@@ -114,7 +114,7 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
     """Checks that a file is complete, in an accepted format, not rotated by EXIF, and of the camera's size.
 
     Raises:
-        Problem: 422 with the file, its fault and the remedy.
+        Problem: 422 with the name of the file, its fault and the remedy.
     """
     camera, field = rig[file.camera], field_of(file)
     try:
@@ -125,14 +125,14 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
     if (header.width, header.height) != (camera.width, camera.height):
         raise Problem(
             422,
-            f"{field}: the picture is {header.width}x{header.height}, the camera {camera.width}x{camera.height}",
+            f"{field}: the picture is {header.width}x{header.height}, but the camera is {camera.width}x{camera.height}",
             field=field,
             value=f"{header.width}x{header.height}",
-            remedy="send pictures of the size the camera was calibrated for",
+            remedy="send pictures in the size for which the camera was calibrated",
         )
     if file.kind == FileKind.MASK and header.format != "png":
         raise Problem(
-            422, f"{field}: a mask as {header.format}", field=field, value=header.format, remedy="send masks as PNG"
+            422, f"{field}: the mask is {header.format}", field=field, value=header.format, remedy="send masks as PNG"
         )
     if header.exif and (orientation := _orientation(data)) != 1:
         raise Problem(
@@ -140,7 +140,7 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
             f"{field}: EXIF orientation {orientation} would rotate the picture",
             field=field,
             value=orientation,
-            remedy="store the pixels as calibrated and remove the tag",
+            remedy="store the pixels in the calibrated orientation and remove the tag",
         )
 
 
@@ -158,7 +158,7 @@ class StructureError(InputError):
     Attributes:
         fault: description of the fault.
         remedy: advice on what to send instead.
-        value: the invalid property, or None for the whole file.
+        value: invalid property, or None if the whole file is invalid.
     """
 
     def __init__(self, fault: str, remedy: str, value: str | None = None) -> None:
@@ -168,7 +168,7 @@ class StructureError(InputError):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Image header: format ("jpeg", "png" or "webp") and size in pixels."""
+    """Header of an image, with its format ("jpeg", "png" or "webp") and its size in pixels."""
 
     format: str
     width: int
@@ -181,7 +181,7 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
     """Checks the structure of a file up to its end and returns its header.
 
     Args:
-        data: content of the file in one contiguous buffer, which is not copied.
+        data: contents of the file in one contiguous buffer, which is not copied.
 
     Raises:
         StructureError: the file has another format, is truncated, damaged, CMYK or animated, or has an unsupported bit
@@ -196,16 +196,17 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
     if start[:4] == b"RIFF" and start[8:] == b"WEBP":
         return _webp(data)
     if not start:
-        raise StructureError("an empty file", "send the picture as JPEG, PNG or WebP")
+        raise StructureError("the file is empty", "send the picture as JPEG, PNG or WebP")
     raise StructureError(
-        f"begins with {start[:8].hex(' ')}, which is not JPEG, PNG or WebP", "encode the picture as one of these"
+        f"the file starts with {start[:8].hex(' ')}, so it is not JPEG, PNG or WebP",
+        "encode the picture as one of these",
     )
 
 
 def _truncated(kind: str, size: int) -> StructureError:
     return StructureError(
-        f"a {kind} that ends early, after {size} bytes",
-        "it was truncated on the way: send it again from its source",
+        f"the {kind} file is truncated after {size} bytes",
+        "send it again from its source",
     )
 
 
@@ -218,7 +219,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
             raise _truncated("JPEG", len(data))
         if data[at] != 0xFF:
             raise StructureError(
-                f"a JPEG without a marker at byte {at}", "the file is damaged: send it again from its source"
+                f"the JPEG file has no marker at byte {at}", "the file is damaged: send it again from its source"
             )
         marker = data[at + 1]
         if marker == 0xD9:
@@ -231,32 +232,32 @@ def _jpeg(data: memoryview) -> ImageHeader:
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             if length < 8:
                 raise StructureError(
-                    "a JPEG with a short frame header", "the file is damaged: send it again from its source"
+                    "the JPEG file has a short frame header", "the file is damaged: send it again from its source"
                 )
             bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
             if bits != 8 or channels not in (1, 3):
                 kind = "CMYK, " if channels == 4 else ""
                 value = f"{kind}{channels} channels of {bits} bits"
-                raise StructureError(f"a JPEG of {value}", "send RGB or grey of 8 bits", value)
+                raise StructureError(f"the JPEG file has {value}", "send 8-bit RGB or greyscale", value)
             header = ImageHeader("jpeg", width, height)
             components = channels if marker in (0xC0, 0xC1) else 0
         exif |= marker == 0xE1 and bytes(data[at + 4 : at + 10]) == b"Exif\0\0"
         at += 2 + length
         if marker == 0xDA:
-            # A sequential JPEG with a single scan has only the end marker after it, and scan data cannot contain that
-            # marker, so a file that ends with the marker is complete. Other files are checked scan by scan.
+            # In a sequential JPEG with a single scan, only the end marker follows the scan, and scan data cannot
+            # contain that marker. A file that ends with it is therefore complete. Other files are checked scan by scan.
             if at <= len(data) - 2 and data[at - length + 2] == components and bytes(data[-2:]) == b"\xff\xd9":
                 break
             at = _end_of_scan(data, at)
     if header is None:
-        raise StructureError("a JPEG without a frame header", "the file is damaged: send it again from its source")
+        raise StructureError("the JPEG file has no frame header", "the file is damaged: send it again from its source")
     return replace(header, exif=exif)
 
 
 def _end_of_scan(data: memoryview, at: int) -> int:
     """Returns the end of the entropy-coded data after `at`.
 
-    This is the next marker other than a restart marker; a stuffed zero byte is not a marker.
+    It is the position of the next marker other than a restart marker; a stuffed zero byte is not a marker.
     """
     end = _SCAN_END.search(data, at)
     if end is None:
@@ -275,25 +276,25 @@ def _png(data: memoryview) -> ImageHeader:
             raise _truncated("PNG", len(data))
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
             raise StructureError(
-                f"a PNG whose {kind!r} chunk at byte {at} fails its checksum",
-                "it was damaged on the way: send it again",
+                f"the {kind!r} chunk at byte {at} of the PNG file fails its checksum",
+                "the file was damaged in transit: send it again",
             )
         if header is None:
             if kind != b"IHDR" or length != 13:
                 raise StructureError(
-                    "a PNG that does not start with its header", "the file is damaged: send it again from its source"
+                    "the PNG file does not start with its header", "the file is damaged: send it again from its source"
                 )
             header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
             if data[at + 16] == 16:
-                raise StructureError("a PNG of 16 bits a channel", "convert the picture to 8 bits", "16 bits")
+                raise StructureError("the PNG file has 16 bits per channel", "convert the picture to 8 bits", "16 bits")
         if kind == b"acTL":
-            raise StructureError("an animated PNG", "send one picture per file", "animated")
+            raise StructureError("the PNG file is animated", "send one picture per file", "animated")
         pixels |= kind == b"IDAT"
         if kind == b"IEND":
             break
         at = end
     if not pixels:
-        raise StructureError("a PNG without pixels", "the file is damaged: send it again from its source")
+        raise StructureError("the PNG file has no pixels", "the file is damaged: send it again from its source")
     return header
 
 
@@ -308,7 +309,7 @@ def _webp(data: memoryview) -> ImageHeader:
         if len(body) < length or at + 8 + length > size:
             raise _truncated("WebP", len(data))
         if kind in (b"ANIM", b"ANMF"):
-            raise StructureError("an animated WebP", "send one picture per file", "animated")
+            raise StructureError("the WebP file is animated", "send one picture per file", "animated")
         if kind == b"VP8X" and length >= 10:
             width, height = int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
             header = ImageHeader("webp", width, height)
@@ -320,5 +321,5 @@ def _webp(data: memoryview) -> ImageHeader:
             header, pixels = header or ImageHeader("webp", (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1), True
         at += 8 + length + length % 2
     if header is None or not pixels:
-        raise StructureError("a WebP without pixels", "the file is damaged: send it again from its source")
+        raise StructureError("the WebP file has no pixels", "the file is damaged: send it again from its source")
     return header

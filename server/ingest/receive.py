@@ -1,4 +1,4 @@
-"""Receiver of S4DF frames; checks, hashes and writes images while the next bytes arrive."""
+"""Receiver of S4DF frames, which checks, hashes and writes images while the next bytes arrive."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from server.storage.frame_store import BLOCK, Upload
 T = TypeVar("T")
 
 BATCH = 4_000_000
-"""Bytes of files that are checked, hashed and written together; a larger file forms its own batch."""
+"""Maximum total bytes of files that are checked, hashed and written together; a larger file is its own batch."""
 MAX_SPARE_BUFFERS = 8
-"""Maximum number of batch buffers kept for reuse, because allocating memory takes as long as filling it."""
+"""Maximum number of batch buffers to keep for reuse, because allocating memory takes as long as filling it."""
 
 Check = Callable[[FrameFile, memoryview], None]
-"""Function that raises Problem for a file that the scene does not accept."""
+"""Function that raises `Problem` if the scene does not accept a file."""
 
 _spare: list[mmap.mmap] = []
 
 
 class FrameReceiver:
-    """Receiver of one record in batches, double-buffered.
+    """Receiver of one record, which processes it in double-buffered batches.
 
-    While one batch is filled, a thread checks, hashes and writes the previous one.
+    While one batch is being filled, a thread checks, hashes and writes the previous one.
 
     Args:
         folder: folder of the frame log.
-        head: names and sizes of the files.
-        seconds: time of the frame, or None if it is not known yet.
-        check: called with each file.
+        head: head of the frame, with the names and sizes of the files.
+        seconds: time of the frame in seconds, or None if it is not known yet.
+        check: called with each file and its contents.
         keep: whether to write the files; if False, they are only checked and hashed.
 
     Attributes:
@@ -56,14 +56,14 @@ class FrameReceiver:
         self._upload = Upload(folder, head, seconds) if keep else None
         self._at_work: asyncio.Future[None] | None = None
         self._batches = in_batches(head.files)
-        # Buffer and file offsets are equal modulo the block size, as writes that bypass the page cache require.
+        # Offsets in the buffer and the file are equal modulo the block size, as direct I/O requires.
         self._at = self._begin = 0 if self._upload is None else self._upload.begin % BLOCK
         self.missing = sum(map(_bytes, self._batches))
         size = BLOCK + max(map(_bytes, self._batches))
         self._buffers = [_buffer(size) for _ in self._batches[:2]]
 
     async def take(self, data: memoryview) -> None:
-        """Takes the next bytes, at most `missing`, and returns when there is space for more.
+        """Takes the next bytes, at most `missing`, and returns when there is room for more.
 
         Raises:
             Problem, OSError: an earlier file is invalid or could not be written.
@@ -114,7 +114,7 @@ class FrameReceiver:
         )
 
     async def abort(self) -> None:
-        """Removes the record, even if the caller is cancelled during the removal."""
+        """Removes the record, even if the caller is cancelled in the meantime."""
         await asyncio.shield(asyncio.ensure_future(self._abort()))
 
     async def _abort(self) -> None:
@@ -128,7 +128,7 @@ class FrameReceiver:
         self._at_work = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
 
     async def _wait_for_thread(self) -> None:
-        """Waits for the thread, which continues if the caller is cancelled."""
+        """Waits for the thread, which continues even if the caller is cancelled."""
         if self._at_work is not None:
             try:
                 await asyncio.shield(self._at_work)
@@ -146,16 +146,16 @@ class FrameReceiver:
 async def read_framed(
     chunks: AsyncIterator[bytes], begin: Callable[[FrameHead], FrameReceiver], total: int | None
 ) -> tuple[FrameHead, FrameReceiver]:
-    """Reads a frame in the format of `client.wire.framing` and buffers at most two batches of it.
+    """Reads a frame in the format of `client.wire.framing`, buffering at most two batches.
 
     Args:
-        chunks: bytes as they arrive.
-        begin: called with the head; raises Problem or returns the receiver.
+        chunks: chunks of the body as they arrive.
+        begin: called with the head; raises `Problem` or returns the receiver.
         total: announced number of bytes, or None.
 
     Raises:
-        Problem: 422 if the body is not a frame or contradicts its head; also everything that `begin` and the checks
-            raise.
+        Problem: 422 if the body is not a frame or contradicts its head; also any problem raised by `begin` or the
+            checks.
     """
     start = bytearray()
     head: FrameHead | None = None
@@ -176,12 +176,12 @@ async def read_framed(
                 receiving = begin(head)
             if len(view) > receiving.missing:
                 over = len(view) - receiving.missing
-                raise FramingError(f"continues for {over} or more bytes after its files", "send none there")
+                raise FramingError(f"has {over} or more bytes after its last file", "send nothing after the files")
             await receiving.take(view)
         if head is None or receiving is None:
             raise FramingError(f"ends after {len(start)} bytes, within its head", "send the whole frame")
         if receiving.missing:
-            raise FramingError(f"ends {receiving.missing} bytes before its last file does", "send the whole frame")
+            raise FramingError(f"ends {receiving.missing} bytes before the end of its files", "send the whole frame")
         return head, receiving
     except BaseException as error:
         if receiving is not None:
@@ -201,18 +201,18 @@ def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
 
 
 def framing_problem(error: FramingError) -> Problem:
-    """Returns the 422 response for a body that is not a valid frame."""
+    """Returns the 422 problem for a body that is not a valid frame."""
     return Problem(422, f"the frame {error.fault}", field="body", value=error.fault, remedy=error.remedy)
 
 
 def _check_length(head: FrameHead, start: int, total: int | None) -> None:
     expected = start + sum(file.size for file in head.files)
     if total is not None and total != expected:
-        raise FramingError(f"has {total} bytes where its head says {expected}", "send what the head describes")
+        raise FramingError(f"has {total} bytes, but its head announces {expected}", "send what the head announces")
 
 
 def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
-    """Groups consecutive files into batches, because a thread hand-over costs more than hashing a small file."""
+    """Groups consecutive files into batches, because handing a small file to a thread takes longer than hashing it."""
     batches: list[list[FrameFile]] = []
     for file in files:
         if not batches or _bytes(batches[-1]) + file.size > BATCH:
@@ -243,7 +243,7 @@ async def receive_frame(
     Args:
         ingest: frame ingest of the scene.
         index: frame index from the URL, or None if only the head contains it.
-        body: bytes of the frame.
+        body: body of the request in chunks.
         length: announced number of bytes, or None.
 
     Raises:
@@ -258,7 +258,7 @@ async def receive_frame(
         if keep:
             ingest.begin_receiving(head.index)
             begun.append(head.index)
-        whole = head.model_copy(update={"single_camera": False})  # the URL decides, not the head
+        whole = head.model_copy(update={"single_camera": False})  # the URL takes precedence over the head
         return frame_receiver(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
 
     try:
@@ -276,9 +276,10 @@ def frame_receiver(ingest: Ingest, head: FrameHead, seconds: float | None, *, ke
 
 
 async def accept_or_remove(receiving: FrameReceiver, accept: Callable[[ReceivedFiles], Coroutine[Any, Any, T]]) -> T:
-    """Finishes a record and accepts it, or removes it if it is not accepted.
+    """Finishes a record and accepts it, or removes it if it is refused.
 
-    This completes even if the request is cancelled, because a record that an event references must not be removed.
+    This runs to completion even if the request is cancelled, because a record must not be removed once an event
+    references it.
     """
 
     async def finish() -> T:
@@ -303,18 +304,18 @@ async def _finish(receiving: FrameReceiver) -> ReceivedFiles:
 
 
 async def drain(body: AsyncIterator[bytes]) -> None:
-    """Reads the rest of a refused body, because a client that is still sending would not read the response."""
+    """Reads and discards the rest of a refused body, because a client reads the response only after sending it."""
     async for _ in body:
         pass
 
 
 def check_index(head: FrameHead, index: int | None) -> None:
-    """Raises Problem (422) if the head's index differs from `index`, the one in the URL, if any."""
+    """Raises `Problem` (422) if the index in the head differs from `index`, which is the one in the URL, if any."""
     if index is not None and head.index != index:
         raise Problem(
             422,
-            f"the head names frame {head.index}, the URL frame {index}",
+            f"the head gives frame {head.index}, but the URL gives frame {index}",
             field="head.index",
             value=head.index,
-            remedy="send both alike",
+            remedy="use the same index in both",
         )

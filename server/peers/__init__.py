@@ -1,1 +1,1 @@
-"""Cooperation of the services in a cluster, which forward each request to the owner of its scene."""
+"""Cooperation of the services in a cluster, which forward each request to the service that owns its scene."""

@@ -8,7 +8,7 @@ from client.wire import Cluster, Node
 
 
 def merge_clusters(own: Cluster, others: Iterable[Cluster]) -> Cluster:
-    """Returns this service's view of the nodes, with the reservations and waiting processes of all services."""
+    """Returns this service's view of the cluster, with the reservations and waiting processes of all services added."""
     nodes, waiting = {node.id: node for node in own.nodes}, list(own.waiting)
     for other in others:
         waiting += other.waiting

@@ -20,19 +20,19 @@ from server.problems import Problem
 PROXIED_HEADER = "x-scas4d-proxied"
 """Header of a request from one service to another, which must handle the request itself instead of forwarding it."""
 FRESH_S = 3.0
-"""Seconds for which a list of the peers, or the result that no peer owns a scene, is cached."""
+"""Seconds for which the list of peers, or the fact that no peer owns a scene, is cached."""
 LIST_S = 2.0
-"""Maximum seconds that a request waits for the first list of peers; later requests use the previous list."""
+"""Maximum seconds for which a request waits for the first list of peers; later requests use the previous list."""
 ASK_S = 5.0
-"""Maximum seconds for a peer to answer a request about its scenes."""
+"""Timeout in seconds of a request to a peer about its scenes."""
 CONNECT_S = 3.0
-"""Maximum seconds to connect to a peer."""
+"""Timeout in seconds of a connection attempt to a peer."""
 SILENT_S = 130.0
 """Read timeout in seconds of a forwarded request, longer than the time limit of a query."""
 REMEMBERED_S = 600.0
 """Seconds for which a lost service is expected to return; clients of its scenes are asked to retry."""
 MOST_KNOWN = 100_000
-"""Maximum number of scenes whose owner is remembered."""
+"""Maximum number of scenes whose owner is cached."""
 MOST_UNKNOWN = 1_000
 """Maximum number of unknown scene ids that are cached, so that repeated requests for them do not reach every peer."""
 
@@ -43,12 +43,12 @@ log = logging.getLogger("scas4d.server")
 
 
 class Peers:
-    """The other services of the cluster, for use on the event loop.
+    """Other services of the cluster and the scenes that they own. For use on the event loop.
 
     Args:
-        listed: returns the addresses of the peers, such as `http://10.0.0.2:8000`; it may take long.
-        secret: token shared by all services of the cluster; None if there is none.
-        client: HTTP client; None creates a new one.
+        listed: returns the addresses of the peers, such as `http://10.0.0.2:8000`; it may be slow.
+        secret: token shared by all services of the cluster; None if there is no token.
+        client: HTTP client; None creates one.
 
     Attributes:
         client: HTTP client that forwards requests.
@@ -71,7 +71,7 @@ class Peers:
         self._owners: OrderedDict[str, str] = OrderedDict()
         """Address of the owner of each known scene, keyed by scene id."""
         self._seen: dict[str, float] = {}
-        """Time at which each address was last among the peers."""
+        """Time at which each address was last in the list of peers."""
         self._unknown: OrderedDict[str, float] = OrderedDict()
         self._refusing: set[str] = set()
         """Addresses of peers that reject the token."""
@@ -84,7 +84,7 @@ class Peers:
         await self.client.aclose()
 
     async def addresses(self) -> Sequence[str]:
-        """Returns the latest addresses of the peers, and refreshes them in the background."""
+        """Returns the latest known addresses of the peers, and refreshes them in the background."""
         if self._listing is None and time.monotonic() - self._asked >= FRESH_S:
             self._listing = asyncio.get_running_loop().create_task(self._list())
         if self._listing is not None:
@@ -96,9 +96,9 @@ class Peers:
             before, self._addresses = self._addresses or (), await self._list_addresses()
             now = time.monotonic()
             seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
-            self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # previous ones were present until now
-        except Exception:  # the head does not respond, or its response is unexpected
-            log.exception("peers cannot be listed; using the previous list")
+            self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # previous ones were listed until now
+        except Exception:  # the head of the cluster does not respond, or its response is unexpected
+            log.exception("cannot list the peers; using the previous list")
         finally:
             self._asked, self._listing = time.monotonic(), None
 
@@ -119,7 +119,7 @@ class Peers:
         known = self._owners.get(scene)
         if known in peers:
             return known
-        if self._addresses is None:  # the peers are not known yet
+        if self._addresses is None:  # the peers have not been listed yet
             raise unreachable_problem(scene)
         if now - self._unknown.get(scene, -FRESH_S) < FRESH_S:
             return None
@@ -135,13 +135,13 @@ class Peers:
         return None
 
     def forget(self, scene: str) -> None:
-        """Forgets the owner of a scene that the owner no longer has."""
+        """Forgets the owner of a scene, because it no longer owns the scene."""
         self._owners.pop(scene, None)
 
     async def check(self, owner: str, scene: str) -> None:
-        """Forgets the owner of a scene if the owner reports that it does not have the scene.
+        """Asks the owner of a scene whether it still owns the scene, and forgets the owner if it does not.
 
-        Asks the owner at most once per `FRESH_S`.
+        The owner is asked at most once per `FRESH_S`.
         """
         now = time.monotonic()
         if now - self._checked.get(scene, -FRESH_S) >= FRESH_S:
@@ -150,12 +150,12 @@ class Peers:
                 self.forget(scene)
 
     async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
-        """Returns the scenes of all peers, and the addresses of peers that do not respond."""
+        """Returns the scenes of all peers, and the addresses of the peers that do not respond."""
         lists, silent = await self._ask_all("/v1/scenes", permission, SceneList)
         return list({status.id: status for listing in lists for status in listing.scenes}.values()), silent
 
     async def clusters(self) -> tuple[list[Cluster], list[str]]:
-        """Returns the peers' cluster descriptions, and the addresses of peers that do not respond."""
+        """Returns the cluster descriptions of all peers, and the addresses of the peers that do not respond."""
         return await self._ask_all("/v1/cluster", ALL, Cluster)
 
     async def _ask_all(self, path: str, permission: Permission, model: type[M]) -> tuple[list[M], list[str]]:
@@ -172,26 +172,26 @@ class Peers:
         return replies, silent
 
     async def _has(self, address: str, scene: str) -> bool | None:
-        """Returns whether a peer owns a scene, or None if the peer gives no valid answer."""
+        """Returns whether a peer owns a scene, or None if the peer gives no valid response."""
         answer = await self._get(address, f"/v1/scenes/{scene}", ALL)
         if answer is None:
             return None
         if answer.status_code in (200, 404):
             return answer.status_code == 200
-        log.warning("service %s does not say whether it has scene %s: %d", address, scene, answer.status_code)
+        log.warning("cannot tell whether service %s has scene %s: status %d", address, scene, answer.status_code)
         return None
 
     async def _get(self, address: str, path: str, permission: Permission) -> httpx.Response | None:
         try:
             answer = await self.client.get(address + path, headers=self.headers(permission), timeout=ASK_S)
         except httpx.HTTPError as error:
-            log.warning("service %s does not answer: %s: %s", address, type(error).__name__, error)
+            log.warning("service %s does not respond: %s: %s", address, type(error).__name__, error)
             return None
         if answer.status_code != 401:
             self._refusing.discard(address)
         elif address not in self._refusing:
             self._refusing.add(address)
-            log.warning("service %s refuses the token; give all services of a cluster the same SCAS4D_TOKEN", address)
+            log.warning("service %s rejects the token; give all services of a cluster the same SCAS4D_TOKEN", address)
         return answer
 
 
@@ -200,14 +200,14 @@ def unreachable_problem(scene: str, *, refused: bool = False) -> Problem:
 
     Args:
         scene: id of the scene.
-        refused: whether the peer does respond, but rejects the token of this service.
+        refused: whether the peer responds but rejects the token of this service.
     """
-    fault, remedy = "does not answer", "ask again: what it acknowledged is on disk"
+    fault, remedy = "does not respond", "try again later; all acknowledged frames are on disk"
     if refused:
-        fault, remedy = "refuses this one's token", "give all services of a cluster the same SCAS4D_TOKEN"
+        fault, remedy = "rejects this service's token", "give all services of a cluster the same SCAS4D_TOKEN"
     return Problem(
         503,
-        f"the service of the cluster that has this scene, or may have it, {fault}",
+        f"the service of the cluster that owns, or may own, this scene {fault}",
         field="id",
         value=scene,
         remedy=remedy,

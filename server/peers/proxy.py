@@ -18,7 +18,7 @@ from server.peers.websocket_proxy import proxy_websocket
 from server.problems import Problem
 
 SCENE_PATHS = re.compile(r"/v1/scenes/([0-9a-f]{12})(?:/.*)?")
-"""Paths that are forwarded. This service answers all others, so peers are not asked for invalid scene ids."""
+"""Pattern of the paths that are forwarded; it matches valid scene ids only, so peers are not asked for invalid ones."""
 HOP_BY_HOP = frozenset(
     {b"connection", b"keep-alive", b"proxy-authenticate", b"proxy-authorization", b"proxy-connection", b"te"}
     | {b"trailer", b"transfer-encoding", b"upgrade"}
@@ -48,10 +48,10 @@ class ProxyMiddleware:
     It runs after authentication and before any middleware that reads bodies.
 
     Args:
-        app: the next application.
-        peers: returns the peers; called after the service has started.
+        app: next application in the middleware stack.
+        peers: returns the peers; called only after the service has started.
         has: returns whether this service owns a scene.
-        most_bytes: maximum size of a message that a client sends over a WebSocket.
+        most_bytes: maximum size in bytes of a WebSocket message from a client.
     """
 
     def __init__(self, app: ASGIApp, peers: Callable[[], Peers], has: Callable[[str], bool], most_bytes: int) -> None:
@@ -86,12 +86,12 @@ class ProxyMiddleware:
     def _remote_scene(self, scope: Scope) -> str | None:
         """Returns the id of the requested scene if the request may be forwarded, otherwise None.
 
-        A request may be forwarded if this service does not own the scene and no peer has forwarded the request.
+        A request may be forwarded if this service does not own the scene and the request did not come from a peer.
         """
         of = SCENE_PATHS.fullmatch(scope["path"]) if scope["type"] in ("http", "websocket") else None
         if of is None or PERMISSION not in scope or PROXIED_HEADER in Headers(scope=scope) or self._has(of[1]):
             return None
-        dots = any(part in (".", "..") for part in scope["path"].split("/"))  # the HTTP client would remove them
+        dots = any(part in (".", "..") for part in scope["path"].split("/"))  # the HTTP client would normalize the path
         return None if dots else of[1]
 
     async def _forward(self, peers: Peers, owner: str, scene: str, scope: Scope, receive: Receive, send: Send) -> None:
@@ -111,7 +111,7 @@ class ProxyMiddleware:
         leaving = asyncio.ensure_future(body.hung_up())
         try:
             await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
-            if answering.done() and answering.result() == NOT_FOUND:  # either the scene or something in it is missing
+            if answering.done() and answering.result() == NOT_FOUND:  # of the scene or of a resource in it
                 await peers.check(owner, scene)
         finally:
             for task in (answering, leaving):
@@ -120,7 +120,7 @@ class ProxyMiddleware:
 
 
 class _Body:
-    """Streamed body of a request, which also detects a disconnect of the client."""
+    """Streamed request body that also detects when the client disconnects."""
 
     def __init__(self, receive: Receive, *, there: bool) -> None:
         self.there = there
@@ -131,7 +131,7 @@ class _Body:
         """Yields the body in parts.
 
         Raises:
-            httpx.RequestError: the client has disconnected; the peer receives an incomplete body.
+            httpx.RequestError: the client has disconnected, so the peer receives an incomplete body.
         """
         while True:
             message = await self._receive()
@@ -143,7 +143,7 @@ class _Body:
         self._is_read.set()
 
     async def hung_up(self) -> None:
-        """Waits until the client disconnects; waits for `parts` to read the body first."""
+        """Waits until `parts` has read the body and then until the client disconnects."""
         if self.there:
             await self._is_read.wait()
         while (await self._receive())["type"] != "http.disconnect":
@@ -173,14 +173,14 @@ async def _forward_request(
             await send({"type": "http.response.body", "body": part, "more_body": True})
         await send({"type": "http.response.body", "body": b""})
     except httpx.HTTPError as error:  # the client receives an incomplete body
-        log.warning("the answer of %s ended early: %s: %s", owner, type(error).__name__, error)
+        log.warning("the response of %s ended early: %s: %s", owner, type(error).__name__, error)
     finally:
         await answer.aclose()
     return answer.status_code
 
 
 def _forwarded_headers(scope: Scope) -> Iterator[tuple[bytes, bytes]]:
-    """Yields the headers of a request that are forwarded, byte for byte."""
+    """Yields the request headers to forward, unchanged."""
     named = {part.strip() for name, value in scope["headers"] if name == b"connection" for part in value.split(b",")}
     asks = False
     for name, value in scope["headers"]:
@@ -193,7 +193,7 @@ def _forwarded_headers(scope: Scope) -> Iterator[tuple[bytes, bytes]]:
 
 
 def peer_url(peer: str, scope: Scope) -> str:
-    """Returns the URL of the request at a peer, percent-encoded as the client sent it."""
+    """Returns the URL of a request at a peer, percent-encoded as the client sent it."""
     path = scope.get("raw_path", scope["path"].encode()).decode("latin-1").partition("?")[0]
     query = scope.get("query_string", b"").decode("latin-1")
     return f"{peer}{path}?{query}" if query else f"{peer}{path}"

@@ -1,4 +1,4 @@
-"""Relaying of a WebSocket to the peer that owns its scene: messages in both directions, and close codes."""
+"""Relay of a WebSocket to the peer that owns its scene, with messages in both directions and close codes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from server.problems import Problem
 SWITCHED = 101
 """HTTP status of an accepted handshake."""
 RESTARTS, ABNORMAL = 1012, 1006
-"""Close codes: the service restarts; the connection ended without a close frame (never sent on the wire)."""
+"""Close codes: the service is restarting; the connection ended without a close frame (never sent on the wire)."""
 
 
 async def proxy_websocket(
@@ -36,13 +36,13 @@ async def proxy_websocket(
     """Relays messages until either end closes, and returns the HTTP status of the peer's handshake response.
 
     Args:
-        address: URL at the peer, `http://…`.
+        address: URL of the WebSocket at the peer, `http://…`.
         scene: id of the scene.
         headers: headers of the request to the peer.
-        most_bytes: maximum size of a message from the client.
+        most_bytes: maximum size in bytes of a message from the client.
         scope: ASGI scope of the client's WebSocket.
-        receive: ASGI receive of the client's WebSocket.
-        send: ASGI send of the client's WebSocket.
+        receive: ASGI `receive` callable of the client's WebSocket.
+        send: ASGI `send` callable of the client's WebSocket.
 
     Raises:
         Problem: 503 if the peer does not respond.
@@ -55,7 +55,7 @@ async def proxy_websocket(
             additional_headers=headers,
             user_agent_header=None,
             compression=None,
-            max_size=None,  # the request bounds the size of messages from the peer
+            max_size=None,  # the client's request bounds the size of the peer's messages
             max_queue=1,  # lets the peer notice a slow client and send it only the newest messages
             open_timeout=SILENT_S,  # the peer may have to wake the scene first
             proxy=None,
@@ -80,7 +80,7 @@ async def proxy_websocket(
 
 
 async def _connect(address: str) -> socket.socket:
-    """Returns a connected TCP socket.
+    """Returns a TCP socket connected to the peer.
 
     Connecting separately allows a short timeout for an unreachable machine and a long one for a busy service.
     """
@@ -128,8 +128,8 @@ async def _refuse_handshake(refused: InvalidStatus, scope: Scope, receive: Recei
     if "websocket.http.response" not in scope.get("extensions", {}):
         problem = Problem(
             answer.status_code,
-            "the service that has the scene refuses the connection",
-            remedy="GET /v1/scenes/ID of the scene has the reason",
+            "the service that owns the scene refused the connection",
+            remedy="see GET /v1/scenes/ID of the scene for the reason",
         )
         await problems.refuse(problem, scope, receive, send)
         return

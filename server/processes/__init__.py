@@ -1,1 +1,1 @@
-"""Processes of a scene (worker, readers, replayer, exporter), their placement, and queries to the readers."""
+"""Processes of a scene (worker, readers, replayer, exporter), their placement, and the queries to readers."""

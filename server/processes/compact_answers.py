@@ -17,7 +17,7 @@ from server.processes.part_labels import resize_labels
 
 
 def compact_head(spec: SceneSpec, history: History) -> FileHeader:
-    """Returns the file header shared by all states of a scene: world frame, effective rig, background, frame rate."""
+    """Returns the file header for all states of a scene: world frame, effective rig, background, frame rate."""
     return FileHeader(
         spec.rig.world_frame(spec.settings.scene.metres_per_unit),
         background=history.background,
@@ -33,19 +33,21 @@ def write_compact(
     """Writes committed frames to a compact file, reading one state at a time.
 
     Frames that retention has deleted in the meantime are skipped. If the scene already stores the first frame in a
-    compact file, its records are copied bit for bit. The output may then also contain earlier frames, on which the
-    requested ones depend, and it ends at the end of the stored file.
+    compact file, records of that file are copied bit for bit. The output may then also contain earlier frames, on which
+    the requested ones depend, and it ends where the stored file ends.
 
     Args:
         file: path of the output; an existing file is replaced.
-        asked: requested frame indices in ascending order.
-        labels: part label of each Gaussian [N], or None.
+        history: committed states of the scene.
+        asked: indices of the requested frames in ascending order.
+        head: header of the output.
+        labels: [N] part label of each Gaussian, or None.
 
     Returns:
-        The last frame in the file.
+        The index of the last frame in the output.
 
     Raises:
-        HistoryError: none of the frames exists any longer, or one cannot be read.
+        HistoryError: none of the frames exists any more, or one cannot be read.
     """
     file.unlink(missing_ok=True)
     frames = [index for index in asked if index in history] or list(asked[:1])
@@ -64,16 +66,16 @@ def write_compact(
 
 
 def _copied(file: Path, history: History, frames: Sequence[int]) -> int | None:
-    """Copies frames from the stored compact file that holds the first; returns the last copied, None if no such file.
+    """Copies frames from the stored compact file that contains the first one, and returns the index of the last copied.
 
-    A damaged or missing compact file also yields None.
+    Returns None if there is no such file or it is damaged.
     """
     if history.files is None or not history.is_compacted(frames[0]):
         return None
     try:
         with file.open("wb") as copy:
             return history.files.chunks.reader(frames[0]).copy_records(frames[0], frames[-1], copy)[-1]
-    except (FileError, FileNotFoundError):  # reading the states one by one then detects and reports the damage
+    except (FileError, FileNotFoundError):  # the caller reads the states one by one and finds the damage
         file.unlink(missing_ok=True)
         return None
 

@@ -1,4 +1,4 @@
-"""Export process, which writes committed frames in a third-party format at low priority."""
+"""Export process, which writes committed frames to a file in an exchange format at low priority."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from server.processes.placement import enter_background, finish_background, use_
 from server.storage.disk import free_bytes, no_room
 
 NICE = 15
-"""Niceness increment of the process: it gets about a tenth of a core that it shares with a scene's worker."""
+"""Niceness increment of the process, which leaves it about a tenth of a core shared with a scene's worker."""
 RESERVE_BYTES = 500_000_000
-"""Free disk space in bytes that exports leave for the frames of scenes, about a thousand frames."""
+"""Free disk space in bytes that exports leave for scenes, enough for about a thousand frames."""
 
 log = logging.getLogger("scas4d.exporter")
 
 
 class DiskReserveError(RuntimeError):
-    """Error raised when an export would use disk space reserved for scenes."""
+    """Error for an export that would use disk space reserved for scenes."""
 
 
 def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
-    """Runs one export; the service terminates the process if the export is cancelled."""
+    """Entry point of the process: runs one export; the service stops the process if the export is cancelled."""
     enter_background(NICE)
     fault: str | None = None
     try:
@@ -52,13 +52,13 @@ def explain(error: Exception) -> str:
     'parts: no Gaussian belongs to one; ask for the parts'
     """
     if isinstance(error, DiskReserveError) or no_room(error):
-        return f"the disk is full ({message_of(error)}); export fewer frames, or a smaller format"
+        return f"the disk is full ({message_of(error)}); export fewer frames, or choose a smaller format"
     if isinstance(error, DamagedFrameError):
-        return f"{message_of(error)}; export again later: it is mended if it can be"
+        return f"{message_of(error)}; export again later: the service repairs the file if it can"
     if isinstance(error, HistoryError):
         return (
-            f"{message_of(error)}: its state was deleted while the export ran, by the scene's retention or because it "
-            "was begun anew; export later frames, or have the scene keep more states (keep_states)"
+            f"{message_of(error)}: its state was deleted during the export, by the scene's retention or a restart of "
+            "its reconstruction; export later frames, or keep more states (keep_states)"
         )
     if isinstance(error, InputError):
         return without_paths(str(error))
@@ -92,7 +92,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
                 labels = renderer.labels(None)
             elif wanted.needs_parts:
                 raise InputError(
-                    "this scene has no moving Gaussians, so it has no parts", "export it in another format"
+                    "this scene has no moving Gaussians and therefore no parts", "export it in another format"
                 )
         else:
             history = History.load(spec.scene.folder.states, only=(spec.first, *spec.frames))
@@ -104,7 +104,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
             twice = size_of(folder) if spec.format == "usd" else 0  # USD is written a second time at the end
             if (free := free_bytes(folder) - twice) < RESERVE_BYTES:
                 raise DiskReserveError(
-                    f"{free / 1e6:.0f} MB are free, {RESERVE_BYTES / 1e6:.0f} MB are reserved for frames"
+                    f"{free / 1e6:.0f} MB are free, but {RESERVE_BYTES / 1e6:.0f} MB are reserved for frames"
                 )
 
         export_sequence(

@@ -11,7 +11,7 @@ from scas4d_core.settings import Settings
 from server.messages import Progressed
 
 STAGE = "compiling kernels"
-"""Stage name that is reported while a worker waits for kernel compilation."""
+"""Name of the stage reported while a worker waits for kernels to be compiled."""
 
 log = logging.getLogger("scas4d.worker")
 
@@ -19,12 +19,12 @@ log = logging.getLogger("scas4d.worker")
 def wait_for_first(settings: Settings, points: bool, connection: Connection[Any, Any]) -> float:
     """Waits until the kernels of the first frame are compiled and returns the seconds waited.
 
-    The kernels of updates are compiled afterwards, while the first frame is being fitted.
+    The kernels of updates are compiled afterwards, while the first frame is being reconstructed.
 
     Args:
         settings: settings of the scene.
-        points: whether the scene was given an initial point cloud.
-        connection: pipe to which progress is sent.
+        points: whether the scene has an initial point cloud.
+        connection: pipe over which progress is sent.
     """
     from scas4d_core import warm_up  # imported lazily: the service process does not need the core
 
@@ -37,7 +37,7 @@ def wait_for_updates(settings: Settings, connection: Connection[Any, Any] | None
 
     Args:
         settings: settings of the scene.
-        connection: pipe to which progress is sent, or None to send none.
+        connection: pipe over which progress is sent, or None to send none.
     """
     from scas4d_core import warm_up
 

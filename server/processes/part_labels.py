@@ -1,6 +1,6 @@
 """Part labels of a scene for each number of parts, stored next to the states so that labels stay stable.
 
-The labels are derived data: if a file is lost or damaged, parts are renumbered by size.
+The labels can be recomputed: if a file is lost or damaged, parts are renumbered by size.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ def resize_labels(labels: NDArray[Any], count: int) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class StoredLabels:
-    """Labels [N] and the newest frame from which they were computed."""
+    """Part labels [N] and the index of the newest frame from which they were computed."""
 
     labels: NDArray[np.int64]
     frame: int
 
 
 class PartLabels:
-    """Part labels of one scene for each number of parts; None means the automatically chosen number.
+    """Part labels of one scene for each number of parts; None stands for the automatically chosen number.
 
     Args:
         folder: folder of the label files; created on demand.
@@ -76,7 +76,7 @@ class PartLabels:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            log.warning("%s cannot be read (%s): parts get new numbers", file, error)
+            log.warning("cannot read %s (%s): parts get new numbers", file, error)
             return None
 
     def _write(self, count: int | None, known: StoredLabels) -> None:
@@ -89,6 +89,6 @@ class PartLabels:
                 np.savez(opened, **arrays)
             beside.replace(file)
         except OSError as error:  # a full disk must not fail the query; only the numbering after a restart is lost
-            log.warning("%s cannot be written (%s): after a restart parts get new numbers", file, error)
+            log.warning("cannot write %s (%s): after a restart, parts get new numbers", file, error)
             with contextlib.suppress(OSError):
                 beside.unlink()

@@ -1,4 +1,4 @@
-"""Placement of scene processes: starting them, exchanging messages with them and detecting their exit.
+"""Placement of scene processes: starts them, exchanges messages with them, and detects when they exit.
 
 Processes are spawned, never forked: the service has threads, and Numba and CUDA do not survive a fork.
 """
@@ -22,13 +22,13 @@ from client.wire import Cluster
 from server.messages import Stop
 
 Entry = Callable[..., None]
-"""Entry point of a process, called as entry(spec, connection).
+"""Entry point of a process, called as `entry(spec, connection)`.
 
 `connection` has the `recv` and `send` methods of a multiprocessing Connection.
 """
 
 STOP_SECONDS = 5.0
-"""Seconds that a process gets to exit on its own when a scene or the service stops.
+"""Seconds within which a process must exit on its own when its scene or the service stops.
 
 An unfinished frame is processed again after the restart.
 """
@@ -42,10 +42,10 @@ class ProcessExit(str):
     """Reason for the exit of a process, as a sentence.
 
     Attributes:
-        exit_code: exit code as in multiprocessing: −N for signal N; None if unknown.
-        lost: whether the machine of the process is gone or unreachable.
-        out_of_memory: whether the kernel's OOM killer ended processes in its control group. None means unknown: check
-            the control group of this machine.
+        exit_code: exit code as in multiprocessing, −N for signal N; None if unknown.
+        lost: whether the machine of the process is down or unreachable.
+        out_of_memory: whether the kernel's OOM killer killed processes in the control group of the process. If None,
+            the caller must check the control group of this machine.
     """
 
     exit_code: int | None
@@ -55,14 +55,14 @@ class ProcessExit(str):
     def __new__(
         cls, exit_code: int | None, why: str = "", *, lost: bool = False, out_of_memory: bool | None = None
     ) -> ProcessExit:
-        """Creates the sentence from the exit code, or uses `why` if given."""
-        self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
+        """Creates the reason from the exit code, or from `why` if given."""
+        self = super().__new__(cls, why or f"its process exited unexpectedly (exit code {exit_code})")
         self.exit_code, self.lost, self.out_of_memory = exit_code, lost, out_of_memory
         return self
 
 
 def end_with_parent() -> None:
-    """Exits this process soon after its parent has exited; for processes that may be busy for a long time."""
+    """Makes this process exit soon after its parent does; for processes that may be busy for a long time."""
     starter = multiprocessing.parent_process()
     parent = os.getppid() if starter is None else starter.pid  # the parent may have exited already
 
@@ -75,7 +75,7 @@ def end_with_parent() -> None:
 
 
 def enter_background(nice: int) -> None:
-    """Prepares a background process: lowers its priority below the updates and ties its lifetime to its parent.
+    """Prepares a background process: lowers its priority below that of updates and ties its lifetime to its parent.
 
     Args:
         nice: niceness increment.
@@ -86,9 +86,9 @@ def enter_background(nice: int) -> None:
 
 
 def finish_background(connection: Connection[Any, Any], ended: Any) -> NoReturn:
-    """Sends the last message of a background process, waits for the request to stop, then exits.
+    """Sends the last message of a background process, waits until the process is asked to stop, then exits.
 
-    An unrequested exit would be treated as a crash.
+    Exiting earlier would be treated as a crash.
     """
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ended)
@@ -98,12 +98,12 @@ def finish_background(connection: Connection[Any, Any], ended: Any) -> NoReturn:
 
 
 def use_one_thread() -> None:
-    """Limits Numba, OpenMP and BLAS to one thread in this process, to leave the other cores to the updates."""
+    """Limits Numba, OpenMP and BLAS to one thread in this process, leaving the other cores to updates."""
     import numba
     from threadpoolctl import threadpool_limits
 
     numba.set_num_threads(1)
-    threadpool_limits(1)  # scikit-learn's threads busy-wait: a part query took 16 s on busy cores
+    threadpool_limits(1)  # threads of scikit-learn busy-wait: a part query took 16 s on busy cores
 
 
 class ProcessHandle(Protocol):
@@ -111,17 +111,17 @@ class ProcessHandle(Protocol):
 
     @property
     def pid(self) -> int | None:
-        """Process id on its machine; None while unknown."""
+        """Process id on the machine of the process; None while unknown."""
 
     def send(self, message: Any) -> None:
-        """Sends a message without blocking; messages to a process that has exited are dropped."""
+        """Sends a message without blocking; messages to an exited process are dropped."""
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
         """Asks the process to exit, waits up to `seconds`, then kills it."""
 
 
 class LocalProcess:
-    """Running process on this machine; two threads transfer its messages, so the event loop never blocks on a pipe."""
+    """Process on this machine; two threads transfer its messages, so that the event loop never blocks on a pipe."""
 
     def __init__(
         self,
@@ -151,7 +151,7 @@ class LocalProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id assigned by the operating system."""
+        """Process id of the process."""
         return self._process.pid
 
     def send(self, message: Any) -> None:
@@ -178,7 +178,7 @@ class LocalProcess:
 
     def _write(self, connection: Connection[Any, Any]) -> None:
         while (message := self._outbox.get()) is not None:
-            with contextlib.suppress(OSError):  # the process has exited, which the reading thread reports
+            with contextlib.suppress(OSError):  # the process has exited; the reading thread reports it
                 connection.send(message)
 
     def _read(self, connection: Connection[Any, Any]) -> None:
@@ -193,7 +193,7 @@ class LocalProcess:
         with self._reaping:
             self._process.join()
             code = self._process.exitcode
-        self._outbox.put(None)  # stop may never be called, so the writing thread must end here
+        self._outbox.put(None)  # ends the writing thread, since `stop` may never be called
         self._call(self._on_end, ProcessExit(code))
 
     def _call(self, function: Callable[[Any], None], argument: Any) -> None:
@@ -211,14 +211,14 @@ class Placement:
     """Placement that runs every process of every scene on this machine.
 
     Args:
-        prepare: picklable function called first in every process, before its entry point imports the core. The service
-            configures logging with it; tests use it to replace the core with a fake.
+        prepare: picklable function that is called first in every process, before its entry point imports the core. The
+            service uses it to configure logging; tests use it to replace the core with a fake.
 
     Attributes:
-        fenced: whether workers get epochs (`server.storage.fencing`), because one may keep running after it was
+        fenced: whether workers get epochs (`server.storage.fencing`), because a worker may keep running after it was
             declared dead.
         has_peers: whether other services may own scenes of the same cluster.
-        has_labels: whether processes run on nodes with labels, which a scene may require.
+        has_labels: whether nodes have labels that a scene may require.
     """
 
     fenced = False
@@ -237,12 +237,12 @@ class Placement:
             entry: module-level function that runs in the process.
             spec: first argument of `entry`; it must be picklable.
             on_message: called on the event loop with every message that the process sends.
-            on_end: called once on the event loop with the reason, if the process exits without being asked to.
+            on_end: called once on the event loop with the reason if the process exits without being asked to.
         """
         return LocalProcess(entry, spec, on_message, on_end, self.prepare)
 
     async def cluster(self) -> Cluster | None:
-        """Returns the machines on which processes run, or None if there is only this one."""
+        """Returns the machines on which processes run, or None if all run on this machine."""
         return None
 
     async def announce(self, host: str, port: int) -> None:
@@ -253,7 +253,7 @@ class Placement:
         return ()
 
     async def open(self) -> None:
-        """Acquires the resources for starting processes; called once, before the first start."""
+        """Acquires the resources needed to start processes; called once, before the first start."""
 
     async def close(self) -> None:
         """Releases the resources acquired by `open`; called after all processes have exited."""

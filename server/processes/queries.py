@@ -15,8 +15,8 @@ from scas4d_core.cameras import Camera
 class RenderQuery:
     """Query for a rendered view of a committed frame.
 
-    A `background` of None selects the one estimated in frame 0. `parts` is the requested number of parts, or None for
-    the automatic choice. `labels` [N] holds the part labels if the view shows parts.
+    If `background` is None, the background estimated in frame 0 is used. `parts` is the requested number of parts, or
+    None for the automatic choice. `labels` [N] are the part labels if the view shows parts.
     """
 
     kind: ClassVar[str] = "render"
@@ -34,7 +34,7 @@ class RenderQuery:
 class TracksQuery:
     """Query for trajectories over `frames`.
 
-    The tracked points are given as Gaussian ids, as pixels [Q, 2] of `camera`, or as 3D points [Q, 3]. Pixels and
+    The points to track are given as Gaussian ids, as pixels [Q, 2] of `camera`, or as 3D points [Q, 3]. Pixels and
     points refer to the frame `at`. `project` lists cameras into which the trajectories are projected, with visibility.
     """
 
@@ -94,7 +94,7 @@ Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | 
 
 
 def refused_field(query: Query) -> tuple[str, object]:
-    """Returns name and value of the query field that only the reader can validate."""
+    """Returns the name and value of the query field that only the reader can validate."""
     if isinstance(query, TracksQuery | GaussiansQuery) and query.ids is not None:
         return "ids", list(query.ids)
     if isinstance(query, TracksQuery):
@@ -102,7 +102,7 @@ def refused_field(query: Query) -> tuple[str, object]:
     if isinstance(query, CompactQuery):
         return "first", query.frames[0]
     if isinstance(query, LabelsQuery | PartsQuery):
-        return "count", query.count if query.count is not None else "chosen by rule"
+        return "count", query.count if query.count is not None else "automatic"
     return "frame", query.frame
 
 
@@ -110,7 +110,7 @@ def refused_field(query: Query) -> tuple[str, object]:
 class NumberedQuery:
     """Query with a number that identifies its answer.
 
-    `stale` lists the frames that were committed, deleted or rolled back since the previous query. None means that any
+    `stale` contains the frames that were committed, deleted or rolled back since the previous query, or is None if any
     frame may have changed.
     """
 
@@ -121,7 +121,7 @@ class NumberedQuery:
 
 @dataclass(frozen=True)
 class Answer:
-    """Encoded body of an HTTP response, with its media type and headers."""
+    """Answer to a query: an encoded HTTP response body with its media type and headers."""
 
     number: int
     body: bytes
@@ -131,7 +131,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class QueryRefused:
-    """Refusal of a query that cannot be answered; `status` is the HTTP status code, and `remedy` may be empty."""
+    """Refusal to answer a query; `status` is the HTTP status code, and `remedy` may be empty."""
 
     number: int
     fault: str

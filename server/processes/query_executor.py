@@ -1,6 +1,6 @@
-"""Reader process with a queue of queries.
+"""Execution of queued queries in a reader process.
 
-A process that exits unexpectedly is restarted with exponential backoff.
+If the process exits unexpectedly, it is restarted with exponential backoff.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from server.processes.placement import Entry, Placement, ProcessExit, ProcessHan
 from server.processes.queries import Answer, NumberedQuery, Query, QueryRefused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
-"""Initial and maximum delay before an unexpectedly exited process is restarted.
+"""Initial and maximum delay in seconds before a process that exited unexpectedly is restarted.
 
 The delay doubles with each exit until a query is answered.
 """
 MOST_WAITING = 64
 """Maximum number of queued queries; further ones are refused with 503.
 
-The queue holds one to two seconds of views. A longer one would only add latency.
+This corresponds to one or two seconds of rendering. A longer queue would only add latency.
 """
 ANSWER_SECONDS = 120.0
 """Seconds after which a query fails with 503; the longest accepted query takes about half of that."""
 
 OnDamage = Callable[[Mapping[str, str]], None]
-"""Callback for unreadable files of the states folder: a mapping from file name to reason."""
+"""Callback that receives a mapping from the name of each unreadable file in the states folder to the reason."""
 
 log = logging.getLogger("scas4d.server")
 
 
 @dataclass(eq=False)
 class _WaitingQuery:
-    """Queued query with the future of its answer; `lost` is set once a reader's machine was lost while answering it."""
+    """Queued query with the future of its answer; `lost` is set if a reader's machine was lost while answering it."""
 
     number: int
     query: Query
@@ -52,18 +52,19 @@ class _WaitingQuery:
 
 
 class QueryExecutor:
-    """Reader process and its queue; the process handles one query at a time, and cancelled queries are never started.
+    """Reader process with a queue of queries, of which it handles one at a time; cancelled queries are never started.
 
     Args:
         entry: entry point of the process.
-        spec: description of the scene.
+        spec: specification of the scene.
         placement: starts the process.
         grace: seconds for which the process may continue with a cancelled query before it is stopped.
-        damaged: called with the files that the process found damaged.
+        damaged: called with a mapping from the name of each damaged file to the reason.
 
     Attributes:
         process: handle of the process; None before the first query and while the process is not running.
-        stale: frames that were committed, deleted or rolled back since the last query; None if any may have changed.
+        stale: frames that were committed, deleted or rolled back since the last query; None if any frame may have
+            changed.
     """
 
     def __init__(
@@ -93,11 +94,11 @@ class QueryExecutor:
 
     @property
     def busy(self) -> bool:
-        """True while a query is queued or being answered, or while an abandoned process is stopping."""
+        """Whether a query is queued or being answered, or an abandoned process is stopping."""
         return bool(self._waiting or self._at_work or self._ending)
 
     def start(self) -> None:
-        """Starts the process immediately instead of with the first query."""
+        """Starts the process now instead of at the first query."""
         if self.process is None and self._pause is None and not self._closed:
             self._start()
 
@@ -105,15 +106,15 @@ class QueryExecutor:
         """Queues a query and returns its answer.
 
         Raises:
-            Problem: 503 if the queue is full or the answer takes longer than `ANSWER_SECONDS`.
+            Problem: 503 if the queue is full or the answer takes more than `ANSWER_SECONDS`.
         """
         if len(self._waiting) >= MOST_WAITING:
             raise Problem(
                 503,
-                f"{count_noun(len(self._waiting), 'question')} of this scene are already waiting",
+                f"this scene already has {count_noun(len(self._waiting), 'waiting request')}",
                 field="id",
                 value=self._spec.folder.name,
-                remedy="ask less often, or subscribe (WS …/stream): it sends only the newest answer",
+                remedy="send fewer queries, or subscribe (WS …/stream), which sends only the newest answer",
                 headers={"Retry-After": "1"},
             )
         if self._closed:
@@ -130,7 +131,7 @@ class QueryExecutor:
                 f"no answer within {ANSWER_SECONDS:g} s",
                 field="id",
                 value=self._spec.folder.name,
-                remedy="ask for less at once, or try again later",
+                remedy="request less at once, or try again later",
                 headers={"Retry-After": "5"},
             ) from None
         finally:
@@ -140,7 +141,7 @@ class QueryExecutor:
                 asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
 
     async def stop(self, seconds: float) -> None:
-        """Stops the process within `seconds`, or immediately if it is busy; refuses queued and later queries."""
+        """Stops the process within `seconds`, or immediately if it is busy, and refuses queued and later queries."""
         self._closed = True
         if self._pause is not None:
             self._pause.cancel()
@@ -182,7 +183,7 @@ class QueryExecutor:
         self._next()
 
     def _give_up(self, turn: _WaitingQuery) -> None:
-        """Stops the process if it is still busy with a cancelled query."""
+        """Stops the process if it is still working on a cancelled query."""
         if self._at_work is not turn or self.process is None:
             return
         log.warning(
@@ -201,13 +202,13 @@ class QueryExecutor:
         turn, self.process, self._at_work = self._at_work, None, None
         pause = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**self._failures)
         self._failures += 1
-        log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
+        log.error("scene %s: a reader exited (%s); restarting it in %g s", self._spec.folder.name, reason, pause)
         if turn is not None and not turn.answer.done():
-            if reason.lost and not turn.lost:  # not caused by the query: the next reader answers it
+            if reason.lost and not turn.lost:  # not caused by the query, so the next reader answers it
                 turn.lost = True
                 self._waiting.appendleft(turn)
             else:
-                fault = f"the reader ended while it was busy with this: {reason}"
+                fault = f"the reader exited while it was working on this query: {reason}"
                 turn.end(QueryRefused(turn.number, fault, status=503 if reason.lost else 500))
         self._pause = asyncio.get_running_loop().call_later(pause, self._restart)
 

@@ -1,6 +1,6 @@
 """Reader processes of a scene: one renders views, the other answers queries for tracks, parts and files.
 
-Neither waits for an update. ``server.processes.readers`` queues their queries.
+Neither ever waits for an update. ``server.processes.readers`` queues their queries.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ if TYPE_CHECKING:
 
 BYTES = "application/octet-stream"
 QUALITY = 92
-"""Default quality of JPEG and WebP, 1…100."""
+"""Default quality of JPEG and WebP images, 1…100."""
 CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
 
 BULK_NICE = 10
-"""Niceness increment of the process for tracks, parts and files, so that views and updates have priority."""
+"""Niceness increment of the process for tracks, parts and files, which gives priority to views and updates."""
 
 DAMAGED_AT_ONCE = 8
 """Maximum number of damaged states that one part query can skip."""
@@ -65,14 +65,14 @@ log = logging.getLogger("scas4d.renderer")
 
 
 def run_view_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs the view process until it is asked to stop or the service exits."""
+    """Entry point of the process for views, which runs until it is asked to stop or the service exits."""
     _serve(spec, connection)
 
 
 def run_bulk_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs the process for queries that may take a long time, until it is asked to stop or the service exits."""
+    """Entry point of the process for all other queries, which runs until it is asked to stop or the service exits."""
     os.nice(BULK_NICE)
-    for left in spec.folder.path.glob(f"{EXPORT}.*"):  # left by a process that was killed during a query
+    for left in spec.folder.path.glob(f"{EXPORT}.*"):  # files left by a process that was killed during a query
         left.unlink(missing_ok=True)
     _serve(spec, connection)
 
@@ -108,7 +108,7 @@ class QueryReader:
 
     @property
     def history(self) -> History:
-        """Committed states, opened once and then refreshed for the frames that changed."""
+        """Committed states, opened on first use and then refreshed for the frames that changed."""
         if self._history is None:
             self._history = History.load(self.spec.folder.states)
         elif self._stale is None or self._stale:
@@ -118,7 +118,7 @@ class QueryReader:
 
     @property
     def reader(self) -> CommittedScene:
-        """Source of views, tracks and parts of the committed states; the core is imported on first use."""
+        """Scene that computes views, tracks and parts from the committed states; the core is imported on first use."""
         history = self.history
         if self._reader is None:
             from scas4d_core.query.committed import CommittedScene
@@ -135,21 +135,21 @@ class QueryReader:
         return self._parts.of(self.reader, self.history, count)
 
     def pop_faults(self) -> dict[str, str]:
-        """Returns the files found damaged or missing since the last call: a mapping from name to reason."""
+        """Returns the files found damaged or missing since the last call, as a mapping from name to reason."""
         return {} if self._history is None else self._history.pop_faults()
 
     def _note_missing(self, query: Query) -> None:
-        """Records frames that the service considers committed but that are missing; it knows which it deleted."""
+        """Records the missing files of frames that the service considers committed."""
         frames = query.frames if isinstance(query, TracksQuery | CompactQuery) else (getattr(query, "frame", None),)
         history = self._history
         if history is not None and history.files is not None:
             known = set(history.indices)
             for index in frames:
                 if index is not None and index not in known:
-                    history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
+                    history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is missing")
 
     def answer(self, ask: NumberedQuery) -> Answer | QueryRefused:
-        """Returns the encoded answer, or a refusal with its reason."""
+        """Returns the encoded answer to a query, or a refusal with the reason."""
         asked = f"{ask.query.kind} query"
         self._stale = None if ask.stale is None or self._stale is None else self._stale | ask.stale
         for more in range(DAMAGED_AT_ONCE, -1, -1):
@@ -160,7 +160,7 @@ class QueryReader:
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # computed from the remaining states
                     continue
                 return QueryRefused(
-                    ask.number, message_of(error), "ask again later: it is mended if it can be", status=503
+                    ask.number, message_of(error), "try again later: the service repairs the file if it can", status=503
                 )
             except UnreadableFrameError as error:  # deleted after the service checked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
@@ -176,7 +176,7 @@ class QueryReader:
             except Exception as error:
                 log.exception("scene %s, %s", self.spec.folder.name, asked)
                 return QueryRefused(ask.number, f"{type(error).__name__}: {message_of(error)}", status=500)
-        raise AssertionError("the last turn returns")
+        raise AssertionError("the last iteration always returns")
 
     def _answer(self, number: int, query: Query) -> Answer:
         match query:
@@ -214,7 +214,7 @@ class QueryReader:
                 )
 
     def _file(self, number: int, write: Callable[[Path], dict[str, str] | None]) -> Answer:
-        """Returns an answer with the contents of a temporary file; `write` fills the file and may return headers."""
+        """Returns an answer with the contents of a temporary file, which `write` fills; `write` may return headers."""
         file = self.spec.folder.export(secrets.token_hex(4))
         try:
             headers = write(file) or {}
@@ -224,10 +224,10 @@ class QueryReader:
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
-    """Concatenates arrays [H, W] or [H, W, 3] along the last axis; returns little-endian float32 bytes and headers.
+    """Concatenates arrays [H, W] or [H, W, 3] along the channels and returns little-endian float32 bytes and headers.
 
-    X-Shape is "H,W,C", X-Channels names the C channels, and X-Dtype is "<f4". Rows run from the top, and channels vary
-    fastest.
+    X-Shape is "H,W,C", X-Channels lists the names of the C channels, and X-Dtype is "<f4". Rows are stored from top to
+    bottom, and channels vary fastest.
     """
     names = [channel for kind in arrays for channel in CHANNELS[kind]]
     stack = np.concatenate([array[..., None] if array.ndim == 2 else array for array in arrays.values()], axis=-1)
@@ -239,15 +239,15 @@ def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
 def encode_view(
     view: View, kinds: Sequence[str], format: str, quality: int | None = None
 ) -> tuple[bytes, str, dict[str, str]]:
-    """Encodes a view and returns body, media type and headers.
+    """Encodes a view and returns the body, media type and headers.
 
-    The image formats encode only the first of `kinds`; the route has checked that there is exactly one.
+    The image formats encode only the first of `kinds`; the route has already checked that there is exactly one.
 
     Args:
-        view: rendered arrays.
-        kinds: names of the arrays to encode.
-        format: png, jpeg, webp, npz or float32.
-        quality: quality of JPEG and WebP, 1…100; None for the default.
+        view: rendered view.
+        kinds: names of the view's arrays to encode.
+        format: format of the body: png, jpeg, webp, npz or float32.
+        quality: quality of JPEG and WebP, 1…100; None selects the default.
     """
     arrays: dict[str, Any] = {kind: getattr(view, kind) for kind in kinds}
     if format == "npz":
@@ -266,13 +266,13 @@ def encode_view(
     if format == "jpeg":
         options = {"quality": quality or QUALITY, "subsampling": 0}
     elif format == "webp":
-        # Live views need speed, not small files: method 0 takes a third of the default's time.
+        # Live views need speed more than small files; method 0 takes a third of the default's time.
         options = {"quality": quality or QUALITY, "method": 0}
     return imageio.imwrite("<bytes>", pixels, extension=f".{format}", plugin="pillow", **options), media_type, headers
 
 
 def part_colours() -> list[int]:
-    """Returns a palette of 256 RGB colours: black for index 0, then the colour of each label."""
+    """Returns a palette of 256 RGB colours: black at index 0, followed by the colour of each label."""
     return [0, 0, 0, *(channel for label in range(255) for channel in part_colour(label))]
 
 
@@ -280,7 +280,7 @@ _PART_COLOURS = part_colours()
 
 
 def _pixels(kind: str, array: NDArray[Any]) -> tuple[NDArray[np.uint8 | np.uint16], dict[str, str]]:
-    """Returns the pixels and headers of an image: depth as 16 bits, parts as palette indices, else 8 bits."""
+    """Returns the pixels and headers of an image: depth in 16 bits, parts as palette indices, others in 8 bits."""
     if kind == "depth":
         met = np.isfinite(array)
         near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)

@@ -1,7 +1,7 @@
-"""Queries about the committed states of a scene, answered by two reader processes with a queue each.
+"""Queries about the committed states of a scene, answered by two reader processes with one queue each.
 
-Views have their own process, so a long track or part query never delays them. The other process starts with its first
-query and runs at lower priority. It is stopped if its query is cancelled, since all its data is on disk.
+Views have their own process, so a long track or part query never delays them. The other process starts at the first
+query that needs it and runs at lower priority. It is stopped if its query is cancelled, since all its data is on disk.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from server.processes.query_executor import OnDamage, QueryExecutor
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 """Seconds for which a process may continue with a cancelled query; starting a new process takes 1 to 2 s."""
 MOST_STALE = 10_000
-"""Maximum number of changed frames that are tracked individually; beyond it, the states folder is listed again."""
+"""Maximum number of changed frames to track individually; if there are more, the states folder is listed again."""
 COUNTS_KEPT = 8
-"""Number of part counts whose labels are cached."""
+"""Maximum number of part counts whose labels are cached."""
 
-NOT_COMMITTED = "ask for a frame that the scene's status counts as committed"
-REMEDIES = {404: NOT_COMMITTED, 500: SERVICE_FAULT, 503: "ask again later"}
-"""Default remedy per HTTP status, used if the process gives none."""
+NOT_COMMITTED = "request a frame that the scene's status counts as committed"
+REMEDIES = {404: NOT_COMMITTED, 500: SERVICE_FAULT, 503: "try again later"}
+"""Default remedy for each HTTP status, used if the process gives none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class CachedLabels:
     """Cached part labels [N].
 
     Attributes:
-        commits: change counter of the readers when the labels were computed.
+        commits: value of the readers' change counter when the labels were computed.
         frame: index of the newest frame used, as text.
-        labels: part labels [N].
+        labels: [N] part label of each Gaussian.
     """
 
     commits: int
@@ -63,8 +63,8 @@ class Readers:
     """Reader processes that answer queries about a scene's committed frames.
 
     Attributes:
-        views: queue and process for views.
-        bulk: queue and process for all other queries.
+        views: executor of view queries.
+        bulk: executor of all other queries.
     """
 
     def __init__(self, spec: SceneSpec, placement: Placement, damaged: OnDamage) -> None:
@@ -78,18 +78,18 @@ class Readers:
 
     @property
     def busy(self) -> bool:
-        """True while a query is pending or part labels are being computed."""
+        """Whether a query is pending or part labels are being computed."""
         return self.views.busy or self.bulk.busy or bool(self._finding)
 
     def start(self) -> None:
-        """Starts the view process before the first query."""
+        """Starts the process for views before its first query."""
         self.views.start()
 
     async def ask(self, query: Query) -> Answer:
-        """Returns the answer to a query; cancelling this cancels the query.
+        """Returns the answer to a query; cancelling this coroutine cancels the query.
 
         Raises:
-            Problem: 4xx if the query cannot be answered, 503 if it takes too long or the queue is full, 500 if the
+            Problem: 4xx if the query cannot be answered; 503 if it takes too long or the queue is full; 500 if the
                 reader fails.
         """
         began, outcome = time.perf_counter(), "failed"
@@ -97,7 +97,7 @@ class Readers:
             answer, outcome = await self._answer(query), "answered"
             return answer
         except asyncio.CancelledError:
-            outcome = "cancelled"  # by the caller: not a failure
+            outcome = "cancelled"  # by the caller, which is not a failure
             raise
         finally:
             counters.QUERY_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
@@ -114,7 +114,7 @@ class Readers:
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
-        """Records that `frames` were committed, deleted or rolled back; None means any frame may have changed."""
+        """Records that `frames` were committed, deleted or rolled back; None means that any frame may have changed."""
         self._commits += 1
         for queue in (self.views, self.bulk):
             if frames is None or queue.stale is None or len(queue.stale) > MOST_STALE:
@@ -129,7 +129,7 @@ class Readers:
         await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
 
     async def _tracks(self, query: TracksQuery) -> Answer:
-        """Answers a track query, split into pieces if it is long so that other queries run in between."""
+        """Answers a track query; a long one is split into pieces so that other queries can run in between."""
         pieces = track_answers.split_query(query)
         if len(pieces) * len(pieces[0]) == 1:
             return _check_answer(await self.bulk.ask(query), query)
@@ -139,8 +139,8 @@ class Readers:
     async def _labels_of(self, count: int | None) -> CachedLabels:
         """Returns the part labels for a view; only the first call waits, later calls get the latest available labels.
 
-        Labels are computed from the whole history, which takes longer than rendering a view. After a commit they are
-        recomputed in the background while views use the previous ones.
+        Labels are computed from the whole history, which takes longer than rendering a view. After a commit, they are
+        recomputed in the background while views use the previous labels.
         """
         known = self._labels.get(count)
         if known is not None and known.commits == self._commits:

@@ -1,4 +1,4 @@
-"""Replay process, which repeats a scene's latest updates at low priority to measure other iteration budgets."""
+"""Replay process, which repeats a scene's latest updates at low priority to measure other numbers of iterations."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from server.processes.placement import enter_background, finish_background, use_
 from server.processes.worker import decode, read
 
 NICE = 15
-"""Niceness increment of the process: it gets about a tenth of a core that it shares with a scene's worker."""
+"""Niceness increment of the process, which leaves it about a tenth of a core shared with a scene's worker."""
 THREADS = 1
-"""Number of threads of a replay; the other cores are left to the worker."""
+"""Number of threads used by a replay; the other cores are left to the worker."""
 
 log = logging.getLogger("scas4d.replayer")
 
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
-    """Runs one replay; the service terminates the process if its result is no longer needed."""
+    """Entry point of the process: runs one replay; the service stops the process if the result is no longer needed."""
     enter_background(NICE)
     fault: str | None = None
     try:

@@ -13,9 +13,9 @@ import numpy as np
 from server.processes.queries import Answer, Query, RenderQuery
 
 QUERIES_AT_ONCE = 2
-"""Maximum number of subscriber queries that a scene's reader holds per lane: one running and one ready to follow.
+"""Maximum number of subscriber queries in flight per lane: one that is running and one that is ready to follow.
 
-Other queries are built when their turn comes, so that they ask for the newest data.
+Other queries are built when their turn comes, so that they request the newest data.
 """
 KEPT_ANSWERS = 64
 """Maximum number of cached answers."""
@@ -26,22 +26,22 @@ AskReaders = Callable[[Query], Awaitable[Answer]]
 
 
 class SharedQuery(Protocol):
-    """Query with a key that is equal for all subscribers that would get the same answer."""
+    """Query that can be shared by all subscribers that would get the same answer."""
 
     @property
     def key(self) -> Hashable:
-        """Cache key, equal for equal queries."""
+        """Cache key, which is equal for queries with the same answer."""
 
     @property
     def query(self) -> Query:
-        """Query to the readers."""
+        """Query to send to the readers."""
 
 
 Q = TypeVar("Q", bound=SharedQuery)
 
 
 def fingerprint(value: Any) -> Hashable:
-    """Returns a hashable value that is equal for equal queries; compares dataclasses by field and arrays by content."""
+    """Returns a hashable value that is equal for equal queries; dataclasses and arrays are compared by content."""
     if is_dataclass(value) and not isinstance(value, type):
         return (type(value).__name__, *(fingerprint(getattr(value, field.name)) for field in fields(value)))
     if isinstance(value, np.ndarray):
@@ -55,7 +55,7 @@ def fingerprint(value: Any) -> Hashable:
 
 
 def lane(query: Query) -> str:
-    """Returns the lane of a query; trajectories and parts take longer than views and must not delay them."""
+    """Returns the lane of a query: "views" or "bulk", because tracks and parts take longer and must not delay views."""
     return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
 
 
@@ -63,8 +63,8 @@ class SharedQueries:
     """Deduplicating front end of a scene's readers, with a small cache of recent answers.
 
     At most `QUERIES_AT_ONCE` queries per lane are in flight. A waiting subscriber builds its query only when its turn
-    comes, so a camera that moved in the meantime is rendered at its current pose. Turns are served in FIFO order, so no
-    subscriber starves another.
+    comes, so a camera that moved in the meantime is rendered at its current pose. Turns are served in FIFO order, so
+    that no subscriber starves another.
     """
 
     def __init__(self, ask: AskReaders) -> None:
@@ -74,7 +74,7 @@ class SharedQueries:
         self._kept: OrderedDict[Hashable, Answer] = OrderedDict()
         self._bytes = 0
         self.asked = 0
-        """Number of queries sent to the readers."""
+        """Number of queries sent to the readers so far."""
 
     async def answer(self, question: Callable[[], Q]) -> tuple[Q, Answer]:
         """Returns the query and its answer; `question` builds the query just before it is sent.
@@ -89,7 +89,7 @@ class SharedQueries:
             begun = False
             try:
                 now = question()
-                # The query may have changed its lane while waiting; it must then wait for a turn in that lane.
+                # If the query has changed its lane while waiting, it must wait for a turn in the new lane.
                 if not self._known(now.key) and self._turns[lane(now.query)] is turns:
                     self._begin(now.key, now.query, turns)
                     begun = True

@@ -1,4 +1,4 @@
-"""Compaction of a scene's older states in its worker: one after each commit, more while the worker is idle."""
+"""Compaction of a scene's older states in its worker: one state after each commit, and more while it is idle."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from server.processes.compact_answers import compact_head
 from server.storage.disk import no_room
 
 BEHIND = 8
-"""Backlog of due states above which one is compacted before the next frame, even if that frame is waiting."""
+"""Number of states due for compaction above which one is compacted even if a frame is waiting."""
 
 log = logging.getLogger("scas4d.worker")
 
 
 class StateCompactor:
-    """Compactor that keeps the newest states of a scene exact and converts older ones to the compact format.
+    """Compactor that converts all but the newest states of a scene to the compact format.
 
     Args:
-        spec: description of the scene. If ``retention.exact_states`` is None, all states stay exact.
+        spec: specification of the scene. If ``retention.exact_states`` is None, all states stay exact.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -44,7 +44,7 @@ class StateCompactor:
         """Compacts due states until a message arrives; if the disk is full, retries at the next message.
 
         Args:
-            history: states of the scene.
+            history: committed states of the scene.
             waits: returns whether a message is waiting.
         """
         exact = self._rules.exact_states
@@ -56,11 +56,11 @@ class StateCompactor:
             while (due := self._compaction.due) and (due > BEHIND or not waits()):
                 if self._compaction.step() is None or waits():
                     return
-        except Exception as error:  # compaction is optional: the scene continues with exact states
+        except Exception as error:  # compaction is optional, so the scene continues with exact states
             if no_room(error):
-                log.warning("scene %s: no state is compacted: %s", self._spec.folder.name, error)
+                log.warning("scene %s: states cannot be compacted: %s", self._spec.folder.name, error)
                 return
-            log.exception("scene %s: no state is compacted until its worker starts again", self._spec.folder.name)
+            log.exception("scene %s: compaction is disabled until its worker restarts", self._spec.folder.name)
             self._failed = True
 
     def _head(self, history: History) -> FileHeader:

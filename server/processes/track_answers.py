@@ -1,7 +1,7 @@
 """Encoding of trajectories, and splitting of long track queries.
 
-A reader answers one query at a time. A long query is split into pieces so that others can run in between, and the
-answers are joined. docs/tracks.md describes the npz layout.
+A reader answers one query at a time. A long query is split into pieces, so that other queries can run in between, and
+the answers are joined. docs/tracks.md describes the npz layout.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Visibility needs one depth map per frame and camera.
 
 
 def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Returns arrays encoded as npz, without pickle."""
+    """Encodes arrays as npz, without pickle."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
     return file.getvalue()
@@ -53,14 +53,14 @@ def metres_per_unit(spec: SceneSpec) -> float:
 
 
 def cameras_of(query: TracksQuery) -> list[Camera]:
-    """Returns the cameras for projection and visibility: the one of the query's pixels, then those requested."""
+    """Returns the cameras for projection and visibility: the camera of the pixels, if any, then those in `project`."""
     own = [query.camera] if query.pixels is not None and query.camera is not None else []
     names = [camera.name for camera in own]
     return own + [camera for camera in query.project if camera.name not in names]
 
 
 def compute_tracks(reader: CommittedScene, history: History, query: TracksQuery) -> Arrays:
-    """Returns trajectories: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as in docs/tracks.md."""
+    """Computes trajectories: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as in docs/tracks.md."""
     frames = list(query.frames)
     if query.ids is not None:
         tracks = reader.tracks_of_ids(np.array(query.ids, dtype=np.int64), frames)
@@ -83,7 +83,7 @@ def compute_tracks(reader: CommittedScene, history: History, query: TracksQuery)
 
 
 def encode(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[bytes, str]:
-    """Returns body and media type of the answer in the requested format."""
+    """Returns the body and media type of the answer in the requested format."""
     cameras = cameras_of(query)
     pixels = {camera.name: camera.project(found["tracks_world"])[0] for camera in cameras}
     if query.format == "npz":
@@ -103,7 +103,7 @@ def encode(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[b
 
 
 def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres_per_unit: float) -> Arrays:
-    """Returns the TAPVid-3D keys for the first camera; without cameras, only the points in world axes and metres."""
+    """Returns the TAPVid-3D arrays for the first camera; without cameras, only the points in metres and world axes."""
     if not cameras:
         return {"tracks_XYZ": (found["tracks_world"] * metres_per_unit).astype(np.float32)}
     row = query.frames.index(query.at) if query.at in query.frames else -1
@@ -114,7 +114,7 @@ def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres
 
 
 def split_query(query: TracksQuery) -> list[list[TracksQuery]]:
-    """Splits a query by points, then by frames; a short query stays in one piece. All pieces are answered as npz."""
+    """Splits a query by points and then by frames; a short query stays whole. All pieces are answered as npz."""
     queries = next(value for value in (query.ids, query.pixels, query.points) if value is not None)
     frames = min(PIECE_POINTS // min(len(queries), PIECE_QUERIES), PIECE_VIEWS // max(1, len(cameras_of(query))))
     return [
@@ -127,7 +127,7 @@ def split_query(query: TracksQuery) -> list[list[TracksQuery]]:
 
 
 def join_answers(answers: Sequence[Sequence[bytes]]) -> Arrays:
-    """Joins the answers of pieces: the inner sequences along time, the outer sequence along points."""
+    """Joins the answers to the pieces of a query: the inner sequences along time, the outer one along points."""
     rows = [_join_in_time([_read_npz(body) for body in row]) for row in answers]
     once = ("frames", "times")
     return {
@@ -139,7 +139,7 @@ def join_answers(answers: Sequence[Sequence[bytes]]) -> Arrays:
 
 
 def join_and_encode(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
-    """Joins the answers of pieces and returns body and media type of the whole answer."""
+    """Joins the answers to the pieces of a query and returns the body and media type of the whole answer."""
     return encode(join_answers(answers), query, metres_per_unit(spec))
 
 
@@ -150,7 +150,7 @@ def _join_in_time(found: Sequence[Arrays]) -> Arrays:
 
 
 def _read_npz(body: bytes) -> Arrays:
-    """Returns the arrays of ``compute_tracks`` from an npz answer."""
+    """Returns the arrays made by ``compute_tracks`` from an npz answer."""
     names = ("tracks_world", "confidence", "ids", "frames", "times")
     with np.load(io.BytesIO(body), allow_pickle=False) as file:
         return {name: file[name] for name in file.files if name in names or name.startswith("visibility.")}

@@ -1,4 +1,4 @@
-"""Worker process, which owns a scene's `Reconstruction`: it decodes frames, runs updates, commits and reports."""
+"""Worker process, which owns a scene's `Reconstruction`: decodes frames, runs updates, commits and reports them."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ PROGRESS_EVERY_S = 0.2
 NICE = 5
 """Niceness increment of the worker, so that requests and views have priority over updates (see docs/viewer.md)."""
 STALL_S, LONGEST_STALL_S = 1.0, 30.0
-"""Initial and maximum delay in seconds between attempts to commit a frame to a full disk."""
+"""Initial and maximum delay in seconds between attempts to commit a frame while the disk is full."""
 
 log = logging.getLogger("scas4d.worker")
 
 
 def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs the worker process until it is asked to stop or the service exits."""
+    """Entry point of the worker process, which runs until it is asked to stop or the service exits."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service decides when to stop
     os.nice(NICE)
     end_with_parent()
@@ -84,7 +84,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             raise
     except _Stopped:
         pass
-    # Threads of numerical libraries can hang at exit, and all relevant data is on disk.
+    # Threads of numerical libraries can hang at exit, so skip the cleanup; all relevant data is on disk.
     logging.shutdown()
     if lock is not None:
         lock.release()
@@ -92,13 +92,13 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class _Stopped(Exception):
-    """Signal that the worker was asked to stop while it waited for disk space."""
+    """Exception that signals that the worker was asked to stop while waiting for disk space."""
 
 
 class Worker:
     """Worker of one scene.
 
-    Every frame results in `FrameCommitted` or `FrameFailedInWorker`, unless the process exits.
+    It responds to every frame with `FrameCommitted` or `FrameFailedInWorker`, unless the process exits.
     """
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
@@ -109,7 +109,7 @@ class Worker:
         self.reconstruction: Reconstruction | None = None
         self._progress_at = 0.0
         self._budget = Budget()
-        self._compiled = False  # the kernels of updates
+        self._compiled = False  # whether the kernels of updates are compiled
         self._write_seconds: float | None = None
         self._publish_seconds = 0.0
         self._later: deque[Any] = deque()
@@ -136,13 +136,13 @@ class Worker:
             report = history.report(history.indices[-1]) if history.indices else {}
             self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
         except (HistoryError, ValueError) as error:  # damaged data raises ValueError
-            log.exception("scene %s cannot be resumed", self.spec.folder.name)
+            log.exception("scene %s: cannot resume", self.spec.folder.name)
             self.connection.send(ResumeFailed(f"{type(error).__name__}: {message_of(error)}"))
             return False
         return True
 
     def handle_frame(self, message: FrameReady) -> None:
-        """Reconstructs one frame; retries while the disk is full."""
+        """Reconstructs and commits one frame; retries while the disk is full."""
         stall = STALL_S
         while True:
             try:
@@ -151,7 +151,7 @@ class Worker:
                 self.connection.send(done)
                 self._publish_seconds += time.perf_counter() - began
                 return
-            except Exception as error:  # a full disk can surface as other errors, e.g. from zipfile on close
+            except Exception as error:  # a full disk can surface as another error, such as one from closing a zip file
                 if not no_room(error):
                     raise
                 log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
@@ -160,16 +160,16 @@ class Worker:
             stall = min(2 * stall, LONGEST_STALL_S)
 
     def next(self) -> Any:
-        """Returns the next message and compacts states while idle.
+        """Waits for the next message, compacting states in the meantime, and returns it.
 
-        Messages that arrived while a frame waited for disk space come first.
+        Messages that arrived while a frame was waiting for disk space come first.
         """
         if self.states is not None and len(self.states) > (self.spec.retention.exact_states or len(self.states)):
             self._compacting.compact_while_idle(self.states, lambda: bool(self._later) or self.connection.poll(0))
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:
-        """Waits for `seconds`; only `Stop` ends the wait early, other messages are queued.
+        """Waits for `seconds` and queues incoming messages; only `Stop` ends the wait early.
 
         Raises:
             _Stopped: the service asked the worker to stop.
@@ -182,10 +182,10 @@ class Worker:
             self._later.append(message)
 
     def finish(self, message: FrameReady) -> FrameCommitted | FrameFailedInWorker:
-        """Reconstructs and commits a frame, or returns the reason for its failure.
+        """Reconstructs and commits a frame, and returns the outcome to report.
 
         Raises:
-            OSError: the disk is full; nothing is committed.
+            OSError: the disk is full, and nothing was committed.
         """
         dropped: dict[str, str] = {}
         began = time.perf_counter()
@@ -193,7 +193,7 @@ class Worker:
             frame, dropped = decode(self.spec.rig, message, read(self._pictures, message))
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
-                reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
+                reason = f"usable pictures: {len(frame.images)}, but the scene requires at least {least}"
                 return FrameFailedInWorker(message.index, reason, dropped)
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
@@ -209,13 +209,13 @@ class Worker:
             )
 
     def set_retention(self, message: ChangeRetention) -> None:
-        """Applies new retention rules and reports the states that they delete."""
+        """Applies new retention rules and reports the deleted states."""
         self.spec = replace(self.spec, retention=message.rules)
         self._compacting.set_rules(message.rules)
         self.connection.send(StatesRetained(tuple(self.retain())))
 
     def repair(self, message: RepairFiles) -> None:
-        """Checks and repairs files that were found damaged, and reports the outcome of each."""
+        """Checks and repairs damaged files, and reports the outcome for each."""
         assert self.states is not None
         for mended in repairs.repair_files(self.states, self.reconstruction, message):
             self.connection.send(mended)
@@ -235,10 +235,10 @@ class Worker:
         """Runs the first frame or an update and commits the result.
 
         Args:
-            frame: decoded images and masks.
-            dropped: cameras that were left out, with the reason.
-            budget: limits of an update; not used for the first frame.
-            began: `time.perf_counter()` before decoding.
+            frame: frame with decoded images and masks.
+            dropped: reason for each camera that was left out, keyed by camera name.
+            budget: budget of an update; not used for the first frame.
+            began: value of `time.perf_counter()` before decoding.
         """
         assert self.states is not None
         if self.reconstruction is None:
@@ -257,7 +257,7 @@ class Worker:
             )
         else:
             if not self._compiled:
-                began += wait_for_updates(self.spec.settings, self.connection)  # compile time does not count
+                began += wait_for_updates(self.spec.settings, self.connection)  # compilation does not count
                 self._compiled = True
             if budget != self._budget:
                 self.reconstruction.set_budget(**budget.model_dump())
@@ -275,7 +275,7 @@ class Worker:
         return FrameCommitted(frame.index, committed, tuple(self.retain()))
 
     def retain(self) -> list[int]:
-        """Deletes old states according to the scene's rules and returns their indices; failures are retried later."""
+        """Deletes old states according to the retention rules and returns their indices; failures are retried later."""
         assert self.states is not None
         rule = self.spec.retention.keep_states
         last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
@@ -289,7 +289,7 @@ class Worker:
         return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:
-        """Sends progress at most every `PROGRESS_EVERY_S` seconds, and always at the end of a stage."""
+        """Sends progress at most once per `PROGRESS_EVERY_S`, and always at the end of a stage."""
         now = time.monotonic()
         if now - self._progress_at >= PROGRESS_EVERY_S or progress.done >= progress.total:
             self._progress_at = now
@@ -300,12 +300,12 @@ class Worker:
 Picture = NDArray[np.uint8]
 
 DECODERS = 8
-"""Maximum number of cameras decoded in parallel; each holds its image twice in memory during decoding."""
+"""Maximum number of cameras to decode in parallel; each needs memory for two copies of its image meanwhile."""
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """Encoded images and masks of a frame per camera; `faults` has a sentence for each unreadable record."""
+    """Encoded images and masks of a frame, keyed by camera; `faults` has a sentence for each unreadable record."""
 
     images: dict[str, memoryview]
     masks: dict[str, memoryview]
@@ -316,7 +316,7 @@ def read(folder: Path, message: FrameReady) -> Encoded:
     """Reads the files of a frame from the frame log.
 
     Raises:
-        FrameDamage: the record that holds the whole frame cannot be used.
+        FrameDamage: the single record that contains the whole frame is damaged.
     """
     contents = Encoded({}, {}, [])
     for name in message.files:
@@ -328,18 +328,18 @@ def read(folder: Path, message: FrameReady) -> Encoded:
             contents.faults.append(f"a record in the frame log is damaged: {error}")
             continue
         if len(message.files) == 1 and frame_identity(pictures.hashes, message.time) != message.identity:
-            raise FrameDamage(f"{name}: it holds other pictures than were acknowledged")
+            raise FrameDamage(f"{name}: its pictures differ from the acknowledged ones")
         contents.images.update(pictures.images)
         contents.masks.update(pictures.masks)
     return contents
 
 
 def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict[str, str]]:
-    """Returns the frame and the cameras that were left out, with the reason; cameras are decoded in parallel."""
+    """Decodes a frame; returns it and the reason for each camera that was left out. Cameras are decoded in parallel."""
     with ThreadPoolExecutor(max_workers=min(DECODERS, os.cpu_count() or 1)) as pool:
         decoded = list(pool.map(lambda camera: _pictures_of(camera, encoded), rig.cameras))
     images, masks, dropped = {}, {}, {}
-    # In rig order regardless of arrival order, so that equal images give bit-identical results.
+    # In the order of the rig, not of arrival, so that equal images give bit-identical results.
     for camera, pictures in zip(rig.cameras, decoded, strict=True):
         if isinstance(pictures, str):
             dropped[camera.name] = pictures
@@ -351,10 +351,10 @@ def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict
 
 
 def _pictures_of(camera: Camera, encoded: Encoded) -> tuple[Picture, Picture | None] | str:
-    """Returns a camera's image and optional mask, or the reason for leaving the camera out."""
+    """Returns a camera's image and mask, if any, or the reason for leaving the camera out."""
     name, size = camera.name, (camera.width, camera.height)
     if name not in encoded.images:
-        return "; ".join(encoded.faults) or f"camera {name!r} had sent nothing when the frame was closed"
+        return "; ".join(encoded.faults) or f"camera {name!r} had sent no picture when the frame was closed"
     try:
         image = decode_image(bytes(encoded.images[name]), size=size, name=f"image of camera {name!r}")
         if name not in encoded.masks:

@@ -1,1 +1,1 @@
-"""Validation of view and track requests, and their conversion into queries to the readers of a scene."""
+"""Validation of view and track requests, and their conversion into queries to a scene's readers."""

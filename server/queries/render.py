@@ -1,4 +1,4 @@
-"""Conversion of view requests into render queries, for HTTP requests and live views."""
+"""Conversion of view requests from HTTP and live subscriptions into render queries."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from server.processes.queries import RenderQuery
 from server.scene.scene import Scene
 
 MOST_PIXELS = 8_000_000
-"""Maximum number of pixels per view: 4K, which takes a few seconds on one core.
+"""Maximum number of pixels per view, about 4K, which takes a few seconds on one core.
 
-Larger views would delay other queries too long.
+Larger views would delay other queries for too long.
 """
 
 SEVERAL = (RenderFormat.NPZ, RenderFormat.FLOAT32)
@@ -33,16 +33,16 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
             f"the view has {pixels} pixels",
             field="camera" if request.width is None else "width",
             value=f"{camera.width}x{camera.height}",
-            remedy=f"ask for at most {MOST_PIXELS} pixels",
+            remedy=f"request at most {MOST_PIXELS} pixels",
         )
     kinds = tuple(dict.fromkeys(kind.value for kind in request.kinds))
     if request.format not in SEVERAL and len(kinds) > 1:
         raise Problem(
             422,
-            f"{request.format} cannot contain {count_noun(len(kinds), 'kind')}",
+            f"{request.format} cannot store {count_noun(len(kinds), 'kind')}",
             field="kinds",
             value=", ".join(kinds),
-            remedy="request one kind, or npz or float32",
+            remedy="request one kind, or format npz or float32",
         )
     if request.format in LOSSY and kinds[0] in ("depth", "parts"):
         raise Problem(

@@ -1,4 +1,4 @@
-"""Conversion of track requests into track queries, for HTTP requests and live tracks.
+"""Conversion of track requests from HTTP and live subscriptions into track queries.
 
 docs/tracks.md describes the answers.
 """
@@ -21,12 +21,12 @@ from server.scene.scene import Scene
 MOST_POINTS = 1_000_000
 """Maximum number of points times frames per query.
 
-The limit amounts to about one minute of reader time, split into pieces, and 30 MB as npz.
+At this limit, a query takes about one minute of reader time, split into pieces, and 30 MB as npz.
 """
 MOST_JSON_POINTS = 100_000
-"""Maximum number of points times frames in a JSON answer, at about 100 bytes each; npz allows more."""
+"""Maximum number of points times frames in a JSON answer, at about 100 bytes each; npz answers may have more."""
 MOST_VIEWS = 4096
-"""Maximum number of cameras times frames for visibility: one depth map each, about one minute in total."""
+"""Maximum number of cameras times frames for visibility; each needs a depth map, about one minute in total."""
 LARGEST_ID = 2**63 - 1
 """Largest possible id of a Gaussian."""
 FARTHEST = 1e15
@@ -44,7 +44,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if len(asked) != 1:
         given = ", ".join(name for name, _ in asked) or "none"
         raise Problem(
-            422, f"the query has {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
+            422, f"the query gives {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
         )
     scene.committed_frame(None, "from")
     start = scene.committed[0] if request.first is None else request.first
@@ -53,10 +53,10 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if not frames:
         raise Problem(
             422,
-            f"no committed frame from {start} to {end}",
+            f"there is no committed frame from {start} to {end}",
             field="from",
             value=start,
-            remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
+            remedy=f"request frames from {scene.committed[0]} to {scene.committed[-1]}",
         )
     field, queries = asked[0]
     if len(queries) * len(frames) > MOST_POINTS:
@@ -65,7 +65,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
             f"{count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')}",
             field=field,
             value=len(queries) * len(frames),
-            remedy=f"ask for at most {MOST_POINTS} points times frames at once",
+            remedy=f"request at most {MOST_POINTS} points times frames at once",
         )
     if request.format == "json" and len(queries) * len(frames) > MOST_JSON_POINTS:
         raise Problem(
@@ -73,16 +73,16 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
             f"{count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')} as JSON",
             field="format",
             value="json",
-            remedy=f"ask for npz, or for at most {MOST_JSON_POINTS} points times frames",
+            remedy=f"request npz, or at most {MOST_JSON_POINTS} points times frames",
         )
     check_ids(request.ids or ())
     if request.pixels is not None and request.camera is None:
         raise Problem(
             422,
-            "pixels need a camera",
+            "pixels require a camera",
             field="camera",
             value="nothing",
-            remedy=f"name one of {', '.join(scene.rig.names)}",
+            remedy=f"give one of {', '.join(scene.rig.names)}",
         )
     if request.points is not None and max(abs(value) for row in request.points for value in row) > FARTHEST:
         raise Problem(
@@ -110,13 +110,13 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
             f"visibility in {count_noun(len(cameras), 'camera')} over {count_noun(len(frames), 'frame')}",
             field="project" if request.project else "camera",
             value=len(cameras) * len(frames),
-            remedy=f"ask for at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
+            remedy=f"request at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
         )
     return query
 
 
 def _check_pixels(query: TracksQuery) -> None:
-    """Raises `Problem` if a pixel lies outside the image."""
+    """Raises `Problem` if a pixel is outside the image."""
     if query.camera is None or query.pixels is None:
         return
     width, height = query.camera.width, query.camera.height
@@ -125,7 +125,7 @@ def _check_pixels(query: TracksQuery) -> None:
         value = query.pixels[outside[0]].tolist()
         raise Problem(
             422,
-            f"pixel {int(outside[0])} lies outside the picture of camera {query.camera.name!r}",
+            f"pixel {int(outside[0])} is outside the picture of camera {query.camera.name!r}",
             field="pixels",
             value=value,
             remedy=f"give 0 ≤ u < {width}, 0 ≤ v < {height}",
@@ -133,7 +133,7 @@ def _check_pixels(query: TracksQuery) -> None:
 
 
 def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
-    """Returns the distinct cameras; raises `Problem` if two different ones share a name, the key of the answers."""
+    """Returns the distinct cameras; raises `Problem` if two different cameras have the same name."""
     by_name: dict[str, Camera] = {}
     for camera in cameras:
         known = by_name.setdefault(camera.name, camera)
@@ -156,7 +156,7 @@ def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
         size = f"{camera.width}x{camera.height}"
         raise Problem(
             422,
-            f"camera {camera.name!r} has a picture of {size}",
+            f"camera {camera.name!r} has a picture size of {size}",
             field="camera",
             value=size,
             remedy=f"give at most {MOST_PIXELS} pixels",
@@ -168,5 +168,5 @@ def check_ids(ids: Iterable[int]) -> None:
     """Raises `Problem` if an id is outside the range of Gaussian ids."""
     for id in ids:
         if not 0 <= id <= LARGEST_ID:
-            remedy = "take ids from an answer"
+            remedy = "use ids from an answer of the service"
             raise Problem(422, f"{id} is not a valid id", field="ids", value=id, remedy=remedy)

@@ -1,4 +1,4 @@
-// Draws the description of the API with Swagger UI. Nothing is asked of another site: its validator is off.
+// Renders the API description with Swagger UI. Its validator is disabled, so nothing is requested from other sites.
 "use strict";
 
 window.ui = SwaggerUIBundle({
@@ -7,6 +7,6 @@ window.ui = SwaggerUIBundle({
   deepLinking: true,
   defaultModelsExpandDepth: 0,
   displayRequestDuration: true,
-  persistAuthorization: false, // a token stays in the page's memory
+  persistAuthorization: false, // keeps the token only in memory
   validatorUrl: null,
 });

@@ -1,7 +1,7 @@
-"""Queue of repairs for damage found while a scene runs; the worker rewrites or recomputes the affected states.
+"""Queue of repairs for damage found in a running scene; the worker rewrites or recomputes the affected states.
 
-Readers, replays and scrubs report damaged files of the states folder. Between two frames, the worker checks each file
-and rewrites it from memory or from a copy if possible. Other states are recomputed from their images when no frame is
+Readers, replays and scrubs report damaged files in the states folder. Between frames, the worker checks each file and
+rewrites it from memory or from a copy if possible. Other states are recomputed from their images when no frame is
 waiting, and queries for them return 503 until then. If recomputation is impossible, the state is reported as lost.
 """
 
@@ -24,15 +24,15 @@ from server.storage.events import StatesDeleted
 from server.storage.ledger import SceneLog
 
 SENTENCES_KEPT = 100
-"""Maximum number of damage messages kept; the oldest are dropped."""
+"""Maximum number of damage messages that are kept; the oldest messages are dropped."""
 RETRY_S = 5.0
 """Seconds before a repair that failed because of a full disk is retried."""
 RECOMPUTE_OUTCOMES = frozenset(
     {RepairOutcome.RECOMPUTED, RepairOutcome.LOST, RepairOutcome.LATER, RepairOutcome.NO_ROOM}
 )
-"""Outcomes that end the recomputation of a state; others may answer an earlier request for the same file."""
+"""Outcomes that end the recomputation of a state; other outcomes may belong to an earlier request for the file."""
 MAX_DEATHS = 2
-"""Number of worker crashes during the recomputation of a state after which the state is given up."""
+"""Number of worker crashes while recomputing a state, after which the state is declared lost."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -50,9 +50,9 @@ class DamageKind(StrEnum):
 
 
 class DamageLog:
-    """Log of the newest damage messages of one scene, limited so that a failing disk does not fill the memory.
+    """Log of the newest damage messages of one scene, limited so that a failing disk does not exhaust memory.
 
-    A repeated message is counted, or ignored if it concerns the same lasting damage.
+    Repeated messages are counted, or ignored if they concern the same lasting damage.
 
     Args:
         sentences: messages from the recovery of the scene.
@@ -65,7 +65,7 @@ class DamageLog:
             self._keep(without_paths(sentence))
 
     def add(self, kind: DamageKind, sentence: str, *, lasting: bool = False) -> None:
-        """Adds a message; `lasting` marks damage that cannot be repaired, so that every check finds it again."""
+        """Adds a message; `lasting` marks damage that cannot be repaired and that every check therefore finds again."""
         sentence = without_paths(sentence)
         if lasting and sentence in self._counts:
             return
@@ -80,8 +80,8 @@ class DamageLog:
 
     @property
     def sentences(self) -> list[str]:
-        """Newest messages in order, preceded by the number of older ones, if any."""
-        before = [f"{self._more} more before these; the service's log has them"] if self._more else []
+        """Newest messages in order, preceded by the number of dropped messages, if any."""
+        before = [f"{self._more} earlier messages are only in the service log"] if self._more else []
         return [*before, *(text if count == 1 else f"{text} ({count} times)" for text, count in self._counts.items())]
 
 
@@ -92,7 +92,7 @@ class RepairQueue:
         log: journal, ledger and frame log of the scene.
         damage: damage messages of the scene.
         background: background tasks of the scene.
-        to_worker: sends a message to the worker and returns False if no worker can receive it.
+        to_worker: function that sends a message to the worker; returns False if no worker can receive it.
         recompute: frames whose states were found damaged during recovery, with the reason.
 
     Attributes:
@@ -134,10 +134,10 @@ class RepairQueue:
         return None
 
     def report_damage(self, files: Mapping[str, str]) -> None:
-        """Requests that the worker checks unreadable files of the states folder.
+        """Asks the worker to check unreadable files in the states folder.
 
         Args:
-            files: reason of the fault by file name.
+            files: names of the files, with a description of the fault.
         """
         new = {}
         for name, reason in files.items():
@@ -150,11 +150,11 @@ class RepairQueue:
         self._ask(new)
 
     def resume(self, damaged: Mapping[int, str]) -> None:
-        """Resends unanswered requests to a new worker and adds the damaged states that it found."""
+        """Resends unanswered requests to a new worker, and adds the damaged states that this worker found."""
         if self.at_work is not None:
             self._deaths[self.at_work] = self._deaths.get(self.at_work, 0) + 1
             if self._deaths[self.at_work] >= MAX_DEATHS:
-                self._declare_unrecoverable(self.at_work, "the worker died each time that it was made again")
+                self._declare_unrecoverable(self.at_work, "the worker crashed each time it recomputed the state")
             self.at_work = None
         self._ask(self._requested)
         self.report_damage({frame_file(index): reason for index, reason in damaged.items()})
@@ -175,19 +175,19 @@ class RepairQueue:
         """Sends the next waiting state to an idle worker for recomputation.
 
         Returns:
-            The seconds after which to call this method again if the disk was full, otherwise 0.
+            If the disk was full, the number of seconds after which to call this method again; otherwise 0.
         """
         if (left := self._full_until - asyncio.get_running_loop().time()) > 0:
             return left
         for index in sorted(self.waiting):
             base = self._base(index)
             if base is None:
-                self._declare_unrecoverable(index, "the state before it cannot be read")
+                self._declare_unrecoverable(index, "the previous state cannot be read")
                 continue
             entry = self._ledger.frames[index]
             receipt = entry.receipt
             if receipt is None or not entry.files:
-                self._declare_unrecoverable(index, "its pictures are no longer held")
+                self._declare_unrecoverable(index, "its images are no longer stored")
                 continue
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
             if self._to_worker(RecomputeState(frame, base)):
@@ -196,25 +196,25 @@ class RepairQueue:
         return 0.0
 
     def handle_result(self, message: RepairResult) -> tuple[int, ...]:
-        """Handles the worker's repair result and returns the frames that readers must reload."""
+        """Handles a repair result of the worker, and returns the frames that readers must reload."""
         index = frame_of(message.name)
         reason = self._requested.pop(message.name, message.reason)
         if index is not None and index == self.at_work and message.outcome in RECOMPUTE_OUTCOMES:
             self.at_work = None
         match message.outcome:
             case RepairOutcome.WHOLE:
-                log.warning("%s could not be read once (%s), and is whole", message.name, reason)
+                log.warning("%s could not be read once (%s), but is intact", message.name, reason)
             case RepairOutcome.WRITTEN:
-                self._log_damage(message.name, f"{message.reason}; it was written again, and nothing is lost")
+                self._log_damage(message.name, f"{message.reason}; it was rewritten, and nothing is lost")
             case RepairOutcome.REPORT_LOST:
                 self._log_damage(
-                    message.name, f"{message.reason}; its state is whole and was written again, its report is lost"
+                    message.name, f"{message.reason}; its state is intact and was rewritten, but its report is lost"
                 )
             case RepairOutcome.DAMAGED if index is not None:
                 self._decide(index, message.reason)
             case RepairOutcome.DAMAGED if checkpoint_of(message.name) is not None:
                 self._log_damage(
-                    message.name, f"{message.reason}; it is needed by nothing but a second damage", lasting=True
+                    message.name, f"{message.reason}; it is needed only if more files are damaged", lasting=True
                 )
             case RepairOutcome.DAMAGED:
                 self._log_damage(message.name, f"{message.reason}; it cannot be recomputed", lasting=True)
@@ -225,7 +225,7 @@ class RepairQueue:
                 self._ledger.frames.replace_record(index, message.report)
                 self._log_damage(
                     message.name,
-                    f"frame {index}: {reason}; its state was made again from its pictures, not with the same bits",
+                    f"frame {index}: {reason}; its state was recomputed from its images, not bit-identically",
                 )
             case RepairOutcome.LOST:
                 assert index is not None
@@ -266,20 +266,20 @@ class RepairQueue:
             timer.cancel()
 
     def _decide(self, index: int, reason: str) -> None:
-        """Queues a damaged state for recomputation from its images, or gives it up."""
+        """Queues a damaged state for recomputation from its images, or declares it lost."""
         entry = self._ledger.frames[index]
         degraded = None if entry.record is None else entry.record.get("degraded")
         self.waiting[index] = reason
         self._ledger.frames.set_unreadable(index, True)
         if not entry.files:
-            self._declare_unrecoverable(index, "its pictures are no longer held")
+            self._declare_unrecoverable(index, "its images are no longer stored")
         elif degraded is not None:
-            self._declare_unrecoverable(index, f"it was {degraded}")
+            self._declare_unrecoverable(index, f"its frame was degraded: {degraded}")
         elif self._base(index) is None:
-            self._declare_unrecoverable(index, "the state before it cannot be read")
+            self._declare_unrecoverable(index, "the previous state cannot be read")
 
     def _base(self, index: int) -> int | None:
-        """Returns the committed frame from which a frame was updated, or None if its state no longer exists."""
+        """Returns the committed frame on which a frame is based, or None if its state was deleted or never existed."""
         for before in range(index - 1, -1, -1):
             entry = self._ledger.frames[before]
             if entry.state == FrameState.COMMITTED:
@@ -287,7 +287,7 @@ class RepairQueue:
         return None
 
     def _declare_unrecoverable(self, index: int, why: str) -> None:
-        """Declares a frame's state deleted because it cannot be recomputed, and records the damage."""
+        """Declares the state of a frame lost because it cannot be recomputed, and records the damage."""
         reason = self.waiting.pop(index, "its state is damaged")
         sentence = f"the state of frame {index} was damaged on disk and cannot be recomputed: {why}"
         self._ledger.frames.set_unreadable(index, False)

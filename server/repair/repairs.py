@@ -1,4 +1,4 @@
-"""Repair of damaged state files in the worker process: from memory, from copies, or from images."""
+"""Repair of damaged state files in the worker process, from memory, copies or images."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ log = logging.getLogger("scas4d.worker")
 
 
 def repair_at_start(history: History) -> list[str]:
-    """Rewrites damaged files that every frame needs, and their copies, and returns one message per file."""
+    """Rewrites damaged files that every frame needs, and damaged copies, and returns one message per file."""
     try:
         mended = history.repair_fixed()
     except OSError as error:  # the states stay readable, so an unwritable disk must not prevent startup
-        log.warning("a file that every frame needs cannot be repaired: %s", error)
+        log.warning("cannot repair a file that every frame needs: %s", error)
         return []
     history.pop_faults()  # these files were just rewritten or are listed in `History.damaged`
-    return [f"{reason}; it was written again from its copy" for reason in mended.values()]
+    return [f"{reason}; it was rewritten from its copy" for reason in mended.values()]
 
 
 def repair_files(
@@ -52,7 +52,7 @@ def repair_files(
         try:
             outcome, reason = _repair_file(history, history.files, reconstruction, name, message)
         except Exception as error:
-            log.exception("%s cannot be repaired", name)
+            log.exception("cannot repair %s", name)
             outcome, reason = RepairOutcome.NO_ROOM if no_room(error) else RepairOutcome.DAMAGED, message_of(error)
         yield RepairResult(name, outcome, reason)
 
@@ -65,7 +65,7 @@ def _repair_file(
     if fault is None:
         return RepairOutcome.WHOLE, ""
     birth = born_of(name)
-    if birth is not None and birth not in history.born_at:  # of a frame that was rolled back
+    if birth is not None and birth not in history.born_at:  # the frame was rolled back
         return RepairOutcome.GONE, ""
     if birth is not None or name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or (known and index == known[0]):
         if name in history.repair_fixed():
@@ -85,7 +85,7 @@ def _repair_file(
 
 
 def _rewrite_with_report(history: History, files: FrameFiles, index: int, message: RepairFiles) -> RepairOutcome:
-    """Rewrites a file with an intact state in which only the report or the time is damaged."""
+    """Rewrites a file in which only the report or the time is damaged and the state is intact."""
     try:
         arrays = files.read(index, PER_FRAME, WHOLES)
         report = message.reports.get(index)
@@ -114,7 +114,7 @@ def recompute_state(
 ) -> Iterator[RepairResult]:
     """Recomputes a state from its images and yields the results; a failure does not affect the running scene.
 
-    Damage often affects neighbouring files, so the preceding state is checked and repaired first.
+    Damage often affects neighbouring files, so the previous state is checked and repaired first.
     """
     index = message.frame.index
     assert history.files is not None
@@ -131,7 +131,7 @@ def recompute_state(
                 case RepairOutcome.NO_ROOM:
                     yield RepairResult(name, RepairOutcome.NO_ROOM, mended.reason)
                 case _:
-                    yield RepairResult(name, RepairOutcome.LOST, "the state before it is gone")
+                    yield RepairResult(name, RepairOutcome.LOST, "the previous state is missing")
             return
     yield _recompute(spec, history, message, decode)
 
@@ -145,7 +145,7 @@ def _recompute(spec: SceneSpec, history: History, message: RecomputeState, decod
     try:
         frame, dropped = decode()
         if len(frame.images) < spec.minimum_cameras:
-            reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {spec.minimum_cameras}"
+            reason = f"images of {len(frame.images)} cameras are left, but the minimum is {spec.minimum_cameras}"
             return RepairResult(name, RepairOutcome.LOST, reason)
         budget = message.frame.budget.model_dump()
         notes = {"budget": budget}
@@ -154,5 +154,5 @@ def _recompute(spec: SceneSpec, history: History, message: RecomputeState, decod
         )
         return RepairResult(name, RepairOutcome.RECOMPUTED, report=report)
     except Exception as error:  # any error is reported as the outcome and must not stop the worker
-        log.exception("scene %s, frame %d cannot be recomputed", spec.folder.name, index)
+        log.exception("scene %s: cannot recompute frame %d", spec.folder.name, index)
         return RepairResult(name, RepairOutcome.NO_ROOM if no_room(error) else RepairOutcome.LOST, message_of(error))

@@ -1,7 +1,7 @@
 """Scrubbing of a scene: slowly rereads all files and verifies checksums to find damage before a file is needed.
 
-Files are read sequentially in pieces in a thread. Pauses keep the read rate to the configured limit, or to a quarter of
-it while a frame is being updated. Pages that only the scrub needed are dropped from the page cache.
+Files are read sequentially in pieces in a thread. Pauses limit the read rate to the configured value, or to a quarter
+of it while a frame is being updated. Pages that only the scrub needed are dropped from the page cache.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from server.storage.ledger import SceneLog
 AT_WORK = 0.25
 """Fraction of the read rate that is used while a frame is being updated."""
 EVENT_WEIGHT = 8
-"""CPU cost per byte of the journal relative to arrays, because the journal consists of many small records."""
+"""CPU cost per byte of the journal relative to arrays; it is higher because the journal has many small records."""
 CHECK_S = 5.0
-"""Seconds between checks that the journal file is still at its path."""
+"""Seconds between checks whether the journal file is still at its path."""
 
 GONE = "gone"
 """Fault of a missing file."""
@@ -94,7 +94,7 @@ class Scrub:
             try:
                 await self.once()
             except Exception:  # a failed scrub must not stop the scene
-                log.exception("scene %s cannot be scrubbed", self._folder.name)
+                log.exception("cannot scrub scene %s", self._folder.name)
 
     async def once(self) -> None:
         """Runs one pass over all files."""
@@ -121,7 +121,7 @@ class Scrub:
             return
         with contextlib.suppress(OSError):  # the next pass retries
             await asyncio.to_thread(write_definition, self._folder, self._definition)
-            self._damage.add(DamageKind.DEFINITION, f"{fault}; it was written again")
+            self._damage.add(DamageKind.DEFINITION, f"{fault}; it was rewritten")
 
     async def _scrub_journal(self) -> None:
         journal = self._journal
@@ -149,7 +149,7 @@ class Scrub:
             await self._state(folder / name, lambda: False)
         newest = checkpoint_file(ledger.committed[-1])
         if listed and not self._ledger.updating and not await asyncio.to_thread((folder / newest).exists):
-            self._repair_queue.report_damage({newest: f"{newest} is gone"})
+            self._repair_queue.report_damage({newest: f"{newest} is missing"})
         await asyncio.to_thread(files.chunks.refresh)
         for index in reversed(committed):
             if index in files.chunks and not files.path(index).exists():
@@ -170,7 +170,7 @@ class Scrub:
                 self._repair_queue.report_damage({files.path(index).name: fault})
 
     def _expected(self, files: FrameFiles, index: int) -> bool:
-        """Returns whether a committed frame should still have its own file, as it has not moved to a chunk."""
+        """Returns whether a frame should still have its own file: it is committed and has not moved to a chunk."""
         if index in self._ledger.committed:
             files.chunks.refresh()
             return index not in files.chunks
@@ -180,7 +180,7 @@ class Scrub:
         """Scrubs one file of the states; `expected` returns whether a missing file counts as damage."""
         fault = await self._read(iter_verified(path))
         if fault == GONE and await asyncio.to_thread(expected):
-            self._repair_queue.report_damage({path.name: f"{path.name} is gone"})
+            self._repair_queue.report_damage({path.name: f"{path.name} is missing"})
         elif fault is not None and fault != GONE:
             self._repair_queue.report_damage({path.name: fault})
 
@@ -189,7 +189,7 @@ class Scrub:
         fault = await self._read(iter_verified(path))
         if fault is None or fault == GONE:
             return
-        used = "the first frame is committed, and needs it no more" if self._ledger.committed else "put it again"
+        used = "not needed, as the first frame is committed" if self._ledger.committed else "upload the points again"
         self._damage.add(DamageKind.POINTS, f"{fault}; {used}", lasting=True)
 
     async def _scrub_frames(self) -> None:
@@ -200,9 +200,9 @@ class Scrub:
             entry = self._ledger.frames.get(index)
             if fault is None or entry is None or name not in entry.files:  # deleted during the scrub
                 continue
-            what = "it fails when its turn comes"
+            what = "the frame will fail when it is processed"
             if entry.state == FrameState.COMMITTED:
-                what = "its state is not touched by that"
+                what = "its state is not affected"
             sentence = f"frame {index}: its record in the frame log is damaged: {fault}; {what}"
             self._damage.add(DamageKind.FRAME, sentence, lasting=True)
 

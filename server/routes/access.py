@@ -54,9 +54,9 @@ AllScenes = Annotated[Scenes, Depends(_scenes)]
 AllExports = Annotated[Exports, Depends(_exports)]
 TheSettings = Annotated[ServerSettings, Depends(_settings)]
 TheScene = Annotated[Scene, Depends(_scene)]
-"""Scene for routes that need its processes: the scene is woken up and takes a slot."""
+"""Scene for routes that need its processes; the scene is woken up and takes a slot."""
 TheRecord = Annotated[Scene, Depends(_record)]
-"""Scene for routes that do not need its processes: it is loaded from its folder even if no slot is free."""
+"""Scene for routes that do not need its processes; it is loaded from its folder even if no slot is free."""
 FrameIndex = Annotated[int, Path(ge=0, le=1_000_000_000)]
 
 
@@ -70,7 +70,7 @@ def only_known(connection: HTTPConnection) -> None:
     """Rejects unknown query parameters, so that misspelled names do not go unnoticed.
 
     Raises:
-        Problem: 422, with the unknown parameter and the valid ones.
+        Problem: 422 if a parameter is unknown; names the valid ones.
     """
     route = connection.scope.get("route")
     if not isinstance(route, APIRoute):  # a WebSocket
@@ -81,15 +81,15 @@ def only_known(connection: HTTPConnection) -> None:
         if name in names:
             continue
         near = difflib.get_close_matches(name, names, 1)
-        meant = f"it may be {near[0]!r} that is meant; " if near else ""
-        there = f"the parameters here are {', '.join(names)}" if names else "this address takes no parameters"
+        meant = f"did you mean {near[0]!r}? " if near else ""
+        there = f"the valid parameters are {', '.join(names)}" if names else "this address takes no parameters"
         raise Problem(422, f"unknown parameter {name!r}", field=name, value=value, remedy=meant + there)
 
 
 async def ask(request: Request, scene: Scene, query: Query) -> Answer:
     """Returns the readers' answer to a query, or cancels the query if the client disconnects.
 
-    The request body must have been read before.
+    The request body must have been read before this call.
 
     Raises:
         Problem: see `Readers.ask`; 503 if the client has closed the connection.
@@ -105,7 +105,7 @@ async def ask(request: Request, scene: Scene, query: Query) -> Answer:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError, Exception):
                 await task
-    raise Problem(503, "the client closed the connection", remedy="ask again")
+    raise Problem(503, "the client closed the connection", remedy="send the request again")
 
 
 async def _hung_up(request: Request) -> None:

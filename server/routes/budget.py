@@ -1,4 +1,4 @@
-"""Routes of the budget, which limits the iterations and time of a scene's updates."""
+"""Routes for the budget, which limits the iterations and time of a scene's updates."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ async def get(scene: TheRecord) -> SceneBudget:
 
 @router.put("/{id}/budget")
 async def put(scene: TheRecord, budget: Budget) -> SceneBudget:
-    """Sets the budget for all frames whose reconstruction has not started; null restores the scene's own setting.
+    """Sets the budget for all frames whose reconstruction has not started; null restores the setting of the scene.
 
     The budget is on disk when the response is sent. After a crash or restart, each frame gets the budget that applied
     to it.

@@ -1,4 +1,4 @@
-"""Route of the cluster: machines, their scenes, and scenes that wait for resources."""
+"""Route for the cluster: machines, their scenes, and scenes that wait for resources."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ router = APIRouter(prefix="/v1/cluster", tags=["service"])
 
 @router.get("")
 async def get(request: Request, response: Response, scenes: AllScenes, server: TheSettings) -> Cluster:
-    """Returns the machines on which scenes run, with resources reserved according to the scenes' estimates.
+    """Returns the machines on which scenes run, with the resources reserved according to estimates per scene.
 
-    On a cluster with several services, the answer covers the scenes of all of them. X-Unreachable names the services
-    that do not answer.
+    On a cluster with several services, the response covers the scenes of all services. The header X-Unreachable names
+    services that do not respond.
     """
     placement: Placement = request.app.state.placement
     peers: Peers | None = request.app.state.peers

@@ -1,4 +1,4 @@
-"""Route of the estimate of a scene's memory and disk usage before it is created."""
+"""Route that estimates the memory and disk usage of a scene before it is created."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Routes of exports: files with many frames in third-party formats, written in the background."""
+"""Routes for exports: files with many frames in third-party formats, written in the background."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ KINDS = (*MEDIA_TYPES.values(), "application/octet-stream")
 FILE: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in KINDS},
-        "description": "The file, or a range of its bytes (206).",
+        "description": "Content of the file, or a range of its bytes (206).",
     }
 }
 
 
 @router.post("/{id}/exports", status_code=202)
 async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, response: Response) -> ExportModel:
-    """Starts an export of committed frames in the background; the `Location` header has its address.
+    """Starts an export of committed frames in the background; the `Location` header contains its address.
 
     The service runs one export at a time, in a separate low-priority process, so that updates and views have priority.
-    A scene can have up to 8 exports. A file is kept for one day, but not across restarts of the service.
+    A scene can have up to 8 exports. Files are kept for one day, but not across restarts of the service.
     """
     if request.ids is not None and request.format != "tracks":
         raise Problem(
@@ -39,7 +39,7 @@ async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, r
             f"ids are given for format {request.format!r}",
             field="ids",
             value=request.ids,
-            remedy="leave ids out; they choose the Gaussians of format 'tracks'",
+            remedy="omit ids, which select the Gaussians for format 'tracks'",
         )
     made = exports.begin(scene, request, _frames(scene, request)).model()
     response.headers["Location"] = f"/v1/scenes/{scene.id}/exports/{made.id}"
@@ -60,7 +60,7 @@ async def get(id: SceneId, export: ExportId, exports: AllExports) -> ExportModel
 
 @router.get("/{id}/exports/{export}/file", response_class=Response, responses=FILE)
 async def file(id: SceneId, export: ExportId, exports: AllExports, request: Request) -> Response:
-    """Returns the file of a finished export; formats with numbered files are packed into one .zip.
+    """Returns the file of a finished export; formats with numbered files are packed into one .zip file.
 
     `Range` and `If-None-Match` are supported.
     """
@@ -73,15 +73,15 @@ async def file(id: SceneId, export: ExportId, exports: AllExports, request: Requ
             value=export,
             remedy=f"wait until GET /v1/scenes/{id}/exports/{export} reports that it is done"
             if file_export.error is None
-            else "ask for another export",
+            else "start another export",
         )
     try:
         return await immutable_file_response(
             request, file_export.spec.file, tag=file_export.id, media_type=file_export.media_type, name=file_export.name
         )
     except FileNotFoundError:  # removed after the state was checked
-        remedy = "ask for another export"
-        raise Problem(404, "the file of the export is removed", field="export", value=export, remedy=remedy) from None
+        remedy = "start another export"
+        raise Problem(404, "the export has been removed", field="export", value=export, remedy=remedy) from None
 
 
 @router.delete("/{id}/exports/{export}", status_code=204)
@@ -107,6 +107,6 @@ def _frames(scene: Scene, request: ExportRequest) -> tuple[int, ...]:
             f"no committed frame from {first} to {last}",
             field="first",
             value=first,
-            remedy=f"ask within {committed[0]} to {committed[-1]}",
+            remedy=f"give a range within {committed[0]} to {committed[-1]}",
         )
     return frames

@@ -1,4 +1,4 @@
-"""Routes of frames: upload, stored images, reports and export."""
+"""Routes for frames: upload, stored images, reports and export."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF; docs/api.md has it byte by byte."}},
+            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF, described in docs/api.md."}},
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
-                    "properties": {"time": {"type": "number", "description": "Seconds; optional."}},
+                    "properties": {"time": {"type": "number", "description": "Frame time in seconds; optional."}},
                     "additionalProperties": {
                         **BINARY,
-                        "description": "One file a camera, the field called like the camera; `mask.<camera>` optional.",
+                        "description": "Image of the camera with the name of the field; `mask.<camera>` is its mask.",
                     },
                 }
             },
@@ -53,23 +53,21 @@ PICTURE: dict[str, Any] = {
         "required": True,
         "content": {
             **{kind: {"schema": BINARY} for kind in ("image/jpeg", "image/png", "image/webp")},
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "Picture and mask of the camera at once."}},
+            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "Image and mask of the camera in one body."}},
         },
     }
 }
 MOST_STATES = 120
 """Maximum number of frames in a requested compact file: a few seconds of reader time and a few megabytes."""
 SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"), b"RI": ("image/webp", ".webp")}
-"""Media type and file extension of an image by its first two bytes."""
+"""Maps the first two bytes of an image file to its media type and file extension."""
 FILE: dict[int | str, dict[str, Any]] = {
-    200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "As it was sent."}
+    200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "File as uploaded."}
 }
 CameraPath = Annotated[str, Path(max_length=64, description="Name of a camera of the rig.")]
 Seconds = Annotated[
     float | None,
-    Query(
-        allow_inf_nan=False, description="Time of the frame in seconds; the first value that a camera sends applies."
-    ),
+    Query(allow_inf_nan=False, description="Time of the frame in seconds; the first value sent by any camera is used."),
 ]
 
 
@@ -77,9 +75,10 @@ Seconds = Annotated[
 async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
     """Accepts frame n with one JPEG, PNG or WebP per camera; frames must arrive in order and without gaps.
 
-    The frame is on disk when the response is sent. Sending the same frame again gives the same answer. Different
-    content for a known index and gaps are refused (409, with the expected index). If the queue is full, the answer is
-    429 with Retry-After, or the frame is skipped if the scene is configured so. If the disk is full, the answer is 507.
+    The frame is on disk when the response is sent. Sending the same frame again returns the same response. Different
+    content for a known index, and gaps, are refused (409, with the expected index). If the queue is full, the response
+    is 429 with Retry-After, or the frame is skipped if the scene is configured this way. If the disk is full, the
+    response is 507.
     """
     kind = _media_type(request)
     try:
@@ -91,10 +90,10 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
         raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
     raise Problem(
         415,
-        f"a frame is {FRAME_MEDIA_TYPE} or multipart/form-data",
+        f"a frame must be {FRAME_MEDIA_TYPE} or multipart/form-data",
         field="Content-Type",
         value=request.headers.get("content-type", ""),
-        remedy="send one file per camera, the field called like the camera",
+        remedy="send one file per camera, with the camera name as field name",
     )
 
 
@@ -105,7 +104,7 @@ async def put_camera(
     c: CameraPath,
     request: Request,
     time: Seconds = None,
-    kind: Annotated[FileKind, Query(description="Send a mask before its picture, or both in one S4DF.")] = (
+    kind: Annotated[FileKind, Query(description="Send a mask before its image, or both in one S4DF body.")] = (
         FileKind.IMAGE
     ),
 ) -> CameraReceipt:
@@ -119,7 +118,7 @@ async def put_camera(
             return await receive_camera(scene.open_frames, n, c, _body(request), _length(request))
         return await receive_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
     except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the picture again") from None
+        raise Problem(400, "the sender closed the connection", field="body", remedy="send the image again") from None
 
 
 @router.get("/{id}/frames/{n}/cameras/{c}", response_class=Response, responses=FILE)
@@ -128,12 +127,12 @@ async def picture(
     n: FrameIndex,
     c: CameraPath,
     request: Request,
-    kind: Annotated[FileKind, Query(description="The picture or its mask.")] = FileKind.IMAGE,
+    kind: Annotated[FileKind, Query(description="Whether to return the image or its mask.")] = FileKind.IMAGE,
 ) -> Response:
-    """Returns one camera's image of frame n, byte for byte as it was sent.
+    """Returns one camera's image of frame n, byte for byte as uploaded.
 
-    Images are kept according to the scene's `ingest.keep_frames`. A 404 says which is missing: the camera, the frame,
-    all its images, or this image.
+    Images are kept according to the scene's `ingest.keep_frames`. A 404 states what is missing: the camera, the frame,
+    all of its images, or this image.
     """
     data = await _stored(scene, n, c, kind)
     media_type, ending = SENT_AS[bytes(data[:2])]
@@ -143,13 +142,13 @@ async def picture(
 
 @router.post("/{id}/frames/{n}/close", status_code=202)
 async def close(scene: TheScene, n: FrameIndex) -> FrameReceipt:
-    """Closes a frame that is sent camera by camera with the images received so far; later images are refused."""
+    """Closes a frame with the single-camera images received so far; later images are refused."""
     return await scene.open_frames.close(n)
 
 
 @router.post("/{id}/frames/{n}/missing")
 async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None = None) -> FrameReportModel:
-    """Declares the next frame permanently missing, so that a rig that lost it can continue with the following one.
+    """Declares the next frame permanently missing, so that a rig that lost it can continue with the frame after it.
 
     Images of the frame that have already arrived are discarded. The next update spans the longer time interval.
     """
@@ -166,7 +165,7 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
             f"frame {n} has not arrived",
             field="n",
             value=n,
-            remedy=f"send it or wait for it: the next frame is {scene.next_frame}",
+            remedy=f"send it, or wait for it: the next frame is {scene.next_frame}",
         )
     return frame_report
 
@@ -174,7 +173,7 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
 @router.get(
     "/{id}/frames/{n}/splat.ply",
     response_class=Response,
-    responses={200: {"content": {"application/octet-stream": {}}, "description": "A 3DGS .ply."}},
+    responses={200: {"content": {"application/octet-stream": {}}, "description": "3DGS .ply file."}},
 )
 async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
     """Returns a committed frame as a 3D Gaussian Splatting .ply file."""
@@ -188,12 +187,12 @@ async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
     responses={
         200: {
             "content": {"application/octet-stream": {}},
-            "description": "A compact 4D file (docs/format.md).",
+            "description": "Compact 4D file (docs/format.md).",
             "headers": {
-                "X-Last-Frame": {"schema": {"type": "integer"}, "description": "The last frame of the answer."},
+                "X-Last-Frame": {"schema": {"type": "integer"}, "description": "Index of the last frame in the file."},
                 "X-Next-Frame": {
                     "schema": {"type": "integer"},
-                    "description": "The committed frame to go on with as `first`; absent where there is none.",
+                    "description": "Value of `first` for the next request; absent if there are no further frames.",
                 },
             },
         }
@@ -208,8 +207,8 @@ async def compact(
 ) -> Response:
     """Returns committed frames as a compact 4D file, which `scas4d export` converts to other formats.
 
-    Frames that the scene already stores in a compact file are copied bit for bit. The answer then ends at the end of
-    that file, and may start before the requested range at the key frame on which it depends.
+    Frames that the scene already stores in a compact file are copied unchanged. The response then ends where that file
+    ends, and may start before the requested range, at the keyframe on which the range depends.
     """
     scene.committed_frame(None, "first")
     begin = bisect_left(scene.committed, first)
@@ -220,7 +219,7 @@ async def compact(
             f"no committed frame from {first} on",
             field="first",
             value=first,
-            remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
+            remedy=f"give a frame from {scene.committed[0]} to {scene.committed[-1]}",
         )
     answer = await ask(request, scene, CompactQuery(frames, parts))
     after = bisect_right(scene.committed, int(answer.headers["X-Last-Frame"]))
@@ -237,22 +236,22 @@ async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
         Problem: 404 if it is missing or damaged.
     """
     if c not in scene.rig.names:
-        raise Problem(404, f"the rig has no camera {c!r}", field="c", value=c, remedy=f"one of {scene.rig.names}")
+        raise Problem(404, f"the rig has no camera {c!r}", field="c", value=c, remedy=f"use one of {scene.rig.names}")
     entry = scene.ledger.frames.get(n)
     if entry is None:
         remedy = f"wait for it: the next frame is {scene.next_frame}"
         raise Problem(404, f"frame {n} has not arrived", field="n", value=n, remedy=remedy)
-    field, fault = "n", f"the pictures of frame {n} are not kept any more"
+    field, fault = "n", f"the images of frame {n} are no longer stored"
     for name in entry.files:
         try:
             stored = await asyncio.to_thread(read_pictures, scene.spec.folder.frames, name)
         except FrameDamage as error:
-            fault = f"the pictures of frame {n} cannot be read: {error}"
+            fault = f"the images of frame {n} cannot be read: {error}"
             continue
         if (picture := (stored.images if kind == FileKind.IMAGE else stored.masks).get(c)) is not None:
             return picture
         field, fault = "c", f"no {kind.value} of camera {c} was sent with frame {n}"
-    remedy = "ask for a newer frame; PATCH of the scene's `keep_frames` keeps more of them"
+    remedy = "request a newer frame; to keep more images, change the scene's `keep_frames` with PATCH"
     raise Problem(404, fault, field=field, value=n if field == "n" else c, remedy=remedy)
 
 

@@ -1,4 +1,4 @@
-"""Route of the lifetimes of Gaussians."""
+"""Route for the lifetimes of Gaussians."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ANSWERS: dict[int | str, dict[str, Any]] = {200: {"model": GaussiansModel}}
 async def gaussians(
     scene: TheScene,
     request: Request,
-    ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Ids, separated by commas.")],
+    ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Ids of Gaussians, separated by commas.")],
 ) -> Response:
     """Returns the frames in which Gaussians were created, retired and revived; ids are never reused."""
     scene.committed_frame(None, "id")

@@ -33,7 +33,7 @@ async def live(scenes: AllScenes) -> Health:
 async def ready(request: Request, scenes: AllScenes, settings: TheSettings) -> Health:
     """Returns 200 once scenes are recovered and kernels are compiled, else 503; `ready_after` is the startup time in s.
 
-    A full disk only affects `ingest_ready`: views, tracks and exports keep working.
+    A full disk affects only `ingest_ready`: views, tracks and exports keep working.
     """
     scenes.recovering.check()
     readiness: Readiness = request.app.state.readiness
@@ -60,6 +60,6 @@ async def ingest(scenes: AllScenes, settings: TheSettings) -> Health:
 
 
 def room_missing(settings: ServerSettings) -> str | None:
-    """Returns a message if the data folder's disk has less than `ROOM_MB` free, else None; blocks."""
+    """Returns a message if the disk of the data folder has less than `ROOM_MB` free, otherwise None; blocks."""
     free = shutil.disk_usage(settings.data).free / 1e6
     return None if free >= ROOM_MB else f"the disk of the data folder has {free:.0f} MB free, less than {ROOM_MB}"

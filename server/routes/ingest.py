@@ -44,10 +44,10 @@ AHEAD = 1
 async def ingest(socket: WebSocket, id: str) -> None:
     """Accepts binary messages in the `client.wire.framing` format and answers each with an `IngestAnswer` as text.
 
-    The sender may pipeline messages: one is received while the previous one is synced to disk. Answers keep the order
-    of the messages. A refused message is answered, and the socket stays open. A message with `part` corresponds to
-    PUT …/cameras/{c}. The handshake is refused if the scene does not exist (404) or has too many senders (429). A
-    message larger than any possible frame of the rig closes the connection (1009).
+    The sender may pipeline messages: one is received while the previous one is synced to disk. Answers are sent in the
+    order of the messages. A rejected message is also answered, and the socket stays open. A message with `part`
+    corresponds to PUT …/cameras/{c}. The handshake is refused if the scene does not exist (404) or has too many senders
+    (429). A message larger than any possible frame of the rig closes the connection (1009).
     """
     scenes: Scenes = socket.app.state.scenes
     server: ServerSettings = socket.app.state.settings
@@ -55,7 +55,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
         try:
             scene = await held.enter_async_context(scenes.use(id))
             scene.ingest.add_socket()
-        except Problem as problem:  # the handshake is refused with a normal HTTP response
+        except Problem as problem:  # an HTTP response refuses the handshake
             await socket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
         limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
@@ -67,7 +67,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
 
 
 async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
-    """Processes messages until the sender closes the socket or sends a text message, or the scene is gone."""
+    """Processes messages until the sender closes the socket or sends text, or the scene is no longer available."""
     taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
     whole_before = True
@@ -79,7 +79,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
             data = message.get("bytes")
             if data is None:
                 await taking.join()
-                await socket.close(UNSUPPORTED, "frames are binary messages")
+                await socket.close(UNSUPPORTED, "frames must be binary messages")
                 return
             try:
                 scene = scenes[id]
@@ -87,7 +87,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
                 await taking.join()
                 await socket.send_text(_refusal(None, problem).model_dump_json())
                 away = problem.status_code == 503
-                await socket.close(SCENE_RESTARTS if away else SCENE_GONE, "the scene is not here")
+                await socket.close(SCENE_RESTARTS if away else SCENE_GONE, "the scene is not available")
                 return
             head = _head(data)
             whole = isinstance(head, FrameHead) and not head.single_camera
@@ -99,7 +99,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
     except WebSocketDisconnect:
         return
     finally:
-        # Only the answers are cancelled: a completely received frame is accepted even if its sender has disconnected.
+        # Only answers are cancelled: a completely received frame is accepted even if its sender has disconnected.
         answering.cancel()
 
 
@@ -143,7 +143,7 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
 
 
 def _refusal(index: int | None, problem: Problem) -> IngestAnswer:
-    """Returns the answer that refuses a message; `retry_after` equals the Retry-After header over HTTP."""
+    """Returns the answer that rejects a message; `retry_after` corresponds to the Retry-After header of HTTP."""
     seconds = (problem.headers or {}).get("Retry-After")
     wait = None if seconds is None else int(seconds)
     return IngestAnswer(index=index, status=problem.status_code, retry_after=wait, problem=problem.document)

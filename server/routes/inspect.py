@@ -1,4 +1,4 @@
-"""Routes of the rig and of frame reports, used by viewers."""
+"""Routes for the rig and for frame reports, used by viewers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from server.routes.access import TheRecord, TheScene
 router = APIRouter(prefix="/v1/scenes")
 
 MOST_FRAMES = 500
-"""Maximum number of frames per answer, limited because each report lists every camera."""
+"""Maximum number of frames per response, limited because each report lists every camera."""
 
 
 @router.get("/{id}/rig", tags=["scenes"])
 async def rig(scene: TheRecord) -> RigModel:
-    """Returns the camera rig of the scene as it was uploaded, without calibration corrections."""
+    """Returns the camera rig of the scene as uploaded, without calibration corrections."""
     return scene.request.rig
 
 

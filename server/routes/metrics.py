@@ -1,4 +1,4 @@
-"""Route of the Prometheus metrics."""
+"""Route for the Prometheus metrics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Route of parts, which are groups of Gaussians that move together."""
+"""Route for parts, which are groups of Gaussians that move together."""
 
 from __future__ import annotations
 

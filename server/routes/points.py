@@ -1,4 +1,4 @@
-"""Route of the initial point cloud."""
+"""Route for the initial point cloud."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ async def put(
     reconstruction: Annotated[
         int | None,
         Query(
-            ge=0, description="Number of the reconstruction: the scene's (default), or the next one, before it starts."
+            ge=0, description="Number of the reconstruction: the current one (default), or the next before it starts."
         ),
     ] = None,
 ) -> PointsReceipt:
     """Accepts the point cloud from which frame 0 is initialized; it must be uploaded before frame 0.
 
     The body is an npz with `positions` [P, 3] in the rig's world frame and units, and `colours` [P, 3] in 0…1.
-    `foreground` [P] in 0…1 is optional. Alternatively it holds `data` [P, 6 or 7] with these as columns, like the
-    `init_pt_cld.npz` of Dynamic3DGaussians. Uploading the same body again gives the same answer. To restart a
+    `foreground` [P] in 0…1 is optional. Alternatively, the npz contains `data` [P, 6 or 7] with these as columns, like
+    the `init_pt_cld.npz` of Dynamic3DGaussians. Uploading the same body again returns the same response. To restart a
     reconstruction from new points, upload them with `reconstruction=n` before `PUT …/reconstructions/{n}`.
     """
     body = await request.body()
@@ -86,16 +86,16 @@ async def put(
 
 
 def check_number(number: int, own: int, next_frame: int) -> None:
-    """Checks that the points are for a reconstruction that has not started and is the current or the next one.
+    """Checks that the points are for the current reconstruction, if it has not started, or for the next one.
 
     Raises:
-        Problem: 409 if not.
+        Problem: 409 if they are for any other reconstruction.
     """
     if number == own + 1 or (number == own == 0 and next_frame == 0):
         return
-    fault = f"reconstruction {number} comes after another one: the scene's is {own}"
+    fault = f"reconstruction {number} is not the next one: the current one is {own}"
     if number <= own:
-        fault = "this reconstruction has begun already, without these points"
+        fault = "this reconstruction has already started without these points"
     raise Problem(
         409,
         fault,
@@ -107,7 +107,7 @@ def check_number(number: int, own: int, next_frame: int) -> None:
 
 
 def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
-    """Returns the validated arrays of an npz cloud; nothing is unpickled, and sizes are checked before unpacking."""
+    """Returns the validated arrays of an npz point cloud; sizes are checked before unpacking; nothing is unpickled."""
     shapes = {"positions": (np.float64, 3), "colours": (np.float32, 3), "foreground": (np.float32, 0)}
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:
@@ -115,7 +115,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
         if unpacked > 64 * limit:
             raise Problem(
                 413,
-                f"the cloud unpacks to {unpacked} bytes",
+                f"the point cloud unpacks to {unpacked} bytes",
                 field="points",
                 value=unpacked,
                 remedy=f"give at most {limit} points",
@@ -128,7 +128,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
             f"the body is not an npz file that can be read without pickle ({error})",
             field="points",
             value=count_noun(len(body), "byte"),
-            remedy="send numpy.savez(positions=…, colours=…, foreground=…) of plain numbers",
+            remedy="send the output of numpy.savez(positions=…, colours=…, foreground=…) with numeric arrays",
         ) from None
     if (data := arrays.pop("data", None)) is not None and "positions" not in arrays:
         arrays = columns_of(data)
@@ -150,7 +150,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
         arrays[name] = array.astype(kind)
         if not np.isfinite(arrays[name]).all():
             raise Problem(
-                422, f"{name} holds NaN or infinity", field=name, value="NaN", remedy="give finite numbers only"
+                422, f"{name} contains NaN or infinity", field=name, value="NaN", remedy="give finite numbers only"
             )
         if name != "positions" and (arrays[name].min() < 0 or arrays[name].max() > 1):
             top = f"{arrays[name].min():g} … {arrays[name].max():g}"

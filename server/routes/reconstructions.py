@@ -30,12 +30,12 @@ async def put(
 
     The new reconstruction replaces the previous one; its committed states and exports are deleted. All frames
     whose images are still stored are reconstructed again in order. The restart is on disk when the response is sent.
-    Sending the same request again gives the same answer.
+    Repeating the request returns the same response.
     """
     asked = request or ReconstructionRequest()
     with setting_problems():
         settings = changed(scene.spec.settings, asked.settings)
-    check_settings(scene.request, settings, server)
+    check_settings(scene.request, settings, server, scenes.placement)
     begun = scene.ledger.reconstruction < n
     status = await scenes.begin_again(scene, NewReconstruction(n, asked, settings, scene.rig))
     if begun:

@@ -1,4 +1,4 @@
-"""Routes of the API reference: Swagger UI from the package `fastapi-offline`, without external resources."""
+"""Routes for the API reference: Swagger UI from the package `fastapi-offline`, without external resources."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HEADERS = security_headers(style_src="'self' 'unsafe-inline'", img_src="'self' d
 
 
 def _files() -> dict[str, Path]:
-    """Returns the served files by name; the package is located without importing it, as only its files are needed."""
+    """Returns the served files, keyed by name; the package is not imported, because only its files are needed."""
     package = find_spec("fastapi_offline")
     assert package is not None, "the package fastapi-offline is not installed; run: pip install 'scas4d[server]'"
     assert package.origin is not None

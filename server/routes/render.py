@@ -20,11 +20,11 @@ FILES = ("image/png", "image/jpeg", "image/webp", "application/vnd.numpy.npz", "
 PICTURES: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {media_type: {"schema": {"type": "string", "format": "binary"}} for media_type in FILES},
-        "description": "The view; X-Frame says of which frame.",
+        "description": "Rendered view; the header X-Frame gives its frame.",
     }
 }
 ENDINGS = {one: f".{'jpg' if one == RenderFormat.JPEG else one.value}" for one in RenderFormat}
-"""File extension by format."""
+"""Maps each image format to its file extension."""
 
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
@@ -41,20 +41,18 @@ async def render_by_name(
     scene: TheScene,
     request: Request,
     camera: Annotated[
-        str | None, Query(max_length=64, description="Name of a camera of the rig; by default the first.")
+        str | None, Query(max_length=64, description="Name of a camera of the rig; the first by default.")
     ] = None,
-    frame: Annotated[int | None, Query(ge=0, description="Index of a committed frame; by default the last.")] = None,
+    frame: Annotated[int | None, Query(ge=0, description="Index of a committed frame; the last by default.")] = None,
     kind: RenderKind = RenderKind.COLOUR,
     format: RenderFormat = RenderFormat.PNG,
-    width: Annotated[
-        int | None, Query(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the picture in pixels.")
-    ] = None,
-    quality: Annotated[int | None, Query(ge=1, le=100, description="Quality of JPEG and WebP.")] = None,
+    width: Annotated[int | None, Query(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the image in pixels.")] = None,
+    quality: Annotated[int | None, Query(ge=1, le=100, description="Quality of JPEG and WebP images.")] = None,
     background: Annotated[
-        str | None, Query(max_length=64, description="Red, green, blue in 0…1, such as 1,1,1.")
+        str | None, Query(max_length=64, description="Background colour as red,green,blue in 0…1, such as 1,1,1.")
     ] = None,
     parts: Annotated[
-        int | None, Query(ge=1, le=254, description="Number of parts; by default chosen by the scene.")
+        int | None, Query(ge=1, le=254, description="Number of parts; chosen by the scene by default.")
     ] = None,
 ) -> Response:
     """Renders a committed frame from a camera of the rig; the URL can be used in an `<img>` element."""
@@ -69,9 +67,9 @@ async def render_by_name(
         parts=parts,
     )
     query = render_query(scene, view)
-    # The latest frame and the parts change over time, so such views are not cached. A frame given by index stays the
+    # Views of the latest frame and of parts change over time, so they are not cached. A frame given by index stays the
     # same until the reconstruction restarts, except that a damaged state may be recomputed with equivalent quality.
-    # Hence the weak ETag, and `no-cache` so that browsers revalidate before they reuse a view.
+    # Hence the weak ETag, and `no-cache`, which makes browsers revalidate a view before they reuse it.
     keep = {"Cache-Control": "no-store"}
     if view.frame is not None and RenderKind.PARTS not in view.kinds:
         keep = {

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Request, Response
 
 from client.wire import SceneCreate, SceneEdit, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
+from scas4d_core.engines.choose import gpu_fault
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
@@ -25,7 +26,7 @@ router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 
 def scene_settings(request: SceneCreate) -> Settings:
-    """Returns the settings of the requested preset with the request's changes applied."""
+    """Returns the settings of the requested preset with the changes of the request applied."""
     with setting_problems():
         return preset(request.preset, request.settings)
 
@@ -45,7 +46,7 @@ def setting_problems() -> Iterator[None]:
 
 
 def check_rig(request: SceneCreate, settings: Settings) -> None:
-    """Raises `Problem` if the settings do not fit the rig, or the unit 'auto' cannot be derived from it."""
+    """Raises `Problem` if the settings do not fit the rig, or the rig does not determine the unit 'auto'."""
     unit, rig = settings.scene.metres_per_unit, request.rig.rig()
     try:
         rig.world_frame(unit)
@@ -65,13 +66,23 @@ def check_nodes(request: SceneCreate, placement: Placement) -> None:
             "this service runs all scenes on its own machine, which has no labels",
             field="nodes",
             value=request.nodes,
-            remedy="leave it out, or run the service on a cluster: scas4d serve --placement ray",
+            remedy="omit it, or run the service on a cluster: scas4d serve --placement ray",
         )
 
 
-def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
-    """Raises `Problem` if the settings do not fit the rig, or the scene would exceed the memory limit."""
+def check_device(settings: Settings, placement: Placement) -> None:
+    """Raises `Problem` if the scene requires a GPU that this machine lacks; other machines are not checked."""
+    if settings.device != "gpu" or placement.has_labels:
+        return
+    if fault := gpu_fault():
+        remedy = "give 'auto' or 'cpu', or see docs/gpu.md"
+        raise Problem(422, f"no GPU can be used: {fault}", field="settings.device", value="gpu", remedy=remedy)
+
+
+def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings, placement: Placement) -> None:
+    """Raises `Problem` if the settings do not fit rig and machine, or the scene would exceed the memory limit."""
     check_rig(request, settings)
+    check_device(settings, placement)
     estimate.refuse_if_too_large(request.rig, settings, server)
 
 
@@ -87,10 +98,10 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 f"camera {camera.name!r} has {pixels} pixels, more than {server.max_image_pixels}",
                 field="rig.cameras",
                 value=f"{camera.width}x{camera.height}",
-                remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
+                remedy="send smaller images with matching intrinsics, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
     check_nodes(request, scenes.placement)
-    check_settings(request, settings, server)
+    check_settings(request, settings, server, scenes.placement)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()
@@ -100,8 +111,8 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 async def listed(scenes: AllScenes, request: Request, response: Response) -> SceneList:
     """Lists all scenes without waking them; a share link lists only its own scene.
 
-    The answer is 503 while scenes of an earlier run are being recovered. On a cluster, the list includes the scenes of
-    the other services. X-Unreachable names the services that do not answer.
+    The response is 503 while scenes of an earlier run are being recovered. On a cluster, the list includes the scenes
+    of the other services. The header X-Unreachable names services that do not respond.
     """
     scenes.recovering.check()
     permission: Permission = request.scope.get(PERMISSION, ALL)
@@ -117,7 +128,7 @@ async def listed(scenes: AllScenes, request: Request, response: Response) -> Sce
 
 @router.get("/{id}")
 async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
-    """Returns the scene's state, progress and queue without waking it."""
+    """Returns the state, progress and queue of the scene without waking it."""
     return scenes.status(id)
 
 
@@ -125,7 +136,7 @@ async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
 async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatus:
     """Renames, archives or unarchives the scene, or changes how many images and states it keeps.
 
-    The change is on disk when the response is sent. A shorter `keep_states` wakes the scene and permanently deletes
+    The change is on disk when the response is sent. Reducing `keep_states` wakes the scene and permanently deletes
     states within seconds.
     """
     async with scenes.use(id, place=request.keep_states is not None or request.exact_states is not None) as scene:
@@ -149,15 +160,15 @@ async def resume(scene: TheScene) -> SceneStatus:
 
 @router.post("/{id}/sleep")
 async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
-    """Stops the processes of an idle scene, which wakes automatically on the next request or frame."""
+    """Stops the processes of an idle scene, which wakes up automatically on the next request or frame."""
     if (scene := scenes.awake.get(id)) is not None:
         if not scene.idle:
             raise Problem(
                 409,
-                "the scene is not idle: frames are waiting, or a request, a page or a sender is connected",
+                "the scene is not idle: frames are waiting, or a request, a viewer or a sender is connected",
                 field="id",
                 value=id,
-                remedy="wait for its frames, and close its pages and senders",
+                remedy="wait until its frames are processed, and disconnect its viewers and senders",
             )
         await scenes.put_to_sleep(scene)
     return scenes.status(id)

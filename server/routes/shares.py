@@ -18,7 +18,7 @@ router = APIRouter(prefix="/v1/shares", tags=["service"])
 
 @router.post("", status_code=201)
 async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings, asked: Request) -> Share:
-    """Creates a read-only token for one scene or for all scenes, and the address at which the viewer shows it.
+    """Creates a read-only token for one scene or all scenes, and a link that opens the viewer with this token.
 
     The token cannot be revoked: it expires, or becomes invalid when the token of the service changes.
     """
@@ -26,7 +26,7 @@ async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings,
     if secret is None:
         raise Problem(
             409,
-            "the service has no token: anyone who can reach it may do everything",
+            "the service has no token: anyone who can reach it has full access",
             field="SCAS4D_TOKEN",
             remedy="start it with SCAS4D_TOKEN; others then need a token or a link",
         )

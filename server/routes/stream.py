@@ -1,4 +1,4 @@
-"""WebSocket route for subscriptions, protocol `scas4d.stream.v1` (docs/stream.md)."""
+"""WebSocket route for subscriptions with the protocol `scas4d.stream.v1` (docs/stream.md)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger("scas4d.server")
 
 @router.websocket("/{id}/stream")
 async def stream(websocket: WebSocket, id: str) -> None:
-    """Streams scene state, finished frames, live views, tracks and parts to which the client subscribes."""
+    """Streams the scene state, finished frames, live views, tracks and parts to which the client subscribes."""
     scenes: Scenes = websocket.app.state.scenes
     hub: Hub = websocket.app.state.hub
     async with contextlib.AsyncExitStack() as held:
@@ -34,7 +34,7 @@ async def stream(websocket: WebSocket, id: str) -> None:
             scene = await held.enter_async_context(scenes.use(id))
             _require_protocol(websocket)
             subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
-        except Problem as problem:  # a normal HTTP response refuses the handshake; browsers see only the failure
+        except Problem as problem:  # an HTTP response refuses the handshake; browsers see only the failure
             await websocket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
         limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` enforces the exact limit
@@ -51,7 +51,7 @@ def _require_protocol(websocket: WebSocket) -> None:
     if STREAM_PROTOCOL not in offered:
         raise Problem(
             400,
-            "the client offers no subprotocol that the service knows",
+            "the client offers no supported subprotocol",
             field="Sec-WebSocket-Protocol",
             value=", ".join(name for name in offered if not name.startswith("scas4d.ticket.")),
             remedy=f"offer {STREAM_PROTOCOL}",
@@ -73,7 +73,7 @@ async def _serve(websocket: WebSocket, subscriber: Subscriber, end: float | None
             task.cancel()
         for ended in await asyncio.gather(reading, writing, return_exceptions=True):
             if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
-                log.error("scene %s: a stream broke", subscriber.scene.id, exc_info=ended)
+                log.error("scene %s: a stream failed", subscriber.scene.id, exc_info=ended)
 
 
 async def _read(websocket: WebSocket, subscriber: Subscriber) -> None:
@@ -84,7 +84,7 @@ async def _read(websocket: WebSocket, subscriber: Subscriber) -> None:
             return
         text = message.get("text")
         if text is not None and len(text) > limit:  # characters, each up to four bytes in UTF-8
-            await websocket.close(TOO_BIG, f"a message of {len(text)} characters; {limit} bytes are taken")
+            await websocket.close(TOO_BIG, f"a message of {len(text)} characters exceeds the limit of {limit} bytes")
             return
         await subscriber.handle_message(text)
 

@@ -13,7 +13,7 @@ router = APIRouter(prefix="/v1/tickets", tags=["service"])
 
 @router.post("", status_code=201)
 async def issue(request: Request) -> Ticket:
-    """Issues a short-lived ticket that opens one WebSocket; the request must carry the token."""
+    """Issues a short-lived ticket that opens one WebSocket; the request must include the token."""
     tickets: Tickets = request.app.state.tickets
     ticket = tickets.issue(request.scope.get(PERMISSION, ALL))
     return Ticket(ticket=ticket, subprotocol=SUBPROTOCOL + ticket, seconds=TICKET_SECONDS)

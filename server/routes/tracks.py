@@ -1,4 +1,4 @@
-"""Routes of point tracks; docs/tracks.md describes the answers."""
+"""Routes for point tracks; docs/tracks.md describes the responses."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
 
 Many = Annotated[list[str] | None, Query(max_length=1024)]
 ANSWERS: dict[int | str, dict[str, Any]] = {
-    200: {"model": TracksModel, "content": {"application/vnd.numpy.npz": {}}, "description": "As JSON or npz."}
+    200: {"model": TracksModel, "content": {"application/vnd.numpy.npz": {}}, "description": "Tracks as JSON or npz."}
 }
 
 
 @router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
 async def query(scene: TheScene, http: Request, request: TracksRequest) -> Response:
-    """Returns world-space trajectories of Gaussians given by id, of pixels, or of 3D points."""
+    """Returns world-space trajectories of Gaussians, given by id, or of pixels or 3D points."""
     return await answer(http, scene, request)
 
 
@@ -32,24 +32,24 @@ async def tracks(
     scene: TheScene,
     http: Request,
     ids: Annotated[str | None, Query(max_length=10_000, description="Ids of Gaussians, separated by commas.")] = None,
-    pixel: Annotated[Many, Query(description="u,v in the picture of `camera`; may be repeated.")] = None,
+    pixel: Annotated[Many, Query(description="u,v in the image of `camera`; may be repeated.")] = None,
     camera: Annotated[
-        str | None, Query(max_length=64, description="Name of the rig's camera that the pixels belong to.")
+        str | None, Query(max_length=64, description="Name of the camera of the rig in which pixels are given.")
     ] = None,
     point: Annotated[Many, Query(description="x,y,z in the rig's world and units; may be repeated.")] = None,
     at: Annotated[
-        int | None, Query(ge=0, description="Frame of the pixels or points; by default the first committed frame.")
+        int | None, Query(ge=0, description="Frame of the pixels or points; the first committed frame by default.")
     ] = None,
     first: Annotated[
-        int | None, Query(alias="from", ge=0, description="First frame; by default the first committed frame.")
+        int | None, Query(alias="from", ge=0, description="First frame; the first committed frame by default.")
     ] = None,
     last: Annotated[
-        int | None, Query(alias="to", ge=0, description="Last frame, inclusive; by default the last committed frame.")
+        int | None, Query(alias="to", ge=0, description="Last frame, inclusive; the last committed frame by default.")
     ] = None,
-    project: Annotated[Many, Query(max_length=64, description="Cameras of the rig to project into.")] = None,
+    project: Annotated[Many, Query(max_length=64, description="Cameras to project the tracks into.")] = None,
     format: Literal["json", "npz"] = "json",
 ) -> Response:
-    """Returns a few trajectories, requested in the query string."""
+    """Returns trajectories like `POST …/tracks/query`, for a few points given in the query string."""
     request = TracksRequest(
         ids=ids_in(ids) if ids else None,
         pixels=_numbers(pixel, "pixel", 2) if pixel else None,
@@ -65,13 +65,13 @@ async def tracks(
 
 
 async def answer(http: Request, scene: Scene, request: TracksRequest) -> Response:
-    """Returns the response of the readers to a validated track request."""
+    """Returns the readers' answer to a validated track request."""
     response = await ask(http, scene, tracks_query(scene, request))
     return Response(response.body, media_type=response.media_type)
 
 
 def ids_in(text: str) -> list[int]:
-    """Returns the ids in a comma-separated query parameter."""
+    """Parses the ids in a comma-separated query parameter."""
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
@@ -80,7 +80,7 @@ def ids_in(text: str) -> list[int]:
             "ids must be whole numbers",
             field="ids",
             value=text,
-            remedy="separate them by commas: ids=3,17,2048",
+            remedy="separate ids by commas, such as ids=3,17,2048",
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""Routes of the trade-off between accuracy and update time of a scene on its machine."""
+"""Routes for the trade-off between accuracy and update time of a scene on its machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
 @router.get("/{id}/tradeoff")
 async def get(scene: TheRecord) -> TradeoffModel:
-    """Returns pairs of accuracy and time: measured in the newest 64 frames, replayed, or extrapolated in time."""
+    """Returns pairs of accuracy and time: measured in the newest 64 frames, replayed, or with extrapolated times."""
     return await answer(scene)
 
 
@@ -22,8 +22,8 @@ async def get(scene: TheRecord) -> TradeoffModel:
 async def replay(scene: TheScene, request: ReplayRequest | None = None) -> TradeoffModel:
     """Measures other iteration counts by replaying the updates of the newest frames in the background, in memory.
 
-    A scene runs one replay at a time, on one thread at low priority. The scene's own iteration count is also measured,
-    so that the ratios are comparable. The field `replay` reports the progress.
+    A scene runs one replay at a time, on one low-priority thread. The iteration count of the scene is also measured,
+    so that ratios are comparable. The field `replay` reports the progress.
     """
     scene.replays.start(request or ReplayRequest())
     return await answer(scene)

@@ -1,4 +1,4 @@
-"""Routes of the viewer: static files without a build step or external resources."""
+"""Routes for the viewer: static files without a build step or external resources."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ FILES = {
     for file in FOLDER.rglob("*")
     if file.suffix in MEDIA_TYPES and file.parent.name != "player"  # used by `scas4d export --player` only
 }
-"""Files that are served, by name; all other names are refused."""
-HEADERS = security_headers(worker_src="'self'")  # prevents script injection through names of rigs or scenes
+"""Served files, keyed by name; all other names are refused."""
+HEADERS = security_headers(worker_src="'self'")  # prevent script injection through names of rigs or scenes
 
 
 @router.get("/")

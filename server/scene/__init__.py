@@ -1,1 +1,1 @@
-"""Life cycle of a scene: creation, status, sleep, replays, exports, reconstruction restart and deletion."""
+"""Life cycle of scenes: creation, status, sleep, replays, exports, restart of the reconstruction, and deletion."""

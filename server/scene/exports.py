@@ -1,7 +1,7 @@
-"""Scene exports, which run one at a time in a separate process; their files expire after a day.
+"""Exports of scenes, which run one at a time in a separate process; their files expire after a day.
 
-Exports are tracked only in memory, while their files are in the data folder, so leftovers of an earlier service are
-removed at startup. An export does not wake a sleeping scene, because it reads only the scene's folder.
+Exports are tracked in memory only, but their files are in the data folder. Files left by an earlier run of the service
+are therefore removed at startup. An export does not wake a sleeping scene, because it reads only the scene's folder.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from server.storage.disk import free_bytes
 from server.storage.layout import DataFolder
 
 MAX_WAITING = 16
-"""Maximum number of unfinished exports of all scenes; further requests get 429."""
+"""Maximum number of unfinished exports across all scenes; further requests get 429."""
 MAX_PER_SCENE = 8
 """Maximum number of waiting, running and finished exports per scene; further requests get 409.
 
-The same number of failed or cancelled exports is remembered.
+Equally many failed or cancelled exports are remembered.
 """
 KEEP_S = 24 * 3600.0
-"""Seconds for which the file of an export is kept."""
+"""Seconds for which an exported file is kept."""
 BYTES_PER_GAUSSIAN = {"ply": 68, "splat": 32, "spz": 20, "spz4": 20, "glb": 70, "usd": 120, "tracks": 60, "s4d": 12}
-"""Approximate bytes per Gaussian and frame, without view-dependent colour; other formats are small.
+"""Approximate bytes per Gaussian and frame of each format, without view-dependent colour; other formats are small.
 
-USD temporarily needs twice its size.
+Writing USD temporarily takes twice the size.
 """
 MEDIA_TYPES = {".zip": "application/zip", ".glb": "model/gltf-binary", ".csv": "text/csv"}
 FINAL_STATES = frozenset({ExportState.DONE, ExportState.FAILED, ExportState.CANCELLED})
@@ -55,15 +55,15 @@ class Export:
 
     Attributes:
         id: export ID.
-        spec: specification for the export process.
+        spec: specification passed to the export process.
         name: suggested name for the downloaded file.
-        created: time of the request.
+        created: time at which the export was requested.
         state: current state.
-        done: number of exported frames.
-        size: bytes on disk.
-        error: reason of a failure, or None.
+        done: number of frames exported so far.
+        size: size on disk in bytes.
+        error: reason for a failure, or None.
         ended: time at which the export finished, or None.
-        timer: timer that removes the export.
+        timer: timer that removes the finished export when it expires.
         task: task that runs the export.
     """
 
@@ -86,11 +86,11 @@ class Export:
 
     @property
     def media_type(self) -> str:
-        """Media type of the file."""
+        """Media type of the exported file."""
         return MEDIA_TYPES.get(self.spec.file.suffix, "application/octet-stream")
 
     def model(self) -> ExportModel:
-        """Returns the API model of the export."""
+        """Returns the export as a model of the HTTP API."""
         place = f"/v1/scenes/{self.scene}/exports/{self.id}"
         return ExportModel.model_validate(
             {
@@ -113,11 +113,11 @@ class Export:
 
 
 class Exports:
-    """All exports of the service. All methods run on the event loop.
+    """All exports of the service. Its methods must be called on the event loop.
 
     Args:
-        scenes: scenes of the service.
-        placement: placement that starts the processes.
+        scenes: registry of the service's scenes.
+        placement: starts the export processes.
     """
 
     def __init__(self, scenes: Scenes, placement: Placement) -> None:
@@ -128,14 +128,14 @@ class Exports:
         self._known: dict[str, dict[str, Export]] = {}
 
     async def open(self) -> None:
-        """Removes leftovers of an earlier service; the caller must hold the lock of the data folder."""
+        """Removes files left by an earlier run of the service; the caller must hold the lock of the data folder."""
         await asyncio.to_thread(shutil.rmtree, self._folder, ignore_errors=True)
 
     def of(self, scene: str) -> list[Export]:
         """Returns the exports of a scene, oldest first.
 
         Raises:
-            Problem: 404 or 503, the scene does not exist or is not available yet.
+            Problem: 404 if the scene does not exist; 503 if it is not available yet.
         """
         self._scenes.status(scene)
         return list(self._known.get(scene, {}).values())
@@ -144,12 +144,12 @@ class Exports:
         """Returns an export by its ID.
 
         Raises:
-            Problem: 404, the export does not exist.
+            Problem: 404 if the export does not exist.
         """
         self._scenes.status(scene)
         known_export = self._known.get(scene, {}).get(export)
         if known_export is None:
-            remedy = f"GET /v1/scenes/{scene}/exports lists them; ask for a new one where it was removed"
+            remedy = f"GET /v1/scenes/{scene}/exports lists the exports; request a new one if it was removed"
             raise Problem(404, f"the scene has no export {export!r}", field="export", value=export, remedy=remedy)
         return known_export
 
@@ -157,8 +157,8 @@ class Exports:
         """Queues an export of committed frames.
 
         Raises:
-            Problem: 409, the scene has too many exports; 429, too many are waiting; 507, there is too little disk
-                space.
+            Problem: 409 if the scene has too many exports; 429 if too many exports are waiting; 507 if there is not
+                enough disk space.
         """
         self._scenes.check_current(scene)
         self._check(scene, request, len(frames))
@@ -186,10 +186,10 @@ class Exports:
         if len(waiting) >= MAX_WAITING:
             raise Problem(
                 429,
-                f"{count_noun(len(waiting), 'export')} of the service not finished",
+                f"the service already has {count_noun(len(waiting), 'unfinished export')}, the maximum",
                 field="id",
                 value=id,
-                remedy="try again when one is finished",
+                remedy="try again after one has finished",
                 headers={"Retry-After": "10"},
             )
         kept = [
@@ -200,10 +200,10 @@ class Exports:
         if len(kept) >= MAX_PER_SCENE:
             raise Problem(
                 409,
-                f"the scene has {count_noun(len(kept), 'export')}, the maximum",
+                f"the scene already has {count_noun(len(kept), 'export')}, the maximum",
                 field="id",
                 value=id,
-                remedy=f"remove one: DELETE /v1/scenes/{id}/exports/EXPORT, as {kept[0].id}",
+                remedy=f"remove one: DELETE /v1/scenes/{id}/exports/EXPORT, such as {kept[0].id}",
             )
         parent = self._folder.parent
         needed = (
@@ -213,15 +213,15 @@ class Exports:
         if (free := free_bytes(parent)) < needed:
             raise Problem(
                 507,
-                f"the disk has {free / 1e6:.0f} MB free, and {exporter.RESERVE_BYTES / 1e6:.0f} MB of it are left to "
-                f"frames; the export takes about {(needed - exporter.RESERVE_BYTES) / 1e6:.1f} MB",
+                f"the disk has {free / 1e6:.0f} MB free, of which {exporter.RESERVE_BYTES / 1e6:.0f} MB are reserved "
+                f"for frames; the export takes about {(needed - exporter.RESERVE_BYTES) / 1e6:.1f} MB",
                 field="last",
                 value=frames,
-                remedy="export fewer frames, a smaller format (spz, s4d), or remove finished exports",
+                remedy="export fewer frames, choose a smaller format (spz, s4d), or remove finished exports",
             )
 
     async def _run_in_turn(self, export: Export) -> None:
-        """Waits for its turn, runs the export process and records the outcome."""
+        """Waits for the export's turn, runs its process and records the outcome."""
         folder, fault = export.spec.file.parent, None
         try:
             async with self._turns:
@@ -248,7 +248,7 @@ class Exports:
             self._drop(one)
 
     async def _run_process(self, export: Export) -> str | None:
-        """Runs the process of an export and returns the reason of a failure, or None."""
+        """Runs the process of an export and returns the reason for a failure, or None on success."""
         ended: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
 
         def end(fault: str | None) -> None:
@@ -256,7 +256,7 @@ class Exports:
                 ended.set_result(fault)
 
         def gone(reason: ProcessExit) -> None:
-            end(f"the export is gone: {reason}")
+            end(f"the export process exited: {reason}")
 
         process = self._placement.start(exporter.main, export.spec, partial(self._on_message, export, end), gone)
         try:
@@ -293,7 +293,7 @@ class Exports:
         """Cancels a waiting or running export, or removes a finished one and its file.
 
         Raises:
-            Problem: 404, the export does not exist.
+            Problem: 404 if the export does not exist.
         """
         removed = self.get(scene, export)
         if removed.state in FINAL_STATES:
@@ -310,7 +310,7 @@ class Exports:
         await self._remove_files(self._folder / scene)
 
     async def stop(self) -> None:
-        """Stops all export processes; their files are removed at the next startup."""
+        """Stops all export processes; their files will be removed at the next startup."""
         for known in list(self._known.values()):
             for export in list(known.values()):
                 await self._cancel(export)
@@ -323,7 +323,7 @@ class Exports:
             export.task.cancel()
             await asyncio.wait({export.task})
         if export.state not in FINAL_STATES:  # otherwise it finished before the cancellation
-            self._finish(export, ExportState.CANCELLED, "it was cancelled")
+            self._finish(export, ExportState.CANCELLED, "the export was cancelled")
             await self._remove_files(export.spec.file.parent)
 
     async def _remove_files(self, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Restart of a scene's reconstruction: checks the request, builds its event and journals it."""
+"""Restart of a scene's reconstruction: validates the request, and builds and journals the event."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger("scas4d.server")
 
 
 def restart_remedy(ledger: Ledger) -> str:
-    """Returns the remedy for a failed scene: a restart of its reconstruction."""
+    """Returns the remedy for a failed scene, which is to restart its reconstruction."""
     number = ledger.reconstruction + 1
     return (
         f"restart its reconstruction: PUT /v1/scenes/{ledger.scene}/reconstructions/{number}, "
@@ -33,19 +33,19 @@ def restart_remedy(ledger: Ledger) -> str:
 
 
 def restarting_problem(id: str) -> Problem:
-    """Returns the 503 response for a scene whose reconstruction is being restarted."""
-    fault = "the reconstruction of this scene is being begun anew"
-    return Problem(503, fault, field="id", value=id, remedy="ask again", headers={"Retry-After": "1"})
+    """Returns the 503 problem for a scene whose reconstruction is being restarted."""
+    fault = "the reconstruction of this scene is being restarted"
+    return Problem(503, fault, field="id", value=id, remedy="try again", headers={"Retry-After": "1"})
 
 
 @dataclass(frozen=True)
 class NewReconstruction:
-    """Reconstruction that will replace the current one.
+    """Reconstruction that will replace the current one of a scene.
 
     Args:
         number: number of the new reconstruction.
-        request: restart request.
-        settings: validated settings of the scene with the request's changes.
+        request: request to restart the reconstruction.
+        settings: validated scene settings, including the changes in the request.
         rig: rig of the scene.
     """
 
@@ -62,8 +62,9 @@ class NewReconstruction:
             folder: current folder of the scene.
 
         Raises:
-            Problem: 409, another number is next, the reconstruction cannot start with the frame, the scene is archived,
-                or committed frames would be discarded without consent; 422, depth cannot be determined.
+            Problem: 409 if `number` is not the next number, the reconstruction cannot start with the requested frame,
+                the scene is archived, or committed frames would be discarded without consent; 422 if depth cannot be
+                determined.
         """
         if self._is_repeated(ledger):
             return None
@@ -80,7 +81,7 @@ class NewReconstruction:
         if count > 1 and not self.request.discard:
             raise Problem(
                 409,
-                f"the states of {count_noun(count, 'committed frame')} would be discarded",
+                f"a restart would discard the states of {count_noun(count, 'committed frame')}",
                 field="discard",
                 value=False,
                 remedy="set discard to true (begin-again --discard) to discard them, or create another scene",
@@ -107,13 +108,13 @@ class NewReconstruction:
         if self.number == now and ledger.begun is not None and ledger.begun.request == self.request:
             return True
         if self.number != now + 1:
-            reason = "has begun already" if self.number <= now else "comes after another one"
+            reason = "has already started" if self.number <= now else "is not the next one"
             raise Problem(
                 409,
-                f"reconstruction {self.number} {reason}: the scene's is {now}",
+                f"reconstruction {self.number} {reason}: the current one is {now}",
                 field="n",
                 value=self.number,
-                remedy=f"begin reconstruction {now + 1}",
+                remedy=f"start reconstruction {now + 1}",
                 expected=now + 1,
             )
         return False
@@ -129,32 +130,32 @@ class NewReconstruction:
             return index
         fault = f"frame {index} is {entry.state}"
         if _takes_part(entry):
-            fault = f"the pictures of frame {index} are deleted"
+            fault = f"the pictures of frame {index} were deleted"
         held = next((other.index for other in frames.with_pictures() if _takes_part(other)), None)
-        remedy = f"begin with the next frame that comes, {ledger.next_frame}"
+        remedy = f"start with the next frame to arrive, {ledger.next_frame}"
         if held is not None:
-            remedy = f"begin with frame {held}, the first whose pictures are held, or with the next that comes, "
+            remedy = f"start with frame {held}, the first whose pictures are available, or with the next to arrive, "
             remedy += f"{ledger.next_frame}"
         raise Problem(
             409,
             fault,
             field="frame",
             value=index,
-            remedy=f"{remedy}; ingest.keep_frames of a scene says how many are kept",
+            remedy=f"{remedy}; ingest.keep_frames of a scene sets how many are kept",
             expected=ledger.next_frame if held is None else held,
         )
 
 
 async def journal_new_reconstruction(folder: SceneFolder, beginning: NewReconstruction) -> list[str]:
-    """Journals the restart of a stopped scene after checking the request again.
+    """Journals the restart of a stopped scene after validating the request again.
 
-    The second check is necessary because a frame may have been committed since the first one.
+    The second validation is necessary because another frame may have been committed since the first one.
 
     Returns:
-        One message per fault found in the folder.
+        One message for each fault found in the folder.
 
     Raises:
-        Problem: see `NewReconstruction.event`; 507, the disk is full.
+        Problem: see `NewReconstruction.event`; 507 if the disk is full.
     """
     definition, _ = await asyncio.to_thread(read_definition, folder)
     recovered = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
@@ -169,10 +170,10 @@ async def journal_new_reconstruction(folder: SceneFolder, beginning: NewReconstr
         raise
     finally:
         await journal.close()
-    log.warning("scene %s begins reconstruction %d with frame %d", folder.name, event.number, event.index)
+    log.warning("scene %s: starting reconstruction %d with frame %d", folder.name, event.number, event.index)
     return recovered.damage
 
 
 def _takes_part(entry: FrameEntry) -> bool:
-    """Returns whether the frame was acknowledged and takes part in reconstructions."""
+    """Returns whether the frame was acknowledged and can be reconstructed."""
     return entry.receipt is not None and entry.state not in (FrameState.MISSING, FrameState.SKIPPED)

@@ -1,4 +1,4 @@
-"""Replays of a scene's newest frames with other budgets, one at a time; the results stay in memory."""
+"""Replays of a scene's newest frames with other budgets, one at a time; the results are kept in memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from server.scene.status import effective_budget
 from server.storage.ledger import Ledger
 
 KEPT = 32
-"""Maximum number of trade-off points kept; the oldest measurements are dropped."""
+"""Maximum number of trade-off points to keep; the oldest measurements are dropped."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -27,13 +27,13 @@ class Replays:
     Args:
         spec: specification of the scene.
         ledger: ledger of the scene.
-        placement: placement that starts the replay processes.
-        damaged: called with unreadable files, as a mapping from name to reason.
+        placement: starts the replay processes.
+        damaged: called with a mapping from the name of each unreadable file to the reason.
         background: background tasks of the scene.
 
     Attributes:
         status: status of the newest replay.
-        points: latest measurement per number of iterations. The milliseconds exclude the time to write a commit.
+        points: latest measurement for each number of iterations. The times exclude writing the commit.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Replays:
         """Starts a replay in a separate process.
 
         Raises:
-            Problem: 409, a replay is already running, or the frames, their images or the preceding state are not
+            Problem: 409 if a replay is already running, or if the frames, their images or the preceding state are not
                 available.
         """
         id = self._ledger.scene
@@ -97,16 +97,16 @@ class Replays:
         )
 
     def _chosen(self, count: int) -> tuple[int, list[int]]:
-        """Returns the commit to start from and the frames after it, the first of which is the warm-up."""
+        """Returns the committed frame to start from and the frames to replay, the first of which is the warm-up."""
         committed, frames = self._ledger.committed, self._ledger.frames
         if len(committed) < count + 2:
             raise Problem(
                 409,
-                f"{count_noun(len(committed), 'committed state')} can be read, {count + 2} are needed: the one to "
-                f"start from, one to warm up, and {count_noun(count, 'frame')} that count",
+                f"{count_noun(len(committed), 'committed state')} available, but {count + 2} are needed: one to start "
+                f"from, one to warm up, and {count_noun(count, 'frame')} to measure",
                 field="frames",
                 value=count,
-                remedy="try again when more frames are committed, or for fewer frames (ingest.keep_states says how "
+                remedy="try again when more frames are committed, or request fewer frames (ingest.keep_states sets how "
                 "many states are kept)",
             )
         base, indices = committed[-count - 2], list(committed[-count - 1 :])
@@ -114,20 +114,20 @@ class Replays:
         if gone:
             raise Problem(
                 409,
-                f"the state of frame {gone[-1]} is deleted: the {len(indices)} frames after it cannot start",
+                f"the state of frame {gone[-1]} was deleted, so the last {len(indices)} frames cannot be replayed",
                 field="frames",
                 value=count,
-                remedy="ask for fewer frames, or create scenes that keep more states (ingest.keep_states)",
+                remedy="request fewer frames, or create scenes that keep more states (ingest.keep_states)",
             )
         bare = [index for index in indices if not frames[index].files]
         if bare:
             held = len(indices) - 1 - indices.index(bare[-1])
             raise Problem(
                 409,
-                f"the pictures of frame {bare[-1]} are no longer kept",
+                f"the pictures of frame {bare[-1]} were deleted",
                 field="frames",
                 value=count,
-                remedy=(f"ask for at most {count_noun(held - 1, 'frame')}, or " if held > 1 else "")
+                remedy=(f"request at most {count_noun(held - 1, 'frame')}, or " if held > 1 else "")
                 + "create scenes that keep more pictures (ingest.keep_frames)",
             )
         return base, indices
@@ -135,7 +135,7 @@ class Replays:
     def _own_iterations(self) -> int:
         """Returns the number of iterations that the scene currently runs per update.
 
-        This is the budgeted number, or, with a time budget, the number that fitted into it most recently. Degraded
+        This is the number in the budget or, under a time budget, the number that the latest update reached. Degraded
         frames are ignored.
         """
         budget = effective_budget(self._spec.settings, self._ledger.budgets[-1][1])
@@ -181,7 +181,7 @@ class Replays:
     def _on_end(self, life: object, reason: ProcessExit) -> None:
         if life is self._life:
             self._process = None
-            self._finish(f"the replay is gone: {reason}")
+            self._finish(f"the replay process exited: {reason}")
 
     def _finish(self, fault: str | None) -> None:
         self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED
@@ -194,14 +194,14 @@ class Replays:
             self._background.run(process.stop(1.0))
 
     async def end(self) -> None:
-        """Stops the running replay on request, if any, and keeps the points measured so far."""
+        """Stops the running replay, if any, at a client's request and keeps the points measured so far."""
         if self._process is None:
             return
         await self.stop()
-        self.status.state, self.status.error = ReplayState.FAILED, "it was ended on request"
+        self.status.state, self.status.error = ReplayState.FAILED, "the replay was stopped on request"
 
     async def stop(self) -> None:
-        """Stops the running replay, if any, when the scene stops."""
+        """Stops the running replay, if any, because the scene is stopping."""
         self._life = None
         process, self._process = self._process, None
         if process is not None:

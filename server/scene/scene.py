@@ -1,4 +1,4 @@
-"""Scene: connects log, ingest, updates and readers, and answers queries. All methods run on the event loop."""
+"""Scene that connects its log, ingest, updates and readers, and answers queries about its state."""
 
 from __future__ import annotations
 
@@ -42,30 +42,30 @@ log = logging.getLogger("scas4d.server")
 
 
 class Scene:
-    """Reconstruction of one rig.
+    """Scene in memory, with the frames of one rig and their reconstruction. All methods run on the event loop.
 
-    Frames are numbered from 0 without gaps. A frame is acknowledged, waits in a bounded queue, and is finally
-    committed, failed, missing or skipped. The ledger contains the state of all frames, and acknowledged changes are
-    journalled first.
+    Frames are numbered from 0 without gaps. A frame is acknowledged, waits in a bounded queue, and ends up committed,
+    failed, missing or skipped. The ledger contains the state of all frames. Changes are journalled before they are
+    acknowledged.
 
     A frame passes through the following steps. `Ingest.acknowledge` journals it, `Updates.begin` sends it to the
     worker, `Updates._commit` records the commit, and `Publisher.publish_frame` publishes its report.
 
     Args:
-        found: scene as stored in its folder, also for a new scene.
+        found: scene as stored in its folder, which also exists for a new scene.
         server: settings of the service.
-        placement: placement that starts the scene's processes.
-        hub: hub that publishes the scene's events.
+        placement: starts the scene's processes.
+        hub: publishes the scene's events.
 
     Attributes:
         has_place: whether the scene has a slot and may have processes; otherwise, it is asleep.
         users: number of active requests and connections.
-        used: end of the last request or connection, from `time.monotonic`.
+        used: time at which the last request or connection ended, from `time.monotonic`.
         log: journal, ledger and frame log.
         ingest: ingest of complete frames.
         open_frames: ingest of frames sent camera by camera.
-        updates: updates of the scene.
-        repair_queue: repair queue for damaged files.
+        updates: scheduler of the scene's updates.
+        repair_queue: queue of damaged files to repair.
         readers: reader processes that answer queries.
         replays: replays of the newest frames.
         points_sha256: SHA-256 of the uploaded initial point cloud, or None.
@@ -152,7 +152,7 @@ class Scene:
         self._background.run(scrub.run(), endless=True)
 
     def _check_start(self) -> None:
-        """Raises Problem (422) if the scene cannot start because depth cannot be determined."""
+        """Raises `Problem` (422) if the scene cannot start because depth cannot be determined."""
         try:
             check_start(self.rig, self.points_sha256 is not None)
         except RigError as error:
@@ -162,12 +162,12 @@ class Scene:
 
     @property
     def frames(self) -> FrameTable:
-        """All closed frames, by index."""
+        """Table of all closed frames, keyed by index."""
         return self.ledger.frames
 
     @property
     def committed(self) -> Sequence[int]:
-        """Indices of frames with a readable committed state, in ascending order."""
+        """Indices of the frames with a readable committed state, in ascending order."""
         return self.ledger.committed
 
     @property
@@ -223,7 +223,7 @@ class Scene:
         """Checks that a frame's state is readable and returns its index; None selects the last committed frame.
 
         Raises:
-            Problem: 404 or 409, there is no readable state; 503, the state is being recomputed.
+            Problem: 404 or 409 if there is no readable state; 503 if the state is being recomputed.
         """
         frames = self.ledger.frames
         if not frames.committed:
@@ -246,11 +246,11 @@ class Scene:
                 remedy="try again, or request another frame",
                 headers={"Retry-After": "2"},
             )
-        other = f"ask for a committed frame, {frames.committed[0]} to {frames.committed[-1]}"
+        other = f"request a committed frame, {frames.committed[0]} to {frames.committed[-1]}"
         if entry is not None and entry.deleted and entry.error is not None:
             raise Problem(404, entry.error, field=field, value=index, remedy=other)
         if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
-            reason = "not here" if entry is None else entry.state.value
+            reason = "unknown" if entry is None else entry.state.value
             if entry is not None and entry.deleted:
                 reason = "deleted by the scene's retention"
             raise Problem(
@@ -267,7 +267,7 @@ class Scene:
         return await self._reports.of(index)
 
     def budget(self) -> SceneBudget:
-        """Returns the budget of frames whose update has not started."""
+        """Returns the budget for the next frame whose update starts."""
         since, asked = self.ledger.budgets[-1]
         effective = effective_budget(self.spec.settings, asked)
         return SceneBudget(scene=self.id, requested=asked, effective=effective, since=since)
@@ -275,12 +275,12 @@ class Scene:
     # Changes.
 
     async def set_budget(self, budget: Budget) -> None:
-        """Sets the budget from the first frame on whose update has not started.
+        """Sets the budget for all frames whose update has not started.
 
-        No update starts while the change is journalled.
+        No update starts while the change is being journalled.
 
         Raises:
-            Problem: 409 for a failed scene; 507 if the disk is full.
+            Problem: 409 if the scene has failed; 507 if the disk is full.
         """
 
         async def journal_budget() -> None:
@@ -308,7 +308,7 @@ class Scene:
         """Changes the name, archive flag or retention rules; the changes survive a service restart.
 
         Raises:
-            Problem: 409, the scene cannot be archived because frames are unfinished; 507, the disk is full.
+            Problem: 409 if the scene cannot be archived because frames are unfinished; 507 if the disk is full.
         """
 
         async def change() -> None:
@@ -328,19 +328,19 @@ class Scene:
         if waiting and self.ledger.fatal is None:
             raise Problem(
                 409,
-                f"{count_noun(waiting, 'frame')} of the scene unfinished",
+                f"the scene has {count_noun(waiting, 'unfinished frame')}",
                 field="archived",
                 value=True,
-                remedy="wait until `queued` and `open_frames` of its status are empty (POST …/resume if it is paused)",
+                remedy="wait until `queued` and `open_frames` in its status are empty (POST …/resume if it is paused)",
             )
 
     def start(self) -> None:
-        """Starts the processes in advance, so that the first frame and view of a new scene are not delayed."""
+        """Starts the processes early, so that the first frame and view of a new scene are not delayed."""
         self.updates.worker.start()
         self.readers.start()
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """Stops the scene's processes, which have `seconds` to exit by themselves; the folder is kept."""
+        """Stops the scene's processes, killing those that do not exit within `seconds`; the folder is kept."""
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
@@ -351,11 +351,11 @@ class Scene:
     # Events.
 
     def _all_events(self) -> Iterator[JournalEvent]:
-        """Returns all known events as a snapshot for `Journal`."""
+        """Returns a snapshot of all known events, from which `Journal` can rewrite itself."""
         return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
 
     def _journal_renewed(self, fault: str) -> None:
-        self._damage.add(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
+        self._damage.add(DamageKind.JOURNAL, f"{fault}; the journal was rewritten from memory")
         self._publisher.publish_status()
 
     def _failed(self, error: BaseException) -> None:

@@ -1,4 +1,4 @@
-"""Registry of all scenes: creates, wakes, restarts and deletes them, safe against power failures at any point."""
+"""Registry of all scenes, which creates, wakes, restarts and deletes them; a power failure at any point is safe."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Scenes:
     Attributes:
         awake: scenes that are in memory, with or without a slot for processes, by ID.
         asleep: all other recovered scenes, by ID.
-        recovering: scenes found at startup that are not recovered yet.
-        unreadable: folders whose scene cannot be read, with the reason; they are left unchanged.
+        recovering: recovery of the scenes that were found at startup.
+        unreadable: reason for each scene folder that cannot be read, keyed by scene ID; the folders are left unchanged.
     """
 
     def __init__(self, server: ServerSettings, placement: Placement, hub: Hub) -> None:
@@ -61,7 +61,7 @@ class Scenes:
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
-        """Locks the data folder, finds its scenes and recovers them in the background.
+        """Locks the data folder, finds its scenes and starts to recover them.
 
         Recovery runs in the background because a journal may cover a whole day.
 
@@ -101,14 +101,14 @@ class Scenes:
 
     @asynccontextmanager
     async def use(self, id: str, *, place: bool = True) -> AsyncIterator[Scene]:
-        """Yields a scene for a request or a connection; wakes it if necessary and keeps it awake inside the context.
+        """Yields a scene for a request or a connection, waking it if necessary and keeping it awake inside the context.
 
         Args:
             id: scene ID.
             place: whether to give the scene a slot for processes; requests that need no processes pass False.
 
         Raises:
-            Problem: see `refuse`; 429, the scene needs a slot and none is free.
+            Problem: see `refuse`; 429 if the scene needs a slot and none can be freed.
         """
         scene = await self._awake(id, place)
         scene.users += 1
@@ -137,10 +137,10 @@ class Scenes:
         return self.server.max_scenes - sum(scene.has_place for scene in self.awake.values()) - self._promised
 
     async def _reserve_place(self) -> None:
-        """Reserves a slot for a scene and puts an idle scene to sleep if none is free.
+        """Reserves a slot for a scene, putting an idle scene to sleep if no slot is free.
 
         Raises:
-            Problem: 429, no scene is idle.
+            Problem: 429 if no slot is free and no scene is idle.
         """
         while self._free_places <= 0:
             if falling := [id for id in self._turns if id in self.awake]:
@@ -150,7 +150,7 @@ class Scenes:
         self._promised += 1
 
     async def put_to_sleep(self, scene: Scene) -> None:
-        """Stops the processes of a scene and releases its slot if it is still idle; its folder has all its data."""
+        """Stops a scene's processes and releases its slot if it is still idle; all its data is in its folder."""
         if self.awake.get(scene.id) is scene and scene.id not in self._turns and scene.idle:
             self._turns.begin(scene.id, self._fall_asleep(scene))
         await self._turns.end(scene.id)
@@ -160,10 +160,10 @@ class Scenes:
         try:
             await scene.stop()
             await asyncio.to_thread(write_status_cache, scene.spec.folder, status)
-        except Exception:  # the folder has all data of the scene
-            log.exception("scene %s did not end properly", scene.id)
+        except Exception:  # harmless: all data of the scene is in its folder
+            log.exception("scene %s did not stop properly", scene.id)
         del self.awake[scene.id]
-        log.info("scene %s sleeps", scene.id)
+        log.info("scene %s fell asleep", scene.id)
 
     def _note_asleep(self, status: SceneStatus) -> None:
         self.asleep[status.id] = SleepingScene(status.id, datetime.fromisoformat(status.created), status)
@@ -174,7 +174,7 @@ class Scenes:
         del self.asleep[id]
 
     async def _put_idle_to_sleep(self) -> None:
-        """Periodically puts scenes to sleep that have been idle long enough."""
+        """Periodically puts to sleep the scenes that have been idle long enough."""
         while (seconds := sleep.check_interval(self.server)) is not None:
             await asyncio.sleep(seconds)
             for scene in sleep.idle_scenes(tuple(self.awake.values()), self.server):
@@ -184,14 +184,15 @@ class Scenes:
                     log.exception("scene %s did not fall asleep", scene.id)
 
     async def _register_stored(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
-        """Registers a stored scene, awake or asleep; returns False and records the reason if it cannot be read.
+        """Registers a stored scene as awake or asleep; returns False and records the reason if it cannot be read.
 
-        A scene with pending work always gets a slot, even above the limit. A recently used scene gets one if available.
+        A scene with pending work always gets a slot, even beyond the limit. A recently used scene gets one if one is
+        free.
 
         Args:
             folder: folder of the scene.
             said: messages about damage that was found earlier.
-            wake: whether to load the scene into memory in any case.
+            wake: whether to load the scene into memory even if it would be asleep.
         """
         try:
             if (
@@ -216,33 +217,33 @@ class Scenes:
             known = isinstance(error, DefinitionError | OSError)
             reason = message_of(error) if known else f"the service failed: {type(error).__name__}: {message_of(error)}"
             self.unreadable[folder.name] = reason
-            log.error("folder %s was left unchanged: %s", folder.path, reason, exc_info=None if known else error)
+            log.error("folder %s cannot be read: %s", folder.path, reason, exc_info=None if known else error)
             return False
         for sentence in restored.content.damage:
             if sentence not in said:
                 log.warning("scene %s: %s", folder.name, sentence)
         return True
 
-    # Restarted reconstructions.
+    # Restart of reconstructions.
 
     def check_current(self, scene: Scene) -> None:
         """Refuses a request that arrived before the scene's reconstruction was restarted.
 
         Raises:
-            Problem: 503, the request must be sent again.
+            Problem: 503 if the request must be sent again.
         """
         if self[scene.id] is not scene:
-            fault = "the reconstruction of this scene was begun anew while this request came"
+            fault = "the reconstruction of this scene was restarted while the request was being received"
             raise Problem(503, fault, field="id", value=scene.id, remedy="send the request again")
 
     async def begin_again(self, scene: Scene, beginning: NewReconstruction) -> SceneStatus:
-        """Restarts the reconstruction of a scene and returns its status; a repeated request changes nothing.
+        """Restarts the reconstruction of a scene and returns its status; a repeated request has no effect.
 
         The scene is stopped, the event is journalled, and the scene is recovered from its folder as after a crash.
         Requests get 503 in the meantime. If the restart is refused, the scene is unchanged.
 
         Raises:
-            Problem: see `NewReconstruction.event`; 507, the disk is full.
+            Problem: see `NewReconstruction.event`; 507 if the disk is full.
         """
         id, current = scene.id, self[scene.id]
         if beginning.event(current.ledger, current.spec.folder) is None:
@@ -255,7 +256,7 @@ class Scenes:
 
     async def _begin_again(self, scene: Scene, beginning: NewReconstruction) -> None:
         self.hub.restart(scene.id)
-        async with scene.log.lock:  # a write of points in progress completes, and later ones are refused
+        async with scene.log.lock:  # lets a pending write of points complete; later ones are refused
             pass
         await scene.stop(0)
         folder, said = self._data.scene(scene.id), scene.status().damage
@@ -275,10 +276,10 @@ class Scenes:
         """Creates a scene on disk and starts its processes.
 
         Raises:
-            Problem: 429, all slots are in use; 503, the scenes found at startup are still being recovered; 507, the
-                disk is full.
+            Problem: 429 if all slots are in use; 503 if the scenes found at startup are still being recovered; 507 if
+                the disk is full.
         """
-        self.recovering.check()  # they may need slots
+        self.recovering.check()  # scenes that are being recovered may need slots
         await self._reserve_place()
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
         folder = self._data.scene(definition.id)
@@ -301,7 +302,7 @@ class Scenes:
         """Returns an awake scene.
 
         Raises:
-            Problem: see `refuse`; 503, its reconstruction is being restarted.
+            Problem: see `refuse`; 503 if its reconstruction is being restarted.
         """
         if id in self._beginning:
             raise restarting_problem(id)
@@ -310,22 +311,22 @@ class Scenes:
         return self.awake[id]
 
     def refuse(self, id: str) -> NoReturn:
-        """Raises the Problem that explains why a scene does not exist.
+        """Raises the `Problem` for a scene that does not exist or is not available yet.
 
         Raises:
-            Problem: 404, or 503 while scenes are still being recovered.
+            Problem: 404; 503 if scenes are still being recovered.
         """
         self.recovering.check(id)
         reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
         raise Problem(404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes")
 
     async def delete(self, id: str) -> None:
-        """Stops the scene's processes and removes its folder; the deletion takes effect when the folder is renamed.
+        """Stops a scene's processes and removes its folder; the deletion takes effect when the folder is renamed.
 
         Raises:
             Problem: see `refuse`.
         """
-        while id in self._turns:  # another task that waits for the same transition may start a new one
+        while id in self._turns:  # another task waiting for the same transition may start a new one
             with suppress(Problem):  # a scene that cannot be woken can still be deleted
                 await self._turns.end(id)
         folder = self._data.scene(id).path
@@ -346,7 +347,7 @@ class Scenes:
         return task
 
     async def stop(self) -> None:
-        """Stops all processes and keeps the scene folders."""
+        """Stops all scenes and their processes, and keeps their folders."""
         await self.recovering.stop()
         await asyncio.gather(*self._turns.values(), return_exceptions=True)
         if self._beginning:

@@ -1,7 +1,6 @@
-"""Sleep of idle scenes, which release their processes and their slot until the next request wakes them.
+"""Sleep of idle scenes, which release their processes and slots until the next request wakes them.
 
-A sleeping scene consists of its status in memory and its folder on disk. To wake it, the service reads the folder as
-after a crash.
+Of a sleeping scene, only the status is in memory. To wake it, the service reads its folder as after a crash.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from server.storage.layout import SceneFolder
 GRACE_S = 30.0
 """Seconds after its last use during which a scene keeps its slot, because its rig may be about to send a frame."""
 CHECK_S = 5.0
-"""Maximum number of seconds between checks for idle scenes; checks are more frequent for short sleep timeouts."""
+"""Maximum seconds between checks for idle scenes; checks are more frequent if `sleep_seconds` is short."""
 
 
 @dataclass(frozen=True, slots=True)
 class SleepingScene:
-    """Sleeping scene with the information that is available without waking it.
+    """Sleeping scene, with the data that is available without waking it.
 
     Attributes:
         id: scene ID.
         created: time at which the scene was created.
-        status: status from when the scene fell asleep, or as found on disk.
+        status: status recorded when the scene fell asleep, or read from disk.
     """
 
     id: str
@@ -42,48 +41,48 @@ class SleepingScene:
 
 
 class Transitions(dict[str, asyncio.Task[None]]):
-    """Tasks of scenes that are falling asleep or waking, by scene ID, at most one per scene."""
+    """Tasks that put scenes to sleep or wake them, keyed by scene ID; at most one per scene."""
 
     def begin(self, id: str, coroutine: Coroutine[Any, Any, None]) -> None:
-        """Starts a transition of a scene; it continues even if the caller is cancelled."""
+        """Starts a transition of a scene, which continues even if the caller is cancelled."""
 
         async def turn() -> None:
             try:
                 await coroutine
             finally:
-                del self[id]  # before the task is done, because waiting callers check again immediately
+                del self[id]  # before the task is done, because waiting callers check immediately afterwards
 
         self[id] = asyncio.create_task(turn())
 
     async def end(self, id: str) -> None:
-        """Waits for the end of a scene's transition, if any, and re-raises its exception."""
+        """Waits for a scene's transition to end, if there is one, and re-raises its exception."""
         if (task := self.get(id)) is not None:
             await asyncio.shield(task)
 
 
 def check_interval(settings: ServerSettings) -> float | None:
-    """Returns the seconds between checks for idle scenes, or None if scenes never fall asleep automatically."""
+    """Returns the seconds between checks for idle scenes, or None if scenes never fall asleep on their own."""
     return min(CHECK_S, settings.sleep_seconds / 2) or None
 
 
 def idle_scenes(scenes: Iterable[Scene], settings: ServerSettings) -> list[Scene]:
-    """Returns the scenes that have been idle long enough to fall asleep; the limit is shorter for archived scenes."""
+    """Returns the scenes that have been idle long enough to fall asleep; archived scenes have a shorter limit."""
     now = time.monotonic()
     return [scene for scene in scenes if now - scene.used >= _idle_limit(scene, settings.sleep_seconds) and scene.idle]
 
 
 def was_awake(used: float, settings: ServerSettings) -> bool:
-    """Returns whether a scene would still be awake if the service had not been down.
+    """Returns whether a scene would still be awake if the service had kept running.
 
-    `used` is the time of its last use in seconds since the epoch.
+    `used` is the time of its last use, in seconds since the epoch.
     """
     return settings.sleep_seconds == 0 or time.time() - used < settings.sleep_seconds
 
 
 def status_if_still_asleep(folder: SceneFolder, settings: ServerSettings) -> SceneStatus | None:
-    """Returns the cached status of a scene that would still be asleep if the service had not been down, or None.
+    """Returns the cached status of a scene that should stay asleep after a restart of the service, otherwise None.
 
-    Blocks.
+    Blocking.
     """
     if folder.journal.exists() and was_awake(folder.journal.stat().st_mtime, settings):
         return None
@@ -100,7 +99,7 @@ def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> 
     """Returns the least recently used idle scene, whose slot can be given to another scene.
 
     Raises:
-        Problem: 429, no scene is idle.
+        Problem: 429 if no scene is idle.
     """
     here = [scene for scene in scenes if scene.has_place]
     grace = min(GRACE_S, settings.sleep_seconds)
@@ -110,16 +109,16 @@ def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> 
         return min(idle, key=lambda scene: scene.used)
     raise Problem(
         429,
-        f"{count_noun(len(here), 'scene')} of at most {settings.max_scenes} are awake, and none is idle",
+        f"{count_noun(len(here), 'scene')} awake (maximum {settings.max_scenes}), and none is idle",
         field="SCAS4D_MAX_SCENES",
         value=settings.max_scenes,
-        remedy="try again when one is idle (no waiting frames, pages or senders), put one to sleep "
+        remedy="try again when one is idle (no queued frames, viewers or senders), put one to sleep "
         "(POST /v1/scenes/ID/sleep), delete one, or raise SCAS4D_MAX_SCENES",
         headers={"Retry-After": "10"},
     )
 
 
 def cannot_wake_problem(id: str, reason: str) -> Problem:
-    """Returns the 503 response for an unreadable scene, which stays asleep because the fault may be temporary."""
-    remedy = "look after the scene's folder in the data folder, then ask again"
+    """Returns the 503 problem for an unreadable scene, which stays asleep because the fault may be temporary."""
+    remedy = "fix the scene's folder in the data folder, then try again"
     return Problem(503, f"the scene cannot be read: {reason}", field="id", value=id, remedy=remedy)

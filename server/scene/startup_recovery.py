@@ -1,4 +1,4 @@
-"""Startup recovery: finds the scenes in the data folder and loads them in the background."""
+"""Recovery at startup: finds the scenes in the data folder and loads them in the background."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class StartupRecovery:
 
     Args:
         data: data folder of the service.
-        read: loads a scene from its folder; it must not raise.
+        read: loads a scene from its folder; must not raise.
     """
 
     def __init__(self, data: DataFolder, read: Callable[[SceneFolder], Awaitable[object]]) -> None:
@@ -28,11 +28,11 @@ class StartupRecovery:
         self._task: asyncio.Task[None] | None = None
 
     def __contains__(self, id: str) -> bool:
-        """Returns whether a scene was found and is not recovered yet."""
+        """Returns whether a scene was found but is not recovered yet."""
         return id in self._left
 
     async def begin(self) -> None:
-        """Lists the scenes and starts to load them in the background, because a journal may cover a whole day."""
+        """Lists the scenes and starts to load them in the background, since a journal may cover a whole day."""
         self._left = await asyncio.to_thread(self._folders)
         self._count = len(self._left)
         self._task = asyncio.create_task(self._run())
@@ -44,19 +44,19 @@ class StartupRecovery:
             await asyncio.wait([self._task])
 
     def check(self, id: str | None = None) -> None:
-        """Checks that one scene, or all scenes if `id` is None, are recovered.
+        """Checks that one scene, or every scene if `id` is None, has been recovered.
 
         Raises:
-            Problem: 503 with the number of recovered scenes.
+            Problem: 503 with the number of scenes recovered so far.
         """
         if id not in self._left and (id is not None or not self._left):
             return
         raise Problem(
             503,
-            f"recovering {self._count - len(self._left)} of {count_noun(self._count, 'scene')}",
+            f"recovered {self._count - len(self._left)} of {count_noun(self._count, 'scene')} so far",
             field="id" if id is not None else None,
             value=id,
-            remedy="try again: all acknowledged frames are on disk and are being read",
+            remedy="try again later; all acknowledged frames are on disk and are being loaded",
             headers={"Retry-After": "1"},
             recovering=list(self._left),
         )
@@ -68,9 +68,9 @@ class StartupRecovery:
         await asyncio.to_thread(self._data.remove_deleted)
 
     def _folders(self) -> list[str]:
-        """Returns the names of the scene folders, newest journal first.
+        """Returns the names of the scene folders, those with the newest journals first.
 
-        Folders of scenes that were never acknowledged are moved to the `deleted` folder.
+        Folders of scenes whose creation was never acknowledged are moved to the `deleted` folder.
         """
         folders = []
         for path in sorted(path for path in self._data.scenes.iterdir() if path.is_dir()):

@@ -52,12 +52,12 @@ class SceneFacts:
         pictures: index of the scene's frame log.
         has_points: whether the scene has an initial point cloud.
         queue_limit: maximum number of queued frames.
-        first: see `first_frame_facts`.
-        damage: damage messages.
+        first: facts about the first frame; see `first_frame_facts`.
+        damage: messages about damaged files.
         warnings: warnings about the rig.
         trouble: reason why the scene is degraded, or None.
-        at_work: whether a frame is being updated.
-        progress: progress of frame 0 during its reconstruction, otherwise None.
+        at_work: whether a frame is being processed.
+        progress: progress of frame 0 while it is being reconstructed, otherwise None.
         worker_deaths: number of worker crashes since the scene was loaded.
         asleep: whether the scene has no slot and therefore no processes.
     """
@@ -88,7 +88,7 @@ class SceneFacts:
         return state_of(self.ledger, at_work=self.at_work, degraded=self.error is not None)
 
     def status(self) -> SceneStatus:
-        """Returns the API status of the scene."""
+        """Returns the status of the scene as a model of the HTTP API."""
         ledger, request, settings = self.ledger, self.definition.request, self.definition.settings
         committed, counts = ledger.committed, ledger.counts
         entry = ledger.frames.get(committed[-1]) if committed else None
@@ -144,7 +144,7 @@ def effects_of(settings: Settings, record: Mapping[str, Any] | None) -> dict[str
 
     Args:
         settings: settings of the scene.
-        record: newest commit record. If it is None or lacks effects, the initial switches are used.
+        record: newest commit record. If it is None or has no effects, the initial switches are used.
     """
     switches = decode_switches((record or {}).get("effects", {})) or first_switches(settings, 0)
     return {
@@ -157,7 +157,7 @@ def camera_of(rig: Rig, name: str) -> Camera:
     """Returns a camera of the rig by name.
 
     Raises:
-        Problem: 422, the rig has no camera of that name.
+        Problem: 422 if the rig has no camera of that name.
     """
     if name not in rig.names:
         raise Problem(
@@ -165,6 +165,6 @@ def camera_of(rig: Rig, name: str) -> Camera:
             f"the rig has no camera {name!r}",
             field="camera",
             value=name,
-            remedy=f"name one of {', '.join(rig.names)}, or give a whole camera",
+            remedy=f"give one of {', '.join(rig.names)}, or a complete camera",
         )
     return rig[name]

@@ -1,6 +1,6 @@
-"""Status cache of a sleeping scene, stored in its folder so that startup need not read the other files.
+"""Status cache of a sleeping scene, stored in its folder so that startup does not have to read the other files.
 
-The cache is used only if every name, size and modification time in the scene's folder is unchanged.
+The cache is valid only if every name, size and modification time in the scene's folder is unchanged.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from server.storage.layout import EXPORT, SceneFolder
 
 
 def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
-    """Writes the status cache of a sleeping scene and ignores disk errors. Blocks.
+    """Writes the status cache of a sleeping scene, ignoring disk errors. Blocking.
 
-    A scene with damage gets no cache, so that every startup checks it again.
+    A damaged scene gets no cache, so that every startup checks it again.
 
     Args:
         folder: folder of the scene.
-        status: status that is reported while the scene sleeps.
+        status: status to report while the scene is asleep.
     """
     if status.damage:
         return
@@ -39,7 +39,7 @@ def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
 
 
 def read_status_cache(folder: SceneFolder) -> SceneStatus | None:
-    """Returns a scene's status from its cache, or None if the cache is missing or invalid. Blocks."""
+    """Returns a scene's status from its cache, or None if the cache is missing or invalid. Blocking."""
     try:
         data = json.loads(folder.status_cache.read_bytes())
         if blake3(data["card"].encode()).hexdigest() != data["blake3"]:
@@ -54,14 +54,14 @@ def read_status_cache(folder: SceneFolder) -> SceneStatus | None:
 
 
 def _of(folder: SceneFolder) -> dict[str, Any]:
-    """Returns the service version, folder format and folder fingerprint, which must all match for a valid cache."""
+    """Returns the service version, folder format and folder fingerprint; the cache is valid only if all match."""
     return {"version": __version__, "format": FORMAT, "content": _fingerprint(folder)}
 
 
 def _fingerprint(folder: SceneFolder) -> list[Any]:
-    """Returns name, size and modification time of each entry in the folder.
+    """Returns the name, size and modification time of each entry in the folder.
 
-    The modification time of a subfolder changes when files are added or removed in it.
+    The modification time of a subfolder changes when files are added to it or removed from it.
     """
     own = {folder.status_cache.name, folder.status_cache.with_suffix(".part").name, folder.worker_lock.name}
     with os.scandir(folder.path) as entries:

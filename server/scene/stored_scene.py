@@ -1,4 +1,4 @@
-"""Scene as stored in its folder: creates a new folder, or loads a scene with its status and pending work."""
+"""Scene as stored in its folder: creates the folder of a new scene, or loads an existing scene."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class StoredScene:
     """Scene as stored in its folder.
 
     Attributes:
-        definition: definition with the settings of the latest reconstruction.
-        content: recovered content of the folder.
+        definition: definition of the scene, with the settings of the latest reconstruction.
+        content: contents recovered from the folder.
         points_sha256: SHA-256 of the uploaded initial point cloud, or None.
         warnings: warnings about the rig.
-        first: see `first_frame_facts`.
+        first: facts about the first frame; see `first_frame_facts`.
         used: time of the last journal write, in seconds since the epoch.
     """
 
@@ -46,15 +46,15 @@ class StoredScene:
 
     @property
     def has_work(self) -> bool:
-        """Whether the scene has work that does not depend on a request."""
+        """Whether the scene has pending work that does not depend on a request."""
         ledger = self.content.ledger
         waits = ledger.unfinished > 0 and not ledger.paused and ledger.fatal is None
         return waits or bool(self.content.events or self.content.recompute or ledger.open)
 
     def facts(self, queue_limit: int) -> SceneFacts:
-        """Returns the data for the status of the sleeping scene.
+        """Returns the data from which the status of the sleeping scene is computed.
 
-        `queue_limit` is the service's default for the maximum number of queued frames.
+        `queue_limit` is the service's default maximum number of queued frames.
         """
         ledger = self.content.ledger
         return SceneFacts(
@@ -93,11 +93,11 @@ async def create_folder(folder: SceneFolder, definition: Definition) -> StoredSc
 def read_stored_scene(
     folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequence[str] = ()
 ) -> StoredScene:
-    """Loads a scene from its folder. Blocks.
+    """Loads a scene from its folder. Blocking.
 
     Args:
         folder: folder of the scene.
-        bury: moves a file or folder that is no longer used to the `deleted` folder under a given name.
+        bury: moves a file or folder that is no longer needed to the `deleted` folder under the given name.
         said: messages about damage that was found earlier.
 
     Raises:
@@ -107,7 +107,7 @@ def read_stored_scene(
     used = folder.journal.stat().st_mtime if folder.journal.exists() else 0.0
     definition, damage = read_definition(folder)
     if definition.id != folder.name:
-        raise DefinitionError(f"it is of scene {definition.id}; the folder was renamed or copied")
+        raise DefinitionError(f"it belongs to scene {definition.id}; the folder was renamed or copied")
     if damage is not None:
         write_definition(folder, definition)
     content = recover(folder, definition.id, definition.as_json())
@@ -117,11 +117,11 @@ def read_stored_scene(
     if (now := definition.with_reconstruction(begun)) is not definition:
         try:
             write_definition(folder, now)
-        except OSError as error:  # the journal has the event, and the next load writes the file
+        except OSError as error:  # a full disk is harmless: the next load writes the file from the journal
             if not no_room(error):
                 raise
     for path in folder.leftovers(begun):
-        with contextlib.suppress(FileNotFoundError):  # concurrently removed states of an earlier worker
+        with contextlib.suppress(FileNotFoundError):  # states of an earlier worker may be removed concurrently
             bury(path, f"{folder.name}-{path.name}")
     rig, settings, positions = now.request.rig.rig(), now.settings, points_positions(folder.points)
     return StoredScene(

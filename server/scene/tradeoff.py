@@ -1,4 +1,4 @@
-"""Trade-off between accuracy and time, computed from a scene's newest frame reports and its replays."""
+"""Trade-off between accuracy and time, computed from the newest frame reports and the replays of a scene."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from client.wire import CurveMean, FrameReportModel, FrameState, PointKind, Time
 from scas4d_core.frame_outcome import OTHER_ORDERS
 
 NEWEST = 64
-"""Number of newest frames whose reports are used."""
+"""Number of the newest frames whose reports are used."""
 LADDER = (10, 25, 50, 100, 200, 300, 500)
-"""Numbers of iterations that are extrapolated if they were not measured."""
+"""Numbers of iterations to extrapolate if they were not measured."""
 NEAR = 0.1
-"""Relative difference to a measured number of iterations up to which no point is extrapolated."""
+"""Relative distance to a measured number of iterations within which no point is extrapolated."""
 
 
 def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
-    """Returns the reports of updates that are valid time measurements.
+    """Returns the reports of the updates whose duration is a valid measurement.
 
-    These were fully committed at the first attempt. The first frame is excluded, and so is the first update, which ran
-    several times.
+    These were fully committed at the first attempt. The first frame is excluded, and so is the first update, because
+    it runs several times.
     """
     return [
         report
@@ -45,7 +45,7 @@ def commit_milliseconds(reports: Iterable[FrameReportModel]) -> float:
 
 
 def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
-    """Returns one point per number of iterations, rounded to two significant digits, and number of threads."""
+    """Returns one point for each number of iterations, rounded to two significant digits, and number of threads."""
     write = commit_milliseconds(reports)
     points = []
     for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
@@ -65,7 +65,7 @@ def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
 
 
 def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
-    """Returns the mean loss curve of updates with the same number of iterations."""
+    """Returns the mean loss curve for each number of iterations."""
     steps = [
         (_rounded(report.iterations), _rounded(point.iterations), point)
         for report in reports
@@ -85,9 +85,9 @@ def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
 
 
 def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
-    """Fits a time model that is linear in the iterations, or returns None without loss curves.
+    """Fits a time model that is linear in the number of iterations; returns None if there are no loss curves.
 
-    The slope comes from the times within each update; the remaining time is the fixed part.
+    The slope is fitted to the times within each update, and the remaining time is constant.
     """
     slopes = []
     for report in reports:
@@ -106,7 +106,7 @@ def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
 def extrapolated_points(
     model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None
 ) -> list[TradeoffPoint]:
-    """Returns points for iterations not measured with this number of threads, with times but no accuracy."""
+    """Returns points with a time but no accuracy for iterations not yet measured with this number of threads."""
     if model is None:
         return []
     there = [point.iterations for point in known if point.threads == threads]

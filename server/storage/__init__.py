@@ -1,1 +1,1 @@
-"""Durable storage of scenes: frame log, journal, ledger, epochs and recovery."""
+"""Durable storage of scenes: frame log, journal, ledger, worker epochs and recovery."""

@@ -1,7 +1,7 @@
 """Scene definition: rig, settings and ingest rules, stored in `scene.json`.
 
-The file is written before the scene is acknowledged. It is written again after a restart of the reconstruction has been
-journalled.
+The file is written before the creation of the scene is acknowledged. It is rewritten after a restart of the
+reconstruction has been journalled.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Increment it with every format change of the definition, journal, frame log or p
 
 
 class DefinitionError(ValueError):
-    """Error for a scene folder without a readable definition; the message states the reason."""
+    """Raised if a scene folder has no readable definition; the message states the reason."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Definition:
     begun: ReconstructionBegun | None = None
 
     def with_reconstruction(self, event: ReconstructionBegun | None) -> Definition:
-        """Returns the definition after a restart of the reconstruction, or this one if it already includes the event.
+        """Returns the definition after a restart of the reconstruction; unchanged if it already includes the event.
 
         Raises:
-            DefinitionError: this version does not accept the event's settings.
+            DefinitionError: the settings of the event are invalid in this version.
         """
         if event is None or (self.begun is not None and self.begun.number >= event.number):
             return self
@@ -61,7 +61,7 @@ class Definition:
             raise DefinitionError(f"the settings cannot be read: {message_of(error)}") from None
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the content of `scene.json`, which the journal's first event repeats."""
+        """Returns the content of `scene.json`, of which the first journal event is a copy."""
         return {
             "format": FORMAT,
             "id": self.id,
@@ -76,13 +76,13 @@ class Definition:
         """Parses a definition from the output of `as_json`.
 
         Raises:
-            DefinitionError: the definition has another format, or this version does not accept it.
+            DefinitionError: the definition has an unsupported format or is invalid in this version.
         """
         try:
             written = data["format"]
             if written != FORMAT:
                 raise DefinitionError(
-                    f"the scene is of format {written}, and this version reads format {FORMAT}; "
+                    f"the scene has format {written}, but this version reads format {FORMAT}; "
                     "open it with the version that wrote it, or move its folder out of the data folder"
                 )
             return cls(
@@ -119,7 +119,7 @@ def read_definition(folder: SceneFolder) -> tuple[Definition, str | None]:
         The definition, and a sentence that describes any damage found, or None.
 
     Raises:
-        DefinitionError: neither file contains it, it has another format, or this version does not accept it.
+        DefinitionError: neither file contains the definition, or it has an unsupported format or is invalid.
     """
     data, fault = _read_checked(folder)
     if fault is None:
@@ -127,8 +127,8 @@ def read_definition(folder: SceneFolder) -> tuple[Definition, str | None]:
     created: list[SceneCreated] = []
     replay(folder.journal, lambda event: created.append(event) if isinstance(event, SceneCreated) else None)
     if created:
-        return Definition.from_json(created[0].definition), f"{fault}; taken from the journal"
-    raise DefinitionError(f"{fault}, and the journal does not have it either")
+        return Definition.from_json(created[0].definition), f"{fault}; read from the journal instead"
+    raise DefinitionError(f"{fault}, and the journal does not contain the definition either")
 
 
 def check_definition(folder: SceneFolder) -> str | None:
@@ -144,7 +144,7 @@ def _read_checked(folder: SceneFolder) -> tuple[Any, str | None]:
         if _digest(_scene_text(text)) == data["blake3"]:
             return data["scene"], None
     except FileNotFoundError:
-        return None, f"{folder.definition.name} is gone"
+        return None, f"{folder.definition.name} is missing"
     except (OSError, KeyError, TypeError, ValueError) as error:
         return None, f"{folder.definition.name} is damaged ({message_of(error)})"
     return None, f"{folder.definition.name} is damaged (it fails its checksum)"
@@ -159,7 +159,7 @@ def _scene_text(text: str) -> str:
 
 
 def never_acknowledged(folder: SceneFolder) -> bool:
-    """Returns whether the scene of a folder without `scene.json` was never acknowledged.
+    """Returns whether a folder without `scene.json` belongs to a scene whose creation was never acknowledged.
 
     Such a folder contains no frames, states or points, and at most the creation event.
     """

@@ -14,13 +14,13 @@ from server.problems import Problem
 from server.storage.layout import DataFolder, SceneFolder
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Error numbers that mean a full disk; the errors disappear once space is available."""
+"""Error numbers that indicate a full disk; such errors disappear once space is available."""
 
 
 def no_room(error: BaseException | None) -> bool:
-    """Returns whether an error, or one that it was raised from, means a full disk.
+    """Returns whether an error, or any error in its chain of causes, indicates a full disk.
 
-    For example, zipfile raises another error while it handles the original one.
+    For example, zipfile raises another error while handling the original one.
     """
     while error is not None:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
@@ -34,7 +34,7 @@ def full_disk(error: Exception) -> Problem:
     return Problem(
         507,
         f"the disk is full: {message_of(error)}",
-        remedy="free space in the service's data folder, or shorten the scene's retention, and send the same again",
+        remedy="free space in the service's data folder, or shorten the scene's retention, and repeat the request",
         headers={"Retry-After": "5"},
     )
 
@@ -45,11 +45,11 @@ def free_bytes(path: Path) -> int:
 
 
 class FolderLock:
-    """Folder lock held by one process at a time; the kernel releases it when the process ends.
+    """Folder lock that one process can hold at a time; the kernel releases it when the process ends.
 
     Args:
         path: path of the lock file, which is created if missing.
-        wait: whether to wait until the lock is free; otherwise BlockingIOError is raised if another process holds it.
+        wait: whether to wait until the lock is free; otherwise, BlockingIOError is raised if another process holds it.
     """
 
     def __init__(self, path: Path, *, wait: bool) -> None:
@@ -80,16 +80,14 @@ def lock_data(data: Path) -> FolderLock:
     try:
         return FolderLock(DataFolder(data).lock, wait=False)
     except BlockingIOError:
-        raise RuntimeError(
-            f"another service uses {data}; stop it, or give this one another folder: --data FOLDER"
-        ) from None
+        raise RuntimeError(f"another service is using {data}; stop it, or use another folder: --data FOLDER") from None
 
 
 def lock_states(folder: SceneFolder) -> FolderLock | None:
     """Waits until no other worker can commit to a scene's states, and locks them for this process.
 
-    With an epoch, it only records this process's ID and returns None without waiting. A worker on another machine could
-    hang while holding a lock, so each epoch commits to its own folder instead (`server.storage.fencing`).
+    With an epoch, this only records the ID of this process and returns None without waiting. A worker on another
+    machine could hang while holding a lock, so each epoch commits to its own folder instead (`server.storage.fencing`).
     """
     path = folder.worker_lock
     if folder.epoch is not None:
@@ -98,7 +96,7 @@ def lock_states(folder: SceneFolder) -> FolderLock | None:
             beside.write_text(f"{os.getpid()}\n")
             beside.replace(path)
         return None
-    # A killed service can leave a worker in the middle of an update; two workers must not commit to one history.
+    # A killed service can leave behind a worker in the middle of an update; two workers must not commit to one history.
     lock = FolderLock(path, wait=True)
     with contextlib.suppress(OSError):  # the note is optional, so a full disk must not stop the worker
         lock.write(f"{os.getpid()}\n")

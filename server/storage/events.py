@@ -1,6 +1,6 @@
 """Journal events of a scene: the only record of its frames, from which the ledger is built in order.
 
-Each event's `type` tag and fields are stored in `journal.log`, so changing them changes the format version
+The `type` tag and the fields of each event are stored in `journal.log`, so changing them requires a new format version
 (`server.storage.definition.FORMAT`).
 """
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from client.wire import Budget, FileKind, IngestSettings, ReconstructionRequest, Retention
 
 Hashes = dict[str, dict[FileKind, str]]
-"""BLAKE3 digest of each file, by camera and kind."""
+"""BLAKE3 digest of each file, keyed by camera and kind."""
 
 
 class _Event(BaseModel):
@@ -29,7 +29,7 @@ class SceneCreated(_Event):
 
 
 class FrameAccepted(_Event):
-    """Acknowledgement of a complete frame, whose images are on disk in `files` of the frame log."""
+    """Acknowledgement of a complete frame, whose images are in the records `files` of the frame log."""
 
     type: Literal["frame_accepted"] = "frame_accepted"
     index: int
@@ -44,7 +44,7 @@ class FrameAccepted(_Event):
 
 
 class CameraAccepted(_Event):
-    """Acknowledgement of one camera's files of an open frame; `time` is None if the camera sent none."""
+    """Acknowledgement of the files of one camera in an open frame; `time` is None if the camera did not send it."""
 
     type: Literal["camera_accepted"] = "camera_accepted"
     index: int
@@ -71,7 +71,7 @@ class FramesSkipped(_Event):
 
 
 class FrameFailed(_Event):
-    """Failure to reconstruct a frame; `fatal` if the scene cannot continue without it."""
+    """Failure to reconstruct a frame; `fatal` is set if the scene cannot continue without it."""
 
     type: Literal["frame_failed"] = "frame_failed"
     index: int
@@ -81,7 +81,7 @@ class FrameFailed(_Event):
 
 
 class WorkerDied(_Event):
-    """Worker crash during a frame; `own` if the worker itself caused it rather than an external signal."""
+    """Worker crash during a frame; `own` is set if the worker itself caused it rather than an external signal."""
 
     type: Literal["worker_died"] = "worker_died"
     index: int
@@ -105,7 +105,7 @@ class StatesDeleted(_Event):
 
 
 class StateFound(_Event):
-    """Discovery of a committed state whose acknowledgement the journal lost; `time` is taken from the state."""
+    """Discovery of a committed state for which the journal has lost the acknowledgement; `time` is from the state."""
 
     type: Literal["state_found"] = "state_found"
     index: int
@@ -120,7 +120,7 @@ class PauseChanged(_Event):
 
 
 class SceneEdited(_Event):
-    """Change of the scene's name, archive flag or retention rules; fields that are None are unchanged."""
+    """Change of the scene's name, archive flag or retention rules; None leaves a field unchanged."""
 
     type: Literal["scene_edited"] = "scene_edited"
     name: str | None = None
@@ -141,7 +141,7 @@ class SceneEdited(_Event):
 
 
 class BudgetChanged(_Event):
-    """New budget from frame `index` on; a frame that is updated again keeps the budget that applied to it."""
+    """New budget from frame `index` on; a frame that is updated again keeps its earlier budget."""
 
     type: Literal["budget_changed"] = "budget_changed"
     index: int
@@ -154,10 +154,10 @@ class ReconstructionBegun(_Event):
     Attributes:
         number: number of the reconstruction; the original one has 0.
         index: index of its first frame.
-        points: number of the reconstruction whose initial points it uses (`SceneFolder.points_of`), or None for no
-            points.
-        settings: the scene's complete settings from now on.
-        request: the restart request, kept to detect a repeated one.
+        points: number of the reconstruction whose initial points are used (`SceneFolder.points_of`), or None if there
+            are no points.
+        settings: complete settings of the scene after the restart.
+        request: restart request, stored to detect repeated requests.
     """
 
     type: Literal["reconstruction_begun"] = "reconstruction_begun"
@@ -179,7 +179,7 @@ class OpenFrame:
 
     @property
     def cameras(self) -> list[str]:
-        """Cameras whose image has arrived, sorted."""
+        """Sorted names of the cameras whose image has arrived."""
         return sorted(camera for camera, kinds in self.hashes.items() if FileKind.IMAGE in kinds)
 
     def add(self, part: CameraAccepted) -> None:
@@ -227,6 +227,6 @@ parse_event = _adapter.validate_json
 
 
 def event_fault(error: ValidationError) -> str:
-    """Returns the first field that makes a record's head an invalid event, and its error."""
+    """Returns the name and the error of the first field that makes a record's head an invalid event."""
     first = error.errors()[0]
     return f"{'.'.join(map(str, first['loc'])) or 'event'}: {first['msg']}"

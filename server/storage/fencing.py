@@ -2,13 +2,13 @@
 
 A worker on another machine may hang, be presumed dead, and resume after another worker has taken over its scene. File
 locks do not work across machines, and a check before each write leaves a race. Every worker therefore commits to its
-own folder, `states.EPOCH`. The folder starts with hard links to the files that the previous worker committed. The
+own folder, `states.EPOCH`. Initially, it contains hard links to the files that the previous worker committed. The
 symbolic link `states` points to the folder of the current worker, and all readers follow it.
 
 The service creates the folder and moves the link before it starts the worker. Anything that the previous worker writes
-afterwards lands in a folder that nobody reads. Only the compact file that is still being written changes in place, so
-it is copied instead of linked. Epochs increase with each worker. HBase fences the writers of its logs per folder in the
-same way. All functions block.
+afterwards ends up in a folder that nobody reads. Only the compact file that is still being written changes in place, so
+it is copied instead of linked. The epoch increases with each worker. HBase fences the writers of its logs per folder in
+the same way. All functions block.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from server.storage.layout import epoch_folder
 PART = ".part"
 """Suffix of a folder that is still being filled."""
 MARKER_NAME = ".epoch"
-"""Name of a file in each epoch folder; a non-empty folder cannot be replaced by a rename of the same epoch."""
+"""Name of a file that makes each epoch folder non-empty, so that another rename to the same epoch fails."""
 MAX_PASSES = 20
-"""Attempts to link a folder that keeps changing because its writer is still running."""
+"""Maximum number of attempts to link a folder that keeps changing because its writer is still running."""
 MAX_REMAINING = 5
-"""Epoch folders that are kept if one worker after another exits before it starts its work."""
+"""Number of epoch folders to keep if one worker after another exits before it starts its work."""
 LOCK_WAIT_S = 10.0
-"""Seconds within which a local worker exits after its service was killed."""
+"""Seconds to wait for the exit of a local worker after its service was killed."""
 
 
 class FencingError(RuntimeError):
-    """Error for a scene whose states cannot be taken over."""
+    """Raised if the states of a scene cannot be taken over."""
 
 
 def epochs(states: Path) -> dict[int, Path]:
-    """Returns the complete epoch folders by epoch, in ascending order."""
+    """Returns the complete epoch folders, keyed by epoch in ascending order."""
     by_epoch = {epoch: path for path, epoch in _folders(states) if path.suffix != PART}
     return dict(sorted(by_epoch.items()))
 
@@ -52,13 +52,13 @@ def current_epoch(states: Path) -> int | None:
 
 
 def repair_link(states: Path) -> None:
-    """Points the link to the newest epoch if an interruption between the rename and the link left it missing."""
+    """Points the link to the newest epoch if the link is missing after an interruption."""
     if not states.exists() and (known := epochs(states)):
         _point_link(states, max(known))
 
 
 def begin_epoch(states: Path, lock: Path) -> int:
-    """Begins the next epoch and returns it; readers now use its folder, which contains all committed states.
+    """Begins the next epoch and returns it; readers then use its folder, which contains all committed states.
 
     A folder without epochs first becomes epoch 0, after the worker that holds `lock` has exited.
 
@@ -67,9 +67,9 @@ def begin_epoch(states: Path, lock: Path) -> int:
         lock: lock file of a worker without an epoch.
 
     Raises:
-        FencingError: that worker does not exit, the previous folder keeps changing or is missing, or another service
-            began the same epoch. The previous epoch stays current.
-        OSError: the disk operation failed. The previous epoch stays current unless the link had already moved.
+        FencingError: the worker that holds `lock` does not exit, the previous folder keeps changing or is missing, or
+            another service began the same epoch. The previous epoch stays current.
+        OSError: a disk operation failed. The previous epoch stays current unless the link had already moved.
     """
     repair_link(states)
     for link in states.parent.glob(f".{states.name}.*.link"):  # left over from interrupted calls
@@ -163,9 +163,10 @@ def _epoch_of(states: Path, path: Path) -> int | None:
 
 
 def _link_all(source: Path, target: Path) -> bool:
-    """Links all files of a folder into another; returns False if the folder changed during the operation.
+    """Links all files of a folder into another; returns False if the source folder changed during the operation.
 
-    Its worker may still be running, so a frame that it commits or moves to a compact file must be seen completely.
+    The worker of the source folder may still be running, so a frame that it commits, or moves to a compact file, must
+    be seen completely.
     """
     try:
         names = _names(source)
@@ -187,7 +188,7 @@ def _link_all(source: Path, target: Path) -> bool:
 def _names(folder: Path) -> list[str]:
     """Returns the names of finished files, compact files last.
 
-    A frame is added to a compact file before its own file is removed.
+    This order loses no frame, because a frame is added to a compact file before its own file is removed.
     """
     names = [name for name in os.listdir(folder) if not name.startswith(".")]
     return sorted(names, key=lambda name: (name.endswith(".s4d"), name))
@@ -198,7 +199,7 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except FileNotFoundError:
         raise
-    except OSError:  # a file system without hard links
+    except OSError:  # the file system does not support hard links
         _copy(source, target)
 
 
@@ -210,7 +211,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _is_closed(chunk: Path) -> bool:
-    """Returns whether a compact file already has its index, after which nothing is written to it."""
+    """Returns whether a compact file already has its index; it is no longer written to after that."""
     with chunk.open("rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - len(FOOTER_MAGIC)))
         return file.read() == FOOTER_MAGIC

@@ -38,14 +38,20 @@ BLOCK = 4096
 
 
 class FrameDamage(ValueError):
-    """Error for an unusable record of the frame log; the message names the record and the reason."""
+    """Raised if a record of the frame log is unusable; the message names the record and the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPictures:
-    """Encoded image and mask files of a record, by camera, with the BLAKE3 digest of each; the files are views.
+    """Encoded image and mask files of a record.
 
-    `time` is in seconds, or None if the upload did not include it. `part` is True for a record of a single camera.
+    Attributes:
+        index: index of the frame.
+        time: time of the frame in seconds, or None if the upload did not include it.
+        part: whether the record is of a single camera.
+        images: image file of each camera, as a view of the record.
+        masks: mask file of each camera, as a view of the record.
+        hashes: BLAKE3 digest of each file, keyed by camera and kind.
     """
 
     index: int
@@ -65,7 +71,7 @@ class Upload:
     Args:
         folder: folder of the frame log.
         head: names and sizes of the files that follow.
-        seconds: time of the frame, or None if it is not known yet.
+        seconds: time of the frame in seconds, or None if it is not known yet.
     """
 
     def __init__(self, folder: Path, head: FrameHead, seconds: float | None) -> None:
@@ -86,8 +92,8 @@ class Upload:
         """Writes the next bytes of the files.
 
         Args:
-            block: page-aligned memory. The new bytes start at `lead`; the space before them receives the remainder of
-                the previous write.
+            block: page-aligned memory. The new bytes start at `lead`; the remainder of the previous write is copied to
+                the space before them.
             lead: file offset of the new bytes, modulo `BLOCK`.
         """
         if self._file is None:
@@ -125,7 +131,7 @@ class Upload:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
         self._file = os.open(self._folder / self.name, flags, 0o644)
         whole = len(self._over) // BLOCK * BLOCK
-        self._write_all(memoryview(self._over[:whole]))  # a long head, as with many cameras
+        self._write_all(memoryview(self._over[:whole]))  # the head is long if there are many cameras
         self._over = self._over[whole:]
         self._direct(True)
 
@@ -141,7 +147,7 @@ class Upload:
             try:
                 data = data[os.write(self._file, data) :]
             except OSError as error:
-                # The file system has larger blocks, or a short write (as on a full disk) ended within a block.
+                # The file system has larger blocks, or a short write (e.g. on a full disk) ended within a block.
                 if error.errno != errno.EINVAL or not fcntl.fcntl(self._file, fcntl.F_GETFL) & DIRECT:
                     raise
                 self._direct(False)
@@ -154,14 +160,14 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
         FrameDamage: the record is missing, truncated or corrupt.
     """
     if not FILE.fullmatch(name):
-        raise FrameDamage(f"{name!r} is no name of a record")
+        raise FrameDamage(f"{name!r} is not the name of a record")
     try:
         data = (folder / name).read_bytes()
     except OSError as error:
         raise FrameDamage(f"{name}: {error.strerror}") from None
     record, end = read_at(memoryview(data), 0)
     if not isinstance(record, LogRecord) or record.kind != LogRecordKind.PICTURES or end != len(data):
-        raise FrameDamage(f"{name}: {'not one record of pictures' if isinstance(record, LogRecord) else record.reason}")
+        raise FrameDamage(f"{name}: {'not a single image record' if isinstance(record, LogRecord) else record.reason}")
     images: dict[str, memoryview] = {}
     masks: dict[str, memoryview] = {}
     hashes: Hashes = {}
@@ -174,7 +180,7 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
             record.index, record.head["time"], bool(record.head["single_camera"]), images, masks, hashes
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None
+        raise FrameDamage(f"{name}: its head does not describe images ({error!r})") from None
 
 
 def verify_record(folder: Path, name: str) -> Iterator[int]:
@@ -195,33 +201,36 @@ def verify_record(folder: Path, name: str) -> Iterator[int]:
 
 
 def list_records(folder: Path) -> dict[str, int]:
-    """Returns the size in bytes of each record of the frame log, by name."""
+    """Returns the size in bytes of each record in the frame log, keyed by record name."""
     return {entry.name: entry.stat().st_size for entry in os.scandir(folder) if FILE.fullmatch(entry.name)}
 
 
 def remove(folder: Path, names: Iterable[str]) -> None:
-    """Deletes records and syncs the folder, so that the deletion is durable."""
+    """Deletes records and syncs the folder, which makes the deletion durable."""
     for name in names:
         (folder / name).unlink(missing_ok=True)
     sync_folder(folder)
 
 
 def frame_of(name: str) -> int:
-    """Returns the index of the frame that a record belongs to, parsed from its name."""
+    """Returns the index of the frame to which a record belongs, parsed from the record name."""
     return int(name.partition("-")[0])
 
 
 def has_record(folder: Path, index: int) -> bool:
-    """Returns whether the frame log has a record of the frame."""
+    """Returns whether the frame log contains a record of the frame."""
     return any(folder.glob(f"{index:010d}-*.frame"))
 
 
 class FrameLogIndex:
-    """In-memory index of a scene's frame log: the size of each record by name, and the total.
+    """In-memory index of the frame log of a scene, with the size of each record.
 
     Args:
         folder: folder of the frame log.
-        sizes: size in bytes of each record in the folder, by name.
+        sizes: size in bytes of each record in the folder, keyed by record name.
+
+    Attributes:
+        bytes: total size of all records in bytes.
     """
 
     def __init__(self, folder: Path, sizes: Mapping[str, int]) -> None:

@@ -1,6 +1,6 @@
 """Columnar table of a scene's frames, without disk or clock access; a day at 30 fps is 2.6 million frames.
 
-Each frame permanently takes 46 bytes. Rare properties (errors, frame log records, worker crashes) are kept in
+Each frame permanently takes 46 bytes. Rare properties (errors, frame log records, worker crashes) are stored in
 dictionaries. Commit records of the newest frames stay in memory; older ones are read from disk.
 """
 
@@ -22,8 +22,8 @@ from server.storage.report_fields import committed_fields
 
 RECORDS_KEPT = 512
 """Number of newest commit records kept in memory."""
-RECORD_LOST = "the journal's record of this frame is damaged, and so it is not known what was sent"
-PICTURES_GONE = "the reconstruction was begun anew, and the pictures of this frame were deleted before"
+RECORD_LOST = "the journal record of this frame is damaged, so it is unknown what was sent"
+PICTURES_GONE = "the reconstruction was restarted after the images of this frame had been deleted"
 STATES = tuple(FrameState)
 CODES = {state: code for code, state in enumerate(STATES)}
 TIME, RECEIPT, DELETED, UNREADABLE = 1, 2, 4, 8
@@ -34,11 +34,11 @@ exists. UNREADABLE: its state is damaged and is being recomputed.
 """
 IDENTITY = 32  # bytes
 FEW_STATES = 32
-"""Number of deleted states from which the list of committed frames is rebuilt instead of edited one by one."""
+"""Minimum number of deleted states for which the list of committed frames is rebuilt instead of edited."""
 
 
 class FrameTable:
-    """Frames of one scene by index, without gaps.
+    """Table of the frames of one scene, by index and without gaps.
 
     Attributes:
         counts: number of frames in each state.
@@ -155,7 +155,7 @@ class FrameTable:
             self.rare_properties(index).error = PICTURES_GONE
 
     def add_committed(self, index: int, time: float | None) -> None:
-        """Records a committed state for which no journal event exists."""
+        """Adds a committed state for which no journal event exists."""
         if time is not None:
             self._times[index] = time
             self._flags[index] |= TIME
@@ -164,7 +164,7 @@ class FrameTable:
         self.set_state(index, FrameState.COMMITTED)
 
     def set_unreadable(self, index: int, unreadable: bool) -> None:
-        """Sets or clears the mark of a damaged committed state that is being recomputed."""
+        """Sets or clears the flag of a damaged committed state that is being recomputed."""
         self._flags[index] = self._flags[index] | UNREADABLE if unreadable else self._flags[index] & ~UNREADABLE
         self.set_state(index, STATES[self._states[index]])
 
@@ -187,7 +187,7 @@ class FrameTable:
         return new
 
     def restore_state(self, index: int) -> bool:
-        """Clears the marks of a frame that will be updated again and returns whether its state was deleted."""
+        """Clears the flags of a frame that will be updated again, and returns whether its state was deleted."""
         gone = bool(self._flags[index] & DELETED)
         self._flags[index] &= ~(DELETED | UNREADABLE)
         if index in self._notes:
@@ -195,7 +195,7 @@ class FrameTable:
         return gone
 
     def commit_up_to(self, last: int) -> None:
-        """Marks all queued and updating frames up to `last` as committed, in bulk after startup."""
+        """Marks all queued and updating frames up to and including `last` as committed; used after startup."""
         states = np.frombuffer(self._states, np.uint8)
         for state in (FrameState.QUEUED, FrameState.UPDATING):
             rows = np.flatnonzero(states[: last + 1] == CODES[state])
@@ -206,7 +206,7 @@ class FrameTable:
         self._list_all()
 
     def set_files(self, index: int, files: tuple[str, ...]) -> None:
-        """Sets the names of the frame's records in the frame log; an empty tuple also drops its parts."""
+        """Sets the names of the frame's records in the frame log; an empty tuple also removes its parts."""
         if files:
             self._files[index] = files
             return
@@ -217,7 +217,7 @@ class FrameTable:
                 del self._notes[index]
 
     def rare_properties(self, index: int) -> RareProperties:
-        """Returns the frame's note for modification and creates it if missing."""
+        """Returns the rare properties of the frame for modification, and creates them if missing."""
         return self._notes.setdefault(index, RareProperties())
 
     def set_record(self, index: int, record: Mapping[str, Any]) -> None:
@@ -296,7 +296,7 @@ class FrameEntry:
 
     @property
     def receipt(self) -> FrameReceipt | None:
-        """Receipt that the sender got, or None if the frame never arrived or the receipt is lost."""
+        """Receipt that was sent to the sender, or None if the frame never arrived or the receipt is lost."""
         identity, time = self.identity, self.time
         if identity is None or time is None:
             return None
@@ -323,19 +323,19 @@ class FrameEntry:
         if (error := self.rare_properties.error) is not None:
             return error
         if self.state == FrameState.SKIPPED:
-            return f"skipped: frame {self.skipped_by} came and the queue was full"
+            return f"skipped because the queue was full when frame {self.skipped_by} arrived"
         if self.state == FrameState.FAILED and self.index < self._table.first:
-            return f"the reconstruction begins with frame {self._table.first}"
+            return f"the reconstruction starts with frame {self._table.first}"
         return RECORD_LOST if self.state == FrameState.FAILED else None
 
     @property
     def record(self) -> Mapping[str, Any] | None:
-        """Commit record of the frame, or None if it is not in memory."""
+        """Commit record of the frame, or None if the record is not in memory."""
         return self._table._records.get(self.index)
 
     @property
     def report(self) -> FrameReportModel:
-        """API report of the frame, including its commit record if that is in memory."""
+        """API report of the frame, including its commit record if the record is in memory."""
         return self.report_with(self.record)
 
     def report_with(self, record: Mapping[str, Any] | None) -> FrameReportModel:

@@ -1,8 +1,8 @@
 """Journal of a scene: one append-only file of events. An event is acknowledged once it is on disk.
 
-If the file is deleted or replaced while the service runs, events appended to the open descriptor would be lost. Each
-write therefore checks that the path still refers to the open file. If it does not, or if a scrub finds damage, the
-journal is rewritten from the ledger (`snapshot`): it is written to a temporary file and renamed.
+If the file is deleted or replaced while the service is running, events appended to the open descriptor would be lost.
+Each write therefore checks that the path still refers to the open file. If it does not, or if a scrub finds damage, the
+journal is rewritten from the ledger (`snapshot`): it is written to a temporary file, which is then renamed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class JournalContent:
 
     Attributes:
         events: all intact events, in order.
-        good: number of intact bytes.
+        good: size of the journal in bytes, without a torn tail.
         damage: one sentence per damaged region.
     """
 
@@ -58,7 +58,7 @@ class JournalReading:
     """Result of reading a journal.
 
     Attributes:
-        good: number of intact bytes.
+        good: size of the journal in bytes, without a torn tail.
         damage: one sentence per damaged region.
         broken: whether there is damage other than a torn tail, so that events may be lost.
         begun: whether the first event is `SceneCreated`.
@@ -73,8 +73,8 @@ class JournalReading:
 def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading:
     """Calls `take` with every intact event, in order.
 
-    The file is read in pieces, and damaged content never raises. An interrupted append leaves a torn tail, which is
-    dropped because it was never acknowledged.
+    The file is read in pieces, and damaged content never raises an error. An interrupted append leaves a torn tail,
+    which is dropped because it was never acknowledged.
     """
     damage: list[str] = []
     broken = False
@@ -98,7 +98,7 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
                 fault = event_fault(error)
                 broken = True
                 damage.append(
-                    f"{path.name}: a record of kind {record.kind}, frame {record.frame}, is no event: {fault}"
+                    f"{path.name}: a record of kind {record.kind}, frame {record.frame}, is not an event: {fault}"
                 )
                 continue
             begun = isinstance(event, SceneCreated) if begun is None else begun
@@ -135,7 +135,7 @@ def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
 
 
 class _FirstBytes:
-    """Readable view of the first bytes of a file."""
+    """Reader that is limited to the first bytes of a file."""
 
     def __init__(self, file: BinaryIO, left: int) -> None:
         self._file = file
@@ -165,7 +165,7 @@ def verify_journal(path: Path, good: int) -> Iterator[int]:
                 yield since
                 since = 0
     if read != good:
-        raise ValueError(f"{read} of {good} bytes are there")
+        raise ValueError(f"only {read} of {good} bytes exist")
     yield since
 
 
@@ -174,9 +174,9 @@ class Journal:
 
     Args:
         path: path of the journal, which is created if missing.
-        good: number of intact bytes; the rest of the file is truncated.
-        snapshot: returns all events known now, to rewrite the journal. If None, the journal is never rewritten.
-        on_rewritten: called with the fault each time the journal was rewritten.
+        good: number of bytes to keep; the rest of the file is truncated.
+        snapshot: function that returns all known events, to rewrite the journal. If None, it is never rewritten.
+        on_rewritten: function called with the fault after each rewrite of the journal.
     """
 
     def __init__(
@@ -197,13 +197,13 @@ class Journal:
         sync_folder(path.parent)
         self._waiting: list[tuple[Sequence[JournalEvent], asyncio.Future[None]]] = []
         self._last: list[JournalEvent] = []
-        """Events of the last write, which the ledger may not have applied yet."""
+        """Events of the last write, which may not have been applied to the ledger yet."""
         self._fault: str | None = None
         self._flushing: asyncio.Task[None] | None = None
 
     @property
     def file_position(self) -> tuple[int, int]:
-        """Inode of the file, which changes with a rewrite, and the number of intact bytes."""
+        """Inode of the file, which changes with a rewrite, and the size of the journal in bytes."""
         return os.fstat(self._file).st_ino, self._good
 
     async def append(self, *events: JournalEvent) -> None:
@@ -211,17 +211,17 @@ class Journal:
 
         Raises:
             OSError: none of the events is on disk; the file is unchanged.
-            Problem: 503, the journal is closed.
+            Problem: 503 if the journal is closed.
         """
         if self._closed:
-            raise Problem(503, "the scene was closed", remedy="try again; a deleted scene then gives 404")
+            raise Problem(503, "the scene was closed", remedy="try again; a deleted scene then returns 404")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.append((events, done))
         self._begin()
         await asyncio.shield(done)
 
     def rewrite(self, fault: str) -> None:
-        """Schedules a rewrite of a damaged journal, serialised with appends; `fault` is a sentence."""
+        """Schedules a rewrite of a damaged journal, serialised with appends; `fault` describes the damage."""
         if not self._closed and self._snapshot is not None:
             self._fault = fault
             self._begin()
@@ -236,9 +236,9 @@ class Journal:
         try:
             there, own = os.stat(self.path), os.fstat(self._file)
         except FileNotFoundError:
-            return f"{self.path.name} is gone"
+            return f"{self.path.name} is missing"
         if (there.st_dev, there.st_ino) != (own.st_dev, own.st_ino):
-            return f"another file has taken the place of {self.path.name}"
+            return f"{self.path.name} was replaced by another file"
         if there.st_size < self._good:
             return f"{self.path.name} has {there.st_size} of {self._good} bytes"
         return None
@@ -276,7 +276,7 @@ class Journal:
             self._flushing = None
 
     def _write(self, events: Sequence[JournalEvent]) -> str | None:
-        """Appends events and returns None, or a fault if they are not in the file at the journal's path."""
+        """Appends events; returns None, or a fault if they are not in the file at the journal's path."""
         watched = self._snapshot is not None
         if watched and (fault := self.file_fault()) is not None:
             return fault
@@ -293,10 +293,10 @@ class Journal:
         return self.file_fault() if watched else None
 
     async def _rewrite_or_append(self, events: Sequence[JournalEvent]) -> None:
-        """Rewrites the journal, or only appends if the disk is too full for that and the open file is in place.
+        """Rewrites the journal, or only appends if the disk is too full for a rewrite and the open file is in place.
 
-        A damaged record loses one event, while a refused frame is lost completely. The next scrub finds the damage
-        again.
+        A damaged record loses one event, whereas a refused frame is lost completely. The next scrub will find the
+        damage again.
         """
         try:
             await self._rewrite(events)

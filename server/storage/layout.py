@@ -23,22 +23,22 @@ class DataFolder:
 
     @property
     def lock(self) -> Path:
-        """Lock file held by the service that uses the folder."""
+        """Lock file of the service that uses the folder."""
         return self.path / "service.lock"
 
     @property
     def scenes(self) -> Path:
-        """Folder that contains one folder per scene, named by scene ID."""
+        """Folder with one subfolder per scene, named by scene ID."""
         return self.path / "scenes"
 
     @property
     def deleted(self) -> Path:
-        """Folder that holds deleted scenes until they are removed from disk."""
+        """Folder for deleted scenes until they are removed from disk."""
         return self.path / "deleted"
 
     @property
     def exports(self) -> Path:
-        """Folder of exports, with one folder per scene ID and in it one per export; emptied at startup."""
+        """Folder of exports, with a subfolder per scene ID and, within it, one per export; emptied at startup."""
         return self.path / "exports"
 
     def scene(self, id: str) -> SceneFolder:
@@ -64,16 +64,17 @@ class DataFolder:
 
 
 EXPORT = "export"
-"""Name prefix of temporary files for exports that are streamed to a client."""
+"""Name prefix of the temporary files of exports that are streamed to a client."""
 
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Folder of one scene. Files of a reconstruction have its number in their names, except those of number 0.
+    """Folder of one scene. Files of a reconstruction other than number 0 have its number in their names.
 
     Attributes:
+        path: path of the folder.
         reconstruction: number of the reconstruction.
-        cloud: number of the reconstruction whose initial points it uses.
+        cloud: number of the reconstruction whose initial points are used.
         epoch: epoch of the worker that commits to the states (`server.storage.fencing`), or None to access the states
             through the `states` path.
     """
@@ -84,7 +85,7 @@ class SceneFolder:
     epoch: int | None = None
 
     def of_reconstruction(self, event: ReconstructionBegun | None) -> SceneFolder:
-        """Returns this folder with the file names of a restarted reconstruction, or unchanged if `event` is None.
+        """Returns this folder with the file names of a restarted reconstruction; unchanged if `event` is None.
 
         If the reconstruction has no initial points, `points` is the path of its own points, which does not exist.
         """
@@ -152,13 +153,13 @@ class SceneFolder:
 
     @property
     def worker_lock(self) -> Path:
-        """Lock file held by the worker process that may commit to the states."""
+        """Lock file of the worker process that may commit to the states."""
         return self.path / "worker.lock"
 
     def export(self, word: str) -> Path:
-        """Returns the temporary file of an export in progress.
+        """Returns the path of the temporary file of an export in progress.
 
-        `word` is unique per reader, because an abandoned reader may still be writing.
+        `word` must be unique per reader, because an abandoned reader may still be writing.
         """
         return self.path / f"{EXPORT}.{word}.part"
 
@@ -168,7 +169,7 @@ def _suffix(reconstruction: int) -> str:
 
 
 def epoch_folder(states: Path, epoch: int) -> Path:
-    """Returns the folder with the states of an epoch.
+    """Returns the path of the folder with the states of an epoch.
 
     >>> epoch_folder(Path("a/states"), 3).name
     'states.3'

@@ -1,6 +1,6 @@
-"""Ledger of a scene's frames, built from its journal events, and the log that journals every change.
+"""Ledger of the frames of a scene, built from its journal events, and the log that journals every change.
 
-A running scene and one recovered after a service restart both use the same `Ledger.apply`.
+`Ledger.apply` is used both by a running scene and by one that is recovered after a service restart.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from server.storage.frame_table import CODES, DELETED, FEW_STATES, RECEIPT, Fram
 from server.storage.journal import Journal
 
 RETRY_S = 1.0
-"""Seconds before the write of an event is retried when the disk is full."""
-NO_FIRST_FRAME = "the scene has failed at a frame before"
+"""Seconds after which writing an event is retried if the disk is full."""
+NO_FIRST_FRAME = "the scene failed at an earlier frame"
 
 
 def frame_identity(hashes: Hashes, time: float) -> str:
@@ -55,11 +55,13 @@ class Ledger:
 
     Attributes:
         frames: table of all frames with an index below `next_frame`.
-        open: frames whose cameras upload separately and that are not closed yet.
+        open: frames whose cameras upload separately and that are not closed yet, keyed by index.
+        paused: whether the scene is paused.
         fatal: reason why the scene cannot continue, or None.
         failed_at: frame at which the scene failed, or None.
-        budgets: pairs of a budget's first frame and the budget, in ascending order.
-        edited: accumulated changes of name, archive flag and retention since creation.
+        states_deleted: number of committed states that no longer exist.
+        budgets: (first frame, budget) pairs, in ascending order.
+        edited: accumulated changes to name, archive flag and retention since creation.
         begun: event that started the current reconstruction, or None for the original one.
     """
 
@@ -106,7 +108,7 @@ class Ledger:
         return self.counts[FrameState.UPDATING] > 0
 
     def apply(self, event: JournalEvent) -> None:
-        """Applies one event; events may be repeated, and earlier ones may be lost."""
+        """Applies one event; events may be repeated, and earlier events may be missing."""
         match event:
             case FrameAccepted():
                 parts = self.open.pop(event.index, None)
@@ -158,7 +160,7 @@ class Ledger:
             case BudgetChanged():
                 self.budgets = [one for one in self.budgets if one[0] < event.index] or [(0, Budget())]
                 self.budgets.append((event.index, event.budget))
-            case _:  # scene creation, a part of a closed frame, or a reconstruction that is already known
+            case _:  # scene creation, an image of a closed frame, or a known reconstruction
                 pass
 
     def budget_of(self, index: int) -> Budget:
@@ -176,16 +178,16 @@ class Ledger:
     def reconcile(
         self, indices: Sequence[int], damaged: Mapping[int, str], recompute: Collection[int] = ()
     ) -> list[JournalEvent]:
-        """Reconciles the frames with the committed states on disk and returns the events that the journal lacks.
+        """Reconciles the frames with the committed states on disk, and returns the events that the journal lacks.
 
         Args:
-            indices: indices of the readable states, in ascending order.
-            damaged: unreadable states, with the reason.
-            recompute: damaged or missing states that will be recomputed, for which no event is returned.
+            indices: frame indices of the readable states, in ascending order.
+            damaged: frame indices of unreadable states, with the reason.
+            recompute: frame indices of damaged or missing states that will be recomputed; they give no events.
 
         Returns:
-            Events that are already applied and must be appended to the journal: missing states, and frames that need an
-            update whose images are deleted.
+            Events that have been applied and must be appended to the journal. They record missing states, and frames
+            that need an update but whose images have been deleted.
         """
         last = indices[-1] if indices else -1
         events: list[JournalEvent] = []
@@ -199,9 +201,7 @@ class Ledger:
             frames.set_state(int(index), FrameState.QUEUED)
             self.states_deleted -= frames.restore_state(int(index))
             if not frames[int(index)].files:
-                events.append(
-                    FrameFailed(index=int(index), reason="its state is damaged, and its pictures are deleted")
-                )
+                events.append(FrameFailed(index=int(index), reason="its state is damaged, and its images are deleted"))
         frames.commit_up_to(last)
         lost = readable & (codes == CODES[FrameState.FAILED]) & ~frames.flagged(RECEIPT)
         for index in np.flatnonzero(lost):  # the event is lost, but the state exists
@@ -214,7 +214,7 @@ class Ledger:
                 frames.set_unreadable(again, True)
         if gone:
             reasons = "; ".join(damaged[index] for index in gone if index in damaged)
-            events.append(StatesDeleted(frames=gone, reason=reasons or "found gone"))
+            events.append(StatesDeleted(frames=gone, reason=reasons or "found missing"))
         for event in events:
             self.apply(event)
         return events
@@ -230,7 +230,7 @@ class Ledger:
 
     def waiting(self) -> list[int]:
         """Returns the queued frames that the worker has not started, in ascending order."""
-        indices: list[int] = []  # scans backwards: queued frames are always the newest
+        indices: list[int] = []  # scan backwards, because queued frames are always the newest
         for index in range(self.next_frame - 1, -1, -1):
             if len(indices) == self.counts[FrameState.QUEUED]:
                 break
@@ -274,7 +274,7 @@ class SceneLog:
         ledger: ledger of the scene.
         journal: journal of the scene.
         pictures: index of the scene's frame log.
-        waits: called with a sentence each time a journal write waits for disk space.
+        waits: function called with a message each time a journal write waits for disk space.
 
     Attributes:
         lock: lock held while the next frame is being accepted.
@@ -291,7 +291,7 @@ class SceneLog:
         """Appends events to the journal and then applies them.
 
         Raises:
-            Problem: 507, the disk is full; nothing has changed.
+            Problem: 507 if the disk is full; nothing has changed.
         """
         try:
             await self.journal.append(*events)
@@ -311,7 +311,7 @@ class SceneLog:
             except OSError as error:
                 if not no_room(error):
                     raise
-                self._waits(f"the journal waits for room on the disk: {message_of(error)}")
+                self._waits(f"the journal is waiting for disk space: {message_of(error)}")
                 await asyncio.sleep(RETRY_S)
 
     async def delete_pictures(self, names: Collection[str]) -> None:
@@ -320,7 +320,7 @@ class SceneLog:
         await asyncio.to_thread(remove, self.pictures.folder, names)
 
     def deletable(self, rule: Retention) -> list[int]:
-        """Returns the frames whose images the retention rule deletes now, in ascending order.
+        """Returns the frames whose images can be deleted under the retention rule, in ascending order.
 
         Images of unfinished frames are kept. An interrupted scene may roll back to an earlier commit, so the images of
         all later frames are kept, too.

@@ -18,8 +18,9 @@ A record consists of a header, a head (JSON), a body (raw bytes) and a checksum:
 
 All numbers are unsigned little-endian integers. A header with a matching CRC can be trusted even within damaged data,
 so a reader can search for the next record. The BLAKE3 digest proves that the record is unchanged. The checksum follows
-the body because a frame is written to disk while it is being received. In version 2, the head contains `files`, and
-each `size` locates a file in the body. The frame's identity uses the same file digests, so no byte is hashed twice.
+the body because a frame is written to disk while it is being received. In version 2, the head contains `files`, in
+which each `size` locates a file in the body. The identity of a frame uses the same file digests, so that no byte is
+hashed twice.
 """
 
 from __future__ import annotations
@@ -50,14 +51,14 @@ class LogRecordKind(IntEnum):
     EVENT = 1
     """Event of a frame or of the scene, stored completely in the head."""
     PICTURES = 2
-    """Encoded image files of a frame, or of one of its cameras."""
+    """Encoded image files of a frame, or of a single camera of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogRecord:
     """Record as read from disk; `body` and `files` are views into the input.
 
-    `files` and `digests`, the BLAKE3 digest of each file, are set only for version 2.
+    `files` and `digests` (the BLAKE3 digest of each file) are set only for version 2.
     """
 
     kind: int
@@ -69,7 +70,7 @@ class LogRecord:
 
 
 class RecordHeader(NamedTuple):
-    """Header of a small record with its unparsed JSON head and the total record size in bytes."""
+    """Header of a small record, with its unparsed JSON head and the total record size in bytes."""
 
     kind: int
     frame: int
@@ -81,7 +82,7 @@ class RecordHeader(NamedTuple):
 class Damage:
     """Byte range [start, end) without an intact record, and the reason.
 
-    `index` and `kind` belong to the damaged record and are set only if its header can still be trusted.
+    `index` and `kind` are those of the damaged record, and are set only if its header can still be trusted.
     """
 
     start: int
@@ -103,7 +104,7 @@ def encode_opening(kind: int, index: int, head: Any, body_length: int, version: 
 def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
     """Returns the truncated BLAKE3 digest of consecutive pieces.
 
-    The pieces are those of a whole record, or its opening and the digest of each of its files.
+    The pieces are those of a whole record, or its opening followed by the digest of each file.
     """
     digest = blake3()
     for piece in pieces:
@@ -130,7 +131,7 @@ def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
     _, version, kind, nought, head_length, index, body_length = HEADER.unpack(header)
     head_end = at + PREFIX + head_length
     if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
-        return _skip(data, at, "the header is of another version, damaged, or cut")
+        return _skip(data, at, "the header has an unknown version, is damaged, or is truncated")
     head_bytes = data[at + PREFIX : head_end]
     if CRC.unpack_from(data, at + HEADER.size)[0] != zlib.crc32(head_bytes, zlib.crc32(header)):
         return _skip(data, at, "the header or head fails its checksum")
@@ -145,7 +146,7 @@ def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
         head = json.loads(bytes(head_bytes))
         files = () if version == WHOLE else _files(head, body)
     except (KeyError, TypeError, ValueError) as error:  # intact, but written by another program
-        return Damage(at, end, f"the head is not one of a record ({error!r})", index, kind), end
+        return Damage(at, end, f"the head is not a valid record head ({error!r})", index, kind), end
     digests = tuple(blake3(file).digest() for file in files)
     if version == BY_FILE and checksum(start, *digests) != found:
         return Damage(at, end, "the record fails its checksum", index, kind), end
@@ -163,12 +164,12 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
         files.append(body[at : at + file["size"]])
         at += file["size"]
     if at != len(body):
-        raise ValueError(f"its files have {at} bytes, the body {len(body)}")
+        raise ValueError(f"its files have {at} bytes, but the body has {len(body)}")
     return tuple(files)
 
 
 def read_records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
-    """Yields every intact record of a log and the damage between them, in order."""
+    """Yields every intact record of a log, and the damage between records, in order."""
     view = memoryview(data)
     at = 0
     while at < len(view):
@@ -179,18 +180,18 @@ def read_records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
 PIECE = 1 << 22
 """Number of bytes read at a time."""
 DECIDABLE_BYTES = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
-"""Number of bytes that suffice to decide whether a record without a body, such as an event, is intact."""
+"""Number of bytes that are sufficient to decide whether a record without a body, such as an event, is intact."""
 
 
 class Readable(Protocol):
     """Protocol of a file that is read in pieces."""
 
     def read(self, size: int, /) -> bytes:
-        """Reads at most `size` bytes, and none at the end of the file."""
+        """Reads at most `size` bytes; returns no bytes at the end of the file."""
 
 
 def stream_records(file: Readable) -> Iterator[RecordHeader | Damage]:
-    """Yields the header of each record in a log of small records, and the damage between them.
+    """Yields the header of each record in a log of small records, and the damage between records.
 
     The log need not fit in memory.
     """
@@ -232,11 +233,11 @@ def _whole(data: bytes, at: int) -> RecordHeader | None:
 
 
 def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
-    """Returns the damage at a byte offset and where to continue, or None at the end of the data."""
+    """Returns the damage at a byte offset, or None at the end of the data, and the offset at which to continue."""
     if at == len(data):
         return None, at
     record, after = read_at(memoryview(data), at)
-    return record if isinstance(record, Damage) else Damage(at, after, "of a version that has no place here"), after
+    return record if isinstance(record, Damage) else Damage(at, after, "of a version that is not allowed here"), after
 
 
 def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
@@ -274,21 +275,21 @@ def check_record(file: Readable) -> Iterator[int]:
         raise ValueError("no record starts here")
     _, version, _, nought, head_length, _, body_length = HEADER.unpack_from(header)
     if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD:
-        raise ValueError("the header is of another version, damaged, or cut")
+        raise ValueError("the header has an unknown version, is damaged, or is truncated")
     head = file.read(head_length)
     if CRC.unpack_from(header, HEADER.size)[0] != zlib.crc32(head, zlib.crc32(header[: HEADER.size])):
         raise ValueError("the header or head fails its checksum")
     try:
         sizes = [body_length] if version == WHOLE else [int(entry["size"]) for entry in json.loads(head)["files"]]
     except (KeyError, TypeError) as error:  # intact, but written by another program
-        raise ValueError(f"the head is not one of a record ({error!r})") from None
+        raise ValueError(f"the head is not a valid record head ({error!r})") from None
     whole = blake3(header + head)
     for size in sizes:
         digest = whole if version == WHOLE else blake3()
         while size:
             piece = file.read(min(size, READ_BYTES))
             if not piece:
-                raise ValueError("it is cut")
+                raise ValueError("the record is truncated")
             digest.update(piece)
             size -= len(piece)
             yield len(piece)

@@ -1,4 +1,4 @@
-"""Recovery of a scene from its folder: reconciles journal, frame log and states, and reports inconsistencies."""
+"""Recovery of a scene from its folder: reconciles the journal, frame log and states, and reports inconsistencies."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from server.storage.snapshot import events_of
 
 RECONSTRUCTION_EVENTS = (FrameFailed, StateFound, StatesDeleted, WorkerDied)
 """Event types that belong to one reconstruction only; a restarted one retries the frames and has new states."""
-NO_STATE = "the journal was lost, and there is no committed state of this frame"
+NO_STATE = "the journal was lost, and this frame has no committed state"
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class Recovered:
     Attributes:
         folder: scene folder with the file names of the latest reconstruction.
         ledger: ledger of the scene with all `events` applied.
-        good: number of intact bytes in the journal.
-        events: events that the journal lacks and that are already applied to the ledger.
-        sizes: size of each frame log record in bytes, by name.
+        good: size of the journal in bytes, without a torn tail.
+        events: events that the journal lacks and that have been applied to the ledger.
+        sizes: size in bytes of each record in the frame log, keyed by record name.
         damage: one sentence per fault that was found.
-        recompute: frames with a damaged or missing state and stored images, with the reason.
-        first_report: report of the first readable committed frame, or empty if there is none.
+        recompute: frames whose state is damaged or missing and whose images are stored, with the reason.
+        first_report: report of the first readable committed frame; empty if there is none.
     """
 
     folder: SceneFolder
@@ -65,7 +65,7 @@ class Recovered:
 
 @dataclass(frozen=True)
 class _States:
-    """Committed states: times of readable ones, faults of damaged ones, and the newest and first reports."""
+    """Committed states: times of readable states, faults of damaged states, and the newest and first reports."""
 
     times: dict[int, float] = field(default_factory=dict)
     damaged: dict[int, str] = field(default_factory=dict)
@@ -85,12 +85,12 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     """Reads a scene's folder and removes leftovers of interrupted uploads. Blocks.
 
     If the journal is damaged or missing, only its own content is lost. Committed states and complete image records are
-    found again, nothing is removed, and the journal is rewritten from the recovered ledger.
+    rediscovered, nothing is removed, and the journal is rewritten from the recovered ledger.
 
     Args:
         folder: folder of the scene.
         scene: scene ID.
-        definition: definition as in `SceneCreated`; without it, the journal is not rewritten.
+        definition: definition as in `SceneCreated`; if None, the journal is not rewritten.
     """
     frames, journal = folder.frames, folder.journal
     frames.mkdir(exist_ok=True)
@@ -98,12 +98,12 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     reading = replay(journal, ledger.apply)
     damage = list(reading.damage)
     if not reading.begun:  # the journal is created with the scene and starts with `SceneCreated`
-        damage.append(f"{journal.name} {'lacks its beginning' if journal.exists() else 'is gone'}")
+        damage.append(f"{journal.name} {'lacks its first event' if journal.exists() else 'is missing'}")
     broken = reading.broken or not reading.begun
     begun = reconstruction_of(definition or {})
     if begun is not None and begun.number > ledger.reconstruction:
         # The order relative to the restart is unknown, so events of states may belong to an earlier reconstruction.
-        damage.append(f"{journal.name} does not have the beginning of reconstruction {begun.number} any more")
+        damage.append(f"{journal.name} no longer contains the start of reconstruction {begun.number}")
         broken, ledger = True, Ledger(scene)
         ledger.apply(begun)
         replay(journal, lambda event: None if isinstance(event, RECONSTRUCTION_EVENTS) else ledger.apply(event))
@@ -121,11 +121,11 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         {event.index for event in events if isinstance(event, FrameAccepted | CameraAccepted)}
     ):
         listed = ", ".join(map(str, recovered_frames))
-        damage.append(f"the journal does not name the records of frames {listed} any more; used as they were found")
+        damage.append(f"the journal no longer lists the records of frames {listed}; they were used as found")
     damage += in_states
     debris = _unreferenced(ledger, sizes)
     if broken and debris:
-        damage.append(f"{len(debris)} records of pictures belong to nothing that is known; left until the next start")
+        damage.append(f"{len(debris)} image records belong to no known frame; they are kept until the next start")
     elif debris:
         remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
@@ -144,7 +144,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         if lost:
             ledger.frames.set_files(entry.index, tuple(name for name in entry.files if name in sizes))
             if entry.state == FrameState.COMMITTED:
-                damage.append(f"frame {entry.index}: its record is gone from the frame log: {', '.join(lost)}")
+                damage.append(f"frame {entry.index}: its record is missing from the frame log: {', '.join(lost)}")
         if entry.state == FrameState.QUEUED and (reason := _fault_of(frames, entry.files, lost)):
             damage.append(f"frame {entry.index}: {reason}")
             gone = FrameFailed(index=entry.index, reason=reason)
@@ -156,7 +156,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
             known = SceneCreated(definition=dict(definition))
             good = write_journal(journal, iter((known, *events_of(ledger))))
             events = []
-            damage.append(f"{journal.name} was written anew from what is known")
+            damage.append(f"{journal.name} was rewritten from the recovered data")
         except OSError as error:
             if not no_room(error):
                 raise
@@ -164,7 +164,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
 
 
 def _unreferenced(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
-    """Returns the records that no event references."""
+    """Returns the names of the records that no event references."""
     named = {name for entry in ledger.frames.with_pictures() for name in entry.files}
     named |= {name for frame in ledger.open.values() for name in frame.files}
     return set(sizes) - named
@@ -188,7 +188,7 @@ def _recomputable(ledger: Ledger, states: _States, broken: bool, deletes: bool) 
     """
     oldest = min(sorted(states.times)[1:], default=0) if deletes else 0
     return {
-        entry.index: states.damaged.get(entry.index, "its state is gone from the disk")
+        entry.index: states.damaged.get(entry.index, "its state is missing from the disk")
         for entry in ledger.frames.with_pictures()
         if entry.state in (FrameState.QUEUED, FrameState.COMMITTED)
         and entry.index < states.last
@@ -230,7 +230,7 @@ def _events_of_records(
 
 
 def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[JournalEvent]:
-    """Returns the events of one frame, reconstructed from its records."""
+    """Returns the events of one frame, derived from its records."""
     pictures: dict[str, StoredPictures] = {}
     for name in names:
         with contextlib.suppress(FrameDamage):
@@ -258,7 +258,7 @@ def _fault_of(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     If the frame has several records, the worker itself drops damaged ones.
     """
     if lost:
-        return f"its record is gone from the frame log: {', '.join(lost)}"
+        return f"its record is missing from the frame log: {', '.join(lost)}"
     if len(files) == 1:
         try:
             read_pictures(folder, files[0])

@@ -8,7 +8,7 @@ from typing import Any
 from client.wire import FrameReportModel
 
 WIRE_NAMES = {"used": "used_cameras", "dropped": "dropped_cameras", "frozen": "frozen_gaussians"}
-"""API names of commit record fields that are renamed; all others keep their name, which a test checks."""
+"""API names of commit record fields that are renamed; all others keep their names. A test checks the mapping."""
 NOT_SENT = frozenset({"index", "time", "publish_seconds", "resumed"})
 """Commit record fields that are not sent.
 

@@ -1,4 +1,4 @@
-"""Conversion of a ledger to events, from which a damaged or deleted journal is rewritten."""
+"""Conversion of a ledger to events, to rewrite a damaged or deleted journal."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ from server.storage.ledger import Ledger
 FRAMES_PER_EVENT = 10_000
 """Maximum number of frames per event, because the head of a record has a limited size."""
 OWN_ERROR = (FrameState.FAILED, FrameState.MISSING)
-"""States for which a frame's error explains the state itself.
+"""States in which the error of a frame explains the state itself.
 
 In other states, the error explains why the committed state no longer exists.
 """
-BEFORE_FIRST = "before the journal was written anew"
+BEFORE_FIRST = "before the journal was rewritten"
 
 
 def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
     """Yields events that reproduce the ledger, except for the committed states on disk (`Ledger.reconcile`).
 
-    Committed and updating frames become queued ones. The reasons why frames were closed and why workers died are lost.
+    Committed and updating frames become queued frames. The reasons why frames were closed and why workers died are
+    lost.
     """
     if ledger.begun is not None:
         yield ledger.begun
@@ -53,7 +54,7 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
             else:
                 deleted.append(index)
         if not entry.files and (entry.identity is not None or index == count - 1):
-            bare.append(index)  # the last frame always needs an event, so that it exists
+            bare.append(index)  # the last frame needs an event so that it exists
     for first in range(0, len(deleted), FRAMES_PER_EVENT):
         yield StatesDeleted(frames=tuple(deleted[first : first + FRAMES_PER_EVENT]))
     for first in range(0, len(bare), FRAMES_PER_EVENT):

@@ -1,1 +1,1 @@
-"""WebSocket subscriptions to scenes: subscribers, their outgoing messages and their live queries."""
+"""WebSocket subscriptions to scenes: subscribers, their outgoing messages, and live queries."""

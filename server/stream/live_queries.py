@@ -1,6 +1,6 @@
 """Live queries for views, tracks and parts; each has at most one query and one message in flight.
 
-A live query is issued only after its previous message was sent, and asks for the newest frame at that time. Slow
+A live query is issued only after the previous answer was sent, and requests the frame that is the newest then. Slow
 clients thus cause less load, and a dragged camera is rendered only at its current pose.
 """
 
@@ -29,12 +29,12 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class LiveSharedQuery:
-    """Query of a subscription at one point in time.
+    """Query of a live subscription at one point in time.
 
     Attributes:
         key: key that is equal for all subscribers that would get the same answer.
-        query: query to the readers.
-        head: head of the message that carries the answer; media type and headers are filled in from the answer.
+        query: query to send to the readers.
+        head: head of the message with the answer; its media type and headers are filled in from the answer.
         changes: number of changes that the answer covers.
     """
 
@@ -45,11 +45,11 @@ class LiveSharedQuery:
 
 
 class LiveQuery(ABC):
-    """Subscription to views, tracks or parts.
+    """Live subscription to views, tracks or parts.
 
     Attributes:
-        request: the client's current request.
-        tag: the client's tag for that request, echoed in every message sent for it.
+        request: current request of the client.
+        tag: tag that the client gave the request, echoed in every message sent for it.
     """
 
     request: Any
@@ -111,7 +111,7 @@ class LiveQuery(ABC):
 
     def _ask(self) -> LiveSharedQuery:
         query = self.query()
-        # Parts are computed from the whole history, so the same query has a different answer after a commit.
+        # Parts are computed from the whole history, so the same query may have a different answer after a commit.
         newest = self.scene.committed[-1] if self.needs_all_frames(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
         return LiveSharedQuery((fingerprint(query), newest), query, head, self._changes)
@@ -125,7 +125,7 @@ class LiveQuery(ABC):
         return False
 
     def on_sent(self, head: BinaryHead) -> None:
-        """Called after the message with this head was put into the outbox."""
+        """Called after a message with this head was put into the outbox."""
         return
 
     @abstractmethod
@@ -142,7 +142,7 @@ class LiveQuery(ABC):
 
 
 class LiveRender(LiveQuery):
-    """Live view of the newest or a chosen frame from a movable camera."""
+    """Live view of the newest or a chosen frame from a moving camera."""
 
     request: RenderRequest
 
@@ -180,7 +180,7 @@ class LiveTracks(LiveQuery):
     def query(self) -> TracksQuery:
         """Returns the query for the frames that have not been sent yet."""
         first = self.request.first if self._from is None else self._from
-        if self._at is None:  # fixed now, because retention may later delete the first frames
+        if self._at is None:  # fixed at the first query, because retention may later delete the first frames
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
         return tracks_query(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
 
@@ -190,7 +190,7 @@ class LiveTracks(LiveQuery):
         return _head("tracks", query.frames[-1]).model_copy(update={"first": query.frames[0]})
 
     def on_sent(self, head: BinaryHead) -> None:
-        """Continues after the last frame that was sent."""
+        """Advances to the frame after the last one that was sent."""
         self._from = head.frame + 1
 
 

@@ -1,4 +1,4 @@
-"""Outgoing messages of one subscriber: replies in order, and only the newest message per subscription."""
+"""Outgoing messages of one subscriber: all replies in order, but only the newest message of each subscription."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from server.counters import STREAM_MISSED
 MAX_UNSENT_REPLIES = 64
 """Maximum number of unsent replies.
 
-At this limit the service stops reading from the client until the client has read replies.
+At this limit, the service stops reading from the client until the client has read some of them.
 """
 
 Make = Callable[[int], str | bytes]
-"""Factory that builds a message just before it is sent, from the number of messages that it replaces."""
+"""Function that builds a message just before it is sent, given the number of messages that it replaces."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class _Slot:
 
 
 class Outbox:
-    """Queue of unsent messages of a subscriber on one event loop; its size is bounded by the subscription count."""
+    """Queue of unsent messages to a subscriber; its size is bounded by the number of subscriptions and replies."""
 
     def __init__(self) -> None:
         self._replies: deque[str] = deque()
@@ -39,7 +39,7 @@ class Outbox:
         self._last = False
 
     async def reply(self, message: Model) -> None:
-        """Adds a message that must be delivered; waits while `MAX_UNSENT_REPLIES` replies are unsent."""
+        """Adds a message that must not be skipped; waits while `MAX_UNSENT_REPLIES` replies are unsent."""
         async with self._news:
             await self._news.wait_for(lambda: len(self._replies) < MAX_UNSENT_REPLIES)
         self._reply(message)
@@ -54,13 +54,14 @@ class Outbox:
         self._poster.set()
 
     def put(self, id: str, make: Make, *, missed: int = 0, weight: int = 1) -> None:
-        """Sets the newest message of a subscription, replacing an unsent one.
+        """Sets the newest message of a subscription, replacing its unsent message, if any.
 
         Args:
             id: id of the subscription.
             make: builds the message when it is sent.
-            missed: number of messages that it replaced before it was put here.
-            weight: number added to the `missed` count of its successor if it is replaced before it is sent.
+            missed: number of messages that this message replaced before it was added.
+            weight: number added to the `missed` count of the next message if this message is replaced before it is
+                sent.
         """
         if self._last:
             return
@@ -68,16 +69,16 @@ class Outbox:
         STREAM_MISSED.inc(missed + (0 if old is None else old.weight))
         if old is not None:
             missed += old.missed + old.weight
-        # Keeps the position of the replaced message, so that frequent changes do not move it to the end each time.
+        # Keeps the position of the replaced message, so that a frequently replaced message is not always the last.
         self._slots[id] = _Slot(make, missed, weight)
         self._poster.set()
 
     def drop(self, id: str) -> None:
-        """Discards the unsent message of a subscription."""
+        """Discards the unsent message of a subscription, if any."""
         self._slots.pop(id, None)
 
     async def sent(self, id: str) -> None:
-        """Waits until the subscription has no unsent message."""
+        """Waits until a subscription has no unsent message."""
         async with self._news:
             await self._news.wait_for(lambda: id not in self._slots and self._sending != id)
 

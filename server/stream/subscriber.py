@@ -1,4 +1,4 @@
-"""Client of a scene's stream: its subscriptions, and the messages generated from the scene's events."""
+"""Client of a scene's stream, with its subscriptions and the messages generated from the scene's events."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from server.stream.outbox import Outbox
 T = TypeVar("T")
 
 MAX_SUBSCRIPTIONS = 16
-"""Maximum number of subscriptions per subscriber, enough for a page with several views.
+"""Maximum number of subscriptions per stream, enough for a page with several views.
 
-A client that needs more can open a second stream.
+A client that needs more can open another stream.
 """
 MESSAGE_KB = 256
 """Maximum size in kB of a message from a subscriber, enough for about 8000 pixels to track."""
@@ -56,7 +56,7 @@ class Subscriber:
     """Subscriber to a scene on behalf of one client; the route that owns the connection drains its outbox.
 
     Attributes:
-        closing: code and reason with which the connection is closed after the last message of the outbox.
+        closing: code and reason with which to close the connection after the last message of the outbox.
     """
 
     def __init__(self, scene: Scene, channel: Channel) -> None:
@@ -81,16 +81,16 @@ class Subscriber:
         await self.outbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
 
     async def handle_message(self, text: str | None) -> None:
-        """Handles a text message of the client; invalid ones get an error reply and have no other effect.
+        """Handles a message from the client; an invalid one gets an error reply and has no other effect.
 
         Args:
-            text: the message, or None if a binary message was received.
+            text: text of the message, or None if a binary message was received.
         """
         id: str | None = None
         tag: int | None = None
         try:
             if text is None:
-                raise Problem(422, "a binary message", field="message", remedy="send JSON in text messages")
+                raise Problem(422, "the message is binary", field="message", remedy="send JSON in text messages")
             message = _validate(CLIENT_MESSAGE.validate_json, text)
             id = message.id
             if isinstance(message, Unsubscribe):
@@ -131,8 +131,8 @@ class Subscriber:
         self.outbox.close_with(SceneGone(reason=reason))
 
     def on_restart(self) -> None:
-        """Handles the restart of the reconstruction: the client must reconnect, as after a service restart."""
-        self.closing = (SCENE_RESTARTS, "the reconstruction is begun anew")
+        """Handles a restart of the reconstruction; the client must reconnect, as after a restart of the service."""
+        self.closing = (SCENE_RESTARTS, "the reconstruction is being restarted")
         self.outbox.close_with(None)
 
     # Subscriptions.
@@ -141,7 +141,7 @@ class Subscriber:
         if id not in self._topics:
             raise Problem(
                 404,
-                f"no subscription {id!r}",
+                f"there is no subscription {id!r}",
                 field="id",
                 value=id,
                 remedy="subscribe first, with an id of your choice",
@@ -154,7 +154,7 @@ class Subscriber:
         if message.id not in self._topics and len(self._topics) >= MAX_SUBSCRIPTIONS:
             raise Problem(
                 429,
-                f"{count_noun(len(self._topics), 'subscription')} are already open, the maximum",
+                f"the stream already has {count_noun(len(self._topics), 'subscription')}, the maximum",
                 field="subscriptions",
                 value=MAX_SUBSCRIPTIONS,
                 remedy="unsubscribe from another one, or open a second stream",
@@ -180,7 +180,7 @@ class Subscriber:
         if message.id not in self._live:
             raise Problem(
                 422,
-                f"topic {topic} cannot be updated",
+                f"subscriptions to topic {topic} cannot be updated",
                 field="id",
                 value=message.id,
                 remedy="update subscriptions to render, tracks or parts",

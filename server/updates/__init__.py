@@ -1,1 +1,1 @@
-"""Scene updates: sends frames to the worker process and records their outcome."""
+"""Updates of scenes: sends frames to the worker process and records their outcomes."""

@@ -1,4 +1,4 @@
-"""Frame reports of a scene; commit records that are not in memory are read from disk."""
+"""Frame reports of a scene, based on commit records in memory and on disk."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from server.storage.ledger import Ledger
 
 
 def first_frame_facts(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the parts of the first frame's commit record that later status reports need.
+    """Returns the parts of the first frame's commit record that the scene's status needs later.
 
-    These are mainly its cloud and calibration. The result is empty for the record of any other frame.
+    These are mainly the point cloud and the calibration. The result is empty for the record of any other frame.
     """
     if not (record.get("cloud") or record.get("calibration")):
         return {}
@@ -28,8 +28,8 @@ class FrameReports:
 
     Args:
         ledger: ledger of the scene.
-        states: folder of its committed states.
-        damaged: called with unreadable files, as a mapping from name to reason.
+        states: folder of the committed states.
+        damaged: called with a mapping from the name of each unreadable file to the reason.
     """
 
     def __init__(self, ledger: Ledger, states: Path, damaged: Callable[[Mapping[str, str]], None]) -> None:
@@ -63,15 +63,15 @@ class FrameReports:
         return entry.report_with(record)
 
     async def is_committed(self, index: int) -> bool:
-        """Returns whether a readable state of the frame is on disk, regardless of the ledger."""
+        """Returns whether a readable state of the frame exists on disk, regardless of the ledger."""
         return bool(await self.record(index))
 
     async def record(self, index: int) -> Mapping[str, Any]:
-        """Reads a commit record from disk; returns an empty mapping if the state is deleted or damaged."""
+        """Reads a commit record from disk; returns an empty mapping if the state was deleted or is damaged."""
         return await asyncio.to_thread(self._read, index)
 
     def _read(self, index: int) -> dict[str, Any]:
-        """Reads a commit record in the current thread; see `record`."""
+        """Reads a commit record. Blocking; see `record`."""
         with self._turn:
             try:
                 if self._history is None:

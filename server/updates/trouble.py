@@ -1,4 +1,4 @@
-"""Reason why a scene is degraded: a message about its last frame, its worker or the disk."""
+"""Reason why a scene is degraded, as a message about its newest frame, its worker or the disk."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from server.storage.ledger import Ledger
 
 
 class Trouble:
-    """Holder of the message that explains why a scene is degraded.
+    """Reason why a scene is degraded.
 
     Attributes:
-        sentence: the message, or None if the scene is not degraded. Code that sets it must publish the change.
+        sentence: message with the reason, or None if the scene is not degraded. Code that sets it must publish the
+            change.
     """
 
     def __init__(self, publisher: Publisher, sentence: str | None) -> None:
@@ -19,17 +20,17 @@ class Trouble:
         self.sentence = sentence
 
     def report(self, sentence: str) -> None:
-        """Sets the message and publishes the change."""
+        """Sets the message and publishes the status change."""
         self.sentence = sentence
         self._publisher.publish_status()
 
 
 def trouble_in_report(report: FrameReportModel) -> str | None:
-    """Returns why a scene is degraded, given the report of its newest finished frame, or None if it is not."""
+    """Returns why a scene is degraded according to its newest frame's report, or None if it is not degraded."""
     if report.state == FrameState.FAILED:
         return f"frame {report.index} failed: {report.error}"
     if report.outcome is not None and report.outcome.degraded:
-        verb = "" if report.outcome.rejected else "committed in part: "
+        verb = "" if report.outcome.rejected else "partly committed: "
         return f"frame {report.index} was {verb}{report.degraded}"
     if report.dropped_cameras:
         left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())
@@ -38,6 +39,6 @@ def trouble_in_report(report: FrameReportModel) -> str | None:
 
 
 def last_trouble(ledger: Ledger) -> str | None:
-    """Returns the problem with the newest committed or failed frame, or None."""
+    """Returns why a scene is degraded according to its newest committed or failed frame, or None."""
     last = ledger.last_tried()
     return None if last is None else trouble_in_report(ledger.frames[last].report)

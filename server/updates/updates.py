@@ -41,15 +41,15 @@ log = logging.getLogger("scas4d.server")
 
 
 class Updates:
-    """Updates of one scene and the worker that runs them. All methods run on the event loop.
+    """Scheduler of one scene's updates. All methods run on the event loop.
 
-    An acknowledged frame waits in the ledger until `begin` sends it to the worker as `FrameReady`. The worker answers
+    An acknowledged frame waits in the ledger until `begin` sends it to the worker as `FrameReady`. The worker responds
     with `FrameCommitted` or `FrameFailedInWorker`, or it dies. `_commit`, `_record_failure` and `_retry_or_fail` record
     the outcome.
 
     Args:
         scene_log: journal, ledger and frame log of the scene.
-        damage: damage messages of the scene.
+        damage: log of damaged files of the scene.
         worker: supervisor of the worker process.
         mending: repair queue of the scene.
         readers: reader processes of the scene.
@@ -58,13 +58,13 @@ class Updates:
         publisher: publisher of the scene's events.
         background: background tasks of the scene.
         keep_frames: retention rule for images.
-        first: initial value of the attribute.
+        first: initial value of the attribute `first`.
 
     Attributes:
-        clock: predictor for the end of the current update.
+        clock: predictor of the end of the current update.
         worker: supervisor of the worker process.
-        progress: progress of frame 0 during its reconstruction, otherwise None.
-        first: parts of the first frame's report needed later, such as its cloud and calibration.
+        progress: progress of frame 0 while it is being reconstructed, otherwise None.
+        first: facts about the first frame; see `first_frame_facts`.
     """
 
     def __init__(
@@ -101,14 +101,14 @@ class Updates:
         self._pauses = 0
         self._stopped = False
         self._rule: IngestSettings | None = None
-        """Retention rule for states that the worker has not confirmed yet."""
+        """Retention rules for states that the worker has not confirmed yet, or None."""
         self._rule_sent = False
         self._repair_timer: asyncio.TimerHandle | None = None
         """Timer that calls `begin` again when a repair is waiting for disk space."""
         worker.listen(self._on_message, self._on_worker_end)
 
     def on_queue_room(self, call: Callable[[], Awaitable[None]]) -> None:
-        """Sets the coroutine function that closes open frames after an update has freed space in the queue."""
+        """Sets the coroutine function that closes open frames when an update has freed space in the queue."""
         self._room_made = call
 
     @property
@@ -118,7 +118,7 @@ class Updates:
 
     @property
     def has_work(self) -> bool:
-        """Whether work is in progress or pending: a frame, repair, retention rule, worker restart or hold of updates.
+        """Whether a frame, repair, retention change, worker restart or suspension of updates is in progress or pending.
 
         Waiting frames of a paused or failed scene do not count.
         """
@@ -131,7 +131,7 @@ class Updates:
         return [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
 
     def begin(self) -> None:
-        """Sends the next waiting frame to an idle worker; call this whenever either condition may have changed."""
+        """Sends the next waiting frame to the worker if it is idle; call this whenever either may have changed."""
         if self._stopped:
             return
         self._publisher.publish_status()
@@ -166,7 +166,7 @@ class Updates:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Context manager that sends no new frame to the worker; the current update continues."""
+        """Context manager inside which no new frame is sent to the worker; the current update continues."""
         self._pauses += 1
         try:
             yield
@@ -181,7 +181,7 @@ class Updates:
             case Ready():
                 self._background.run(self._resume(message, self.worker.life))
             case Progressed():
-                over = message.stage == STAGE and message.done == message.total  # an update reports only this stage
+                over = message.stage == STAGE and message.done == message.total  # the only stage that an update reports
                 self.progress = None if over else ProgressModel(**vars(message))
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self._publisher.publish_status()
@@ -200,20 +200,20 @@ class Updates:
                 if frames:
                     self._readers.refresh(frames)
                 self.begin()
-                if not self.first:  # the first report may be readable now
+                if not self.first:  # the first frame's report may be readable now
                     self._background.run(self._reread_first_report())
             case WaitingForDisk():
                 self.clock.stall(message.seconds)
-                self._trouble.report(f"frame {message.index} waits for room on the disk: {message.reason}")
+                self._trouble.report(f"frame {message.index} is waiting for disk space: {message.reason}")
             case WaitsForNode():
                 self._trouble.report(message.reason)
             case ResumeFailed():
-                self._ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
+                self._ledger.fatal = f"cannot resume from the committed states: {message.reason}"
                 log.error("scene %s: %s", self._ledger.scene, self._ledger.fatal)
                 self._publisher.publish_status()
 
     async def _resume(self, ready: Ready, life: object) -> None:
-        """Reconciles the ledger with the committed states that a new worker has loaded, and continues."""
+        """Reconciles the ledger with the committed states that a new worker has loaded, then continues."""
         ledger = self._ledger
         newest = ledger.committed[-1] if ledger.committed else -1
         again = self._repair_queue.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
@@ -226,7 +226,7 @@ class Updates:
         if ready.indices and ready.report:
             self._record(ready.indices[-1], ready.report)
             self._readers.refresh()
-            if ready.indices[-1] > newest:  # committed by a worker that died before it could report it
+            if ready.indices[-1] > newest:  # committed by a worker that died before it reported the commit
                 self._publisher.publish_frame(ledger.frames[ready.indices[-1]].report)
         if life is None or life is not self.worker.life:  # the worker died in the meantime
             return
@@ -271,7 +271,7 @@ class Updates:
         self._index, self.progress = None, None
         self._trouble.sentence = trouble_in_report(self._ledger.frames[event.index].report)
         if event.fatal:
-            async with self._log.lock:  # include a frame that is just being acknowledged
+            async with self._log.lock:  # waits for a frame that is being acknowledged
                 pass
             await self._fail_waiting()
         log.warning("scene %s: %s", self._ledger.scene, self._trouble.sentence)
@@ -292,12 +292,12 @@ class Updates:
         self.first = first_frame_facts(record) or self.first
 
     async def _reread_first_report(self) -> None:
-        """Rereads the first frame's report, which was unreadable before."""
+        """Reads the first frame's report again after it was unreadable."""
         if self._ledger.committed:
             self.first = first_frame_facts(await self._reports.record(self._ledger.committed[0])) or self.first
 
     async def retain(self) -> None:
-        """Deletes images under the scene's retention rule, except those needed to recompute states."""
+        """Deletes images according to the scene's retention rule, except those needed to recompute states."""
         gone = [i for i in self._log.deletable(self._keep_frames) if i not in self._repair_queue.waiting]
         if not gone:
             return
@@ -309,7 +309,7 @@ class Updates:
         await self._log.write(event)
 
     async def set_retention(self, rules: IngestSettings) -> None:
-        """Applies new retention rules and deletes everything beyond them."""
+        """Applies new retention rules and deletes the images and states that exceed them."""
         before = self.worker.spec.retention
         if (rules.keep_states, rules.exact_states) != (before.keep_states, before.exact_states):
             self.worker.spec = replace(self.worker.spec, retention=rules)
@@ -327,7 +327,7 @@ class Updates:
             return
         counters.RESTARTS.labels("worker").inc()
         own, delay = self.worker.deaths.note_death(reason)
-        self._trouble.sentence = f"the worker is gone: {reason}; it is started again in {delay:g} s"
+        self._trouble.sentence = f"the worker exited: {reason}; restarting it in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self._trouble.sentence)
         self._background.run(self._retry_or_fail(reason, own, delay))
 
@@ -339,7 +339,7 @@ class Updates:
                 death = WorkerDied(index=index, reason=str(reason), own=own)
                 await self._log.write(death)
                 self._ledger.apply(death)
-                # If the worker died after its commit but before its message, the next worker reports the commit.
+                # If the worker died between the commit and its message, the next worker reports the commit.
                 event = give_up_event(self._ledger.frames[index], death)
                 if event is not None and not await self._reports.is_committed(index):
                     await self._record_failure(event)
@@ -347,7 +347,7 @@ class Updates:
         self.worker.start_in(delay)
 
     def stop(self) -> None:
-        """Stops starting workers, sending frames and repairing damage."""
+        """Prevents any further worker start, update or repair."""
         self._stopped = True
         self.worker.close()
         self._repair_queue.stop()

@@ -1,4 +1,4 @@
-"""Prediction of the end of the current update, from which clients learn how long to wait."""
+"""Prediction of when the current update ends, so that clients know how long to wait."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import Callable
 from statistics import median
 
 UPDATES_KEPT = 8
-"""Number of recent updates in the median; small enough to follow a budget change within a few frames."""
+"""Number of recent updates in the median, small enough to adapt to a budget change within a few frames."""
 FIRST_GUESS_S = 1.0
 """Predicted seconds per update before any update has been timed."""
 SHORTEST_S = 0.1
-"""Shortest prediction in seconds."""
+"""Minimum prediction in seconds."""
 OVERDUE = 0.25
 """Predicted remaining time of an overdue update, as a fraction of the time by which it exceeds its prediction.
 
-Between two stages of frame 0, it is the fraction of the elapsed time.
+Between two stages of frame 0, the prediction is this fraction of the elapsed time.
 """
 
 
 class WorkClock:
-    """Predictor for the end of the current update, based on earlier updates and its progress.
+    """Predictor of the end of the current update, based on the durations of earlier updates and on its progress.
 
     Frame 0 is not counted as an update, because it takes minutes while an update takes about a second.
 
@@ -55,7 +55,7 @@ class WorkClock:
         return median(self._updates) if self._updates else FIRST_GUESS_S
 
     def begin(self, *, first: bool) -> None:
-        """Records the start of a frame; ``first`` means that no committed state precedes it."""
+        """Records the start of a frame; ``first`` is true if no committed state precedes it."""
         self._began, self._first, self._stalled_until = self._now(), first, None
         self._stage, self._done, self._first_end = "", 0.0, None
 
@@ -70,17 +70,17 @@ class WorkClock:
         self._first_end = None if seconds is None else self._now() + seconds
 
     def stall(self, seconds: float) -> None:
-        """Records that the current frame waits for disk space and is retried after the given seconds."""
+        """Records that the current frame is waiting for disk space and will be retried after `seconds`."""
         self._stalled_until = self._now() + seconds
 
     def end(self, *, committed: bool) -> None:
-        """Records the end of a frame; frames that stalled or were not committed do not count as updates."""
+        """Records the end of a frame; frames that stalled or were not committed are not timed."""
         if committed and self._began is not None and not self._first and self._stalled_until is None:
             self._updates.append(self._now() - self._began)
         self._began = self._stalled_until = None
 
     def remaining(self) -> float:
-        """Returns the predicted seconds until the current frame ends, or those of one update if there is none."""
+        """Returns the predicted seconds until the current frame ends, or the duration of an update if there is none."""
         if self._began is None:
             return max(SHORTEST_S, self.update_seconds)
         now = self._now()

@@ -1,6 +1,6 @@
 """Supervision of a scene's worker process: starts it, counts its crashes and restarts it.
 
-Whether the worker itself caused a crash determines when it is restarted and when a frame is given up.
+The cause of a crash, internal or external, determines when the worker is restarted and when the frame fails.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ OWN_SIGNALS = frozenset(
     {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSYS, signal.SIGTRAP}
 )
 OWN_DEATHS = 2
-"""Number of crashes caused by the worker itself after which a frame fails."""
+"""Number of crashes caused by the worker itself after which the frame fails."""
 OTHER_DEATHS = 6
-"""Number of external kills after which a frame fails, because it is probably the cause."""
+"""Number of external kills after which the frame fails, because it is probably the cause."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.5, 30.0
 
 MAX_FREE_LOSSES = 3
-"""Number of consecutive machine losses before the restart delay grows, in case a frame takes the machines down."""
+"""Number of consecutive machine losses before the restart delay grows, in case the frame brings machines down."""
 MAX_WAIT_AFTER_LOSS_S = 8.0
-"""Maximum delay in seconds after a machine loss; with other causes, the scene recovers within half a minute."""
+"""Maximum restart delay in seconds after a machine loss, so that the scene recovers within half a minute."""
 
 SWEEP_AFTER_S = 120.0
-"""Seconds for which states of an abandoned worker are kept, because NFS may cache the old link for up to a minute."""
+"""Seconds for which the states of an abandoned worker are kept, since NFS may cache the old link for up to a minute."""
 
 
 class WorkerDeaths:
-    """Counter of the crashes of one scene's worker."""
+    """Counter of crashes of one scene's worker."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -54,15 +54,15 @@ class WorkerDeaths:
         self._oom_kills = oom_kills()
 
     def note_commit(self) -> None:
-        """Records a commit, which proves that the worker functions and resets the restart delays."""
+        """Records a commit, which proves that the worker is functional and resets the restart delays."""
         self._in_a_row = self._lost_in_a_row = 0
 
     def note_death(self, why: ProcessExit) -> tuple[bool, float]:
-        """Records the end of the worker process; the restart delay is shorter if its machine was lost.
+        """Records an exit of the worker process; the restart delay is shorter if its machine was lost.
 
         Returns:
-            Whether the worker itself caused its end, and the seconds to wait before a restart. The worker is the cause
-            if it exited with an error, crashed (for example with SIGSEGV) or was killed for lack of memory.
+            Whether the worker itself caused the exit, and the seconds to wait before a restart. The worker is the cause
+            if it exited with an error, crashed (for example with SIGSEGV) or ran out of memory.
         """
         own = why.exit_code is not None and (why.exit_code > 0 or -why.exit_code in OWN_SIGNALS)
         own = own or (oom_kills() > self._oom_kills if why.out_of_memory is None else why.out_of_memory)
@@ -77,12 +77,12 @@ class WorkerDeaths:
 
 
 def give_up_event(entry: FrameEntry, death: WorkerDied) -> FrameFailed | None:
-    """Returns the event that fails the frame after a crash that is already counted, or None to retry the frame."""
+    """Returns the event that fails the frame after a crash that `entry` already counts, or None to retry the frame."""
     own, other = entry.rare_properties.own_deaths, entry.rare_properties.other_deaths
     if own >= OWN_DEATHS:
-        reason = f"the worker died {own} times while it reconstructed this frame: {death.reason}"
+        reason = f"the worker crashed {own} times while reconstructing this frame: {death.reason}"
     elif other >= OTHER_DEATHS:
-        reason = f"the worker was killed {other} times while it reconstructed this frame: {death.reason}"
+        reason = f"the worker was killed {other} times while reconstructing this frame: {death.reason}"
     else:
         return None
     return FrameFailed(index=death.index, reason=reason)
@@ -92,11 +92,11 @@ class WorkerProcess:
     """Supervisor of at most one worker process at a time. All methods run on the event loop.
 
     Args:
-        spec: specification of the scene; a changed one takes effect at the next start.
-        placement: placement that starts the process.
+        spec: specification of the scene; a change takes effect at the next start.
+        placement: starts the process.
 
     Attributes:
-        ready: whether the process has loaded the scene, set by the receiver of its `Ready` message.
+        ready: whether the process has loaded the scene; set by the receiver of its `Ready` message.
         life: identity of the running process, or None if there is none.
         deaths: counter of worker crashes.
     """
@@ -113,17 +113,17 @@ class WorkerProcess:
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
         self._ends = False
-        """Whether the process has ended and `start_in` has not been called yet."""
+        """Whether the process has exited and `start_in` has not been called yet."""
         self._epoch: int | None = None
         self._fencing: asyncio.Task[None] | None = None
-        """Task that begins an epoch for the next process."""
+        """Task that starts an epoch for the next process."""
 
     def listen(self, received: Callable[[Any], None], ended: Callable[[ProcessExit], None]) -> None:
-        """Sets the message receivers; call this once, before the first start.
+        """Sets the callbacks; call this once, before the first start.
 
         Args:
             received: called with every message from the process.
-            ended: called when the process ends unexpectedly; it must call `start_in` to start the next one.
+            ended: called when the process exits unexpectedly; it must call `start_in` to start the next process.
         """
         self._received, self._ended = received, ended
 
@@ -135,23 +135,23 @@ class WorkerProcess:
     def start(self) -> None:
         """Starts the process unless it is running, already starting, or the supervisor is closed."""
         if not (self._process or self._fencing or self._next or self._ends or self._closed):
-            # If the folder has epochs, a worker on another machine that was presumed dead may still be running.
+            # With epochs, a worker on another machine may still be running although it was presumed dead.
             if self._placement.fenced or self.spec.folder.states.is_symlink():
                 self._fencing = asyncio.get_running_loop().create_task(self._start_fenced())
             else:
                 self._start(self.spec)
 
     async def _start_fenced(self) -> None:
-        """Starts the process with its own epoch; a failure to begin the epoch is handled like a process exit."""
+        """Starts the process with its own epoch; a failure to start the epoch is handled like a process exit."""
         folder = self.spec.folder
         try:
             epoch = await asyncio.to_thread(begin_epoch, folder.states, folder.worker_lock)
             if not self._closed:
                 self._start(replace(self.spec, folder=replace(folder, epoch=epoch)))
-        except Exception as error:  # on any error, the scene must retry
+        except Exception as error:  # whatever the error is, the scene must retry
             if not isinstance(error, OSError | FencingError):
                 log.exception("scene %s", folder.name)
-            self._on_end(ProcessExit(None, f"the committed states cannot be taken over: {message_of(error)}"))
+            self._on_end(ProcessExit(None, f"cannot take over the committed states: {message_of(error)}"))
         finally:
             self._fencing = None
 
@@ -162,7 +162,7 @@ class WorkerProcess:
         self._process = self._placement.start(worker.main, spec, self._received, self._on_end)
 
     async def remove_earlier_epochs(self) -> None:
-        """Removes the states of earlier workers after a delay in which readers notice the new link."""
+        """Removes the states of earlier workers after a delay that gives readers time to notice the new link."""
         if (epoch := self._epoch) is None:
             return
         await asyncio.sleep(SWEEP_AFTER_S)
@@ -176,7 +176,7 @@ class WorkerProcess:
             self._next = asyncio.get_running_loop().call_later(seconds, self._restart)
 
     def send(self, message: Any) -> bool:
-        """Sends a message to a ready process; otherwise starts one and returns False."""
+        """Sends a message to the process if it is ready; otherwise starts the process and returns False."""
         if self.ready and self._process is not None:
             self._process.send(message)
             return True
@@ -184,13 +184,13 @@ class WorkerProcess:
         return False
 
     def close(self) -> None:
-        """Prevents any further start and cancels a scheduled one."""
+        """Cancels any scheduled start and prevents further ones."""
         self._closed = True
         if self._next is not None:
             self._next.cancel()
 
     async def stop(self, seconds: float) -> None:
-        """Stops the process, which has `seconds` to exit by itself; the next process repeats an unfinished frame."""
+        """Stops the process, killing it after `seconds`; the next process repeats an unfinished frame."""
         if self._fencing is not None:
             await asyncio.wait({self._fencing})  # a thread is changing the folder, which may be deleted next
         if self._process is not None:

@@ -1,24 +1,24 @@
-// Keys of the page: they work whatever control was used last.
+// Keyboard shortcuts of the page, which work no matter which control was used last.
 
 const MODES = { 1: "colour", 2: "depth", 3: "parts", 4: "alpha" };
 const ARROWS = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "PageUp", "PageDown"];
 const TYPED = "input[type=text], input[type=password], input[type=number], textarea";
 
-/** Whether a key belongs to the control that has the focus. */
+/** Whether the focused control handles a key itself. */
 function isItsOwn(target, key) {
   if (target.closest("dialog") || target.matches(TYPED)) return true;
-  if (target.matches("select")) return key.length > 1 || key === " "; // letters and digits are the page's
+  if (target.matches("select")) return key.length > 1 || key === " "; // letters and digits are shortcuts of the page
   if (target.matches("input[type=range], .scroll") || target.closest("[role=radiogroup]")) return ARROWS.includes(key);
   if (target.matches("button, a, summary, input")) return key === " " || key === "Enter";
   return false;
 }
 
 /**
- * Listens to the keys of the page.
+ * Registers the keyboard shortcuts of the page.
  *
- * @param view the live view, which has keys of its own
+ * @param view live view, which handles further keys itself
  * @param on { mode(name), step(count), live(), play(), nextCamera(), beside(), fit(), fullScreen(), snapshot() }
- * @param ready whether a scene is open
+ * @param ready returns whether a scene is open
  */
 export function listenToKeys(view, on, ready) {
   const actions = {
@@ -33,7 +33,7 @@ export function listenToKeys(view, on, ready) {
     else if (!view.key(event)) return;
     event.preventDefault();
   });
-  // What was pressed with a pointer does not keep the keys: space plays after a click on any button of the view.
+  // A control that was used with a pointer loses the focus, so that space plays after a click on any button of the view.
   const stage = document.getElementById("stage");
   const back = () => document.getElementById("overlay").focus({ preventScroll: true });
   let pointer = false;

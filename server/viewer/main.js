@@ -1,4 +1,4 @@
-// The page: opens a scene, and passes what comes of it to the view and the panels.
+// Main module of the page: opens a scene and passes its messages to the view and the panels.
 
 import { Manage } from "./manage.js";
 import { listenToKeys } from "./keys.js";
@@ -27,7 +27,7 @@ const view = new LiveView($("picture"), $("overlay"), {
   slow: (mode) => {
     const ready = page.status?.committed > 0;
     $("busy").hidden = !ready || page.lost;
-    $("busy").textContent = mode === "parts" ? "Finding the parts …" : "Waiting for the picture …";
+    $("busy").textContent = mode === "parts" ? "Computing the parts …" : "Waiting for the picture …";
   },
   turned: () => $("hint").classList.add("known"),
   stale: (stale) => {
@@ -39,7 +39,7 @@ const view = new LiveView($("picture"), $("overlay"), {
 const partList = new PartList($("parts"), $("parts-words"), (hiddenParts) => view.setExtras({ hiddenParts }));
 const beside = new Beside($("beside"));
 const timeline = new Timeline(() => {
-  if (!timeline.playing) remember(); // browsers bound how often an address may change
+  if (!timeline.playing) remember(); // browsers limit how often a page may change its URL
   view.setFrame(page.frame, true);
   showMoment();
 }, () => page.scene && remember(), { smooth: (...frames) => view.smooth(...frames), set: (...moment) => view.setBetween(...moment) });
@@ -102,7 +102,7 @@ function closeScene() {
   tradeoff.close();
   takeAway.close();
   Object.assign(page, { stream: null, status: null, rig: null, scene: null, tracks: [], failed: null, lost: false });
-  timeline.stop(); // it would keep the address of the scene that is open
+  timeline.stop(); // otherwise it would keep the URL of the open scene
   page.reports.clear();
   tracks.show();
   manage.show();
@@ -116,7 +116,7 @@ function closeScene() {
   delete $("view").dataset.tag;
 }
 
-/** Puts the scene to sleep that the page has kept awake. */
+/** Closes the open scene, which keeps it awake, and puts it to sleep. */
 async function letGo() {
   const { scene: id } = page;
   const name = page.status.name || id;
@@ -124,18 +124,18 @@ async function letGo() {
   list.leave();
   $("connection").textContent = "Not connected";
   $("connection").classList.remove("good");
-  curtain({ title: `${name} falls asleep`, share: null });
+  curtain({ title: `${name} is falling asleep`, share: null });
   for (let tries = 0; ; tries++) {
     try {
       await call("POST", `${scenePath(id)}/sleep`);
       break;
-    } catch (error) { // the service may not know yet that this page has gone
-      if (tries === SLEEP_TRIES) return curtain({ title: `${name} stays awake`, words: error.message, actions: [["Open it", () => list.choose(id)]] });
+    } catch (error) { // the service may not have noticed yet that this page has disconnected
+      if (tries === SLEEP_TRIES) return curtain({ title: `${name} is still awake`, words: error.message, actions: [["Open it", () => list.choose(id)]] });
       await new Promise((done) => setTimeout(done, 300));
     }
   }
   await list.look();
-  curtain({ title: `${name} is asleep`, words: "It has no processes and wakes at the next request.",
+  curtain({ title: `${name} is asleep`, words: "It has no processes and wakes up at the next request.",
     actions: [["Wake it", () => list.choose(id)], ...list.others(id)] });
 }
 
@@ -158,13 +158,13 @@ function connection(state, wait) {
   } else {
     page.lost = true;
     $("busy").hidden = true;
-    $("banner").textContent = `The connection to the service is lost. The next try is in ${wait < 1 ? "a moment" : `${Math.round(wait)} s`}; the page shows the last data that came. If this lasts, see whether the service runs.`;
+    $("banner").textContent = `The connection to the service was lost. Reconnecting in ${wait < 1 ? "a moment" : `${Math.round(wait)} s`}; the page shows the latest data received. If this persists, check that the service is running.`;
   }
 }
 
 function showStatus(status) {
   if (status.id !== page.scene) return;
-  if (page.status && status.reconstruction !== page.status.reconstruction) return openScene(status); // begun anew
+  if (page.status && status.reconstruction !== page.status.reconstruction) return openScene(status); // the reconstruction was restarted
   page.status = status;
   const chip = $("state");
   chip.hidden = false;
@@ -173,7 +173,7 @@ function showStatus(status) {
   chip.textContent = stateWords(status);
   chip.dataset.state = stateKey(status);
   $("trouble").hidden = !status.error;
-  $("trouble").textContent = status.error ? sentence(status.error) + (status.state === "failed" ? (token.reads() ? "" : " Begin again under Manage, or delete the scene.") : "") : "";
+  $("trouble").textContent = status.error ? sentence(status.error) + (status.state === "failed" ? (token.reads() ? "" : " Choose Begin again under Manage, or delete the scene.") : "") : "";
   showFacts($("facts"), status);
   showQueue($("queue"), $("queue-words"), status);
   showWarnings($("warnings"), $("to-check"), status.warnings);
@@ -236,7 +236,7 @@ function showMoment() {
 // The picture.
 
 function bulk(head, bytes) {
-  if (head.type === "render") view.receive(head, bytes).catch((error) => note(`The picture could not be shown: ${error.message}`));
+  if (head.type === "render") view.receive(head, bytes).catch((error) => note(`The picture cannot be shown: ${error.message}`));
   else if (head.type === "tracks") tracks.grow(head, JSON.parse(new TextDecoder().decode(bytes)));
 }
 
@@ -295,7 +295,7 @@ async function snapshot() {
 
 function fullScreen() {
   if (document.fullscreenElement) document.exitFullscreen();
-  else $("stage").requestFullscreen?.().catch((error) => note(`No full screen: ${error.message}`));
+  else $("stage").requestFullscreen?.().catch((error) => note(`Full screen is not available: ${error.message}`));
 }
 
 const fit = () => view.fit().catch((error) => note(error.message));
@@ -353,7 +353,7 @@ listenToKeys(view, {
 }, () => page.stream !== null);
 window.addEventListener("hashchange", () => {
   const { scene, frame, token: link } = wanted();
-  if (link) return location.reload(); // a link to share, in a tab that shows the page already
+  if (link) return location.reload(); // a share link was opened in a tab that already shows the page
   if (scene && scene !== page.scene) {
     closeScene();
     list.gone = false;

@@ -1,12 +1,12 @@
-// The dialog in which a scene is managed: its name, what it keeps, pausing, archiving, sleep, beginning again, deletion.
+// Dialog to manage a scene: its name and retention, pausing, archiving, sleep, restart of its reconstruction, and deletion.
 
 import { call, scenePath } from "./service.js";
 import { $, note, page, sentence } from "./page.js";
 
 export class Manage {
   /**
-   * @param changed called with the status that a change led to
-   * @param letGo puts the scene to sleep, and shows it no more
+   * @param changed called with the status after a change
+   * @param letGo closes the scene and puts it to sleep
    */
   constructor(changed, letGo) {
     this.dialog = $("manage");
@@ -33,7 +33,7 @@ export class Manage {
     this.dialog.showModal();
   }
 
-  /** Shows what can be done now; the status comes with every change. */
+  /** Updates the available actions; called whenever the status changes. */
   show() {
     const status = page.status;
     if (!status) return this.dialog.open && this.dialog.close();
@@ -55,7 +55,7 @@ export class Manage {
       if (given !== (page.status.ingest[field]?.last ?? null)) edit[field] = given === null ? {} : { last: given };
     }
     if (Object.keys(edit).length) await this.edit(edit, "saved");
-    else this.say("nothing was changed");
+    else this.say("no changes");
   }
 
   edit(edit, done) {
@@ -68,14 +68,14 @@ export class Manage {
 
   again() {
     const body = { discard: true };
-    return this.run(() => call("PUT", `${scenePath(page.scene)}/reconstructions/${page.status.reconstruction + 1}`, body), "begun again");
+    return this.run(() => call("PUT", `${scenePath(page.scene)}/reconstructions/${page.status.reconstruction + 1}`, body), "restarted");
   }
 
   async remove() {
     if (await this.run(() => call("DELETE", scenePath(page.scene)), "deleted")) this.dialog.close();
   }
 
-  /** The page itself keeps the scene awake: it lets go of it first. */
+  /** Closes the scene first, because the page itself keeps it awake. */
   sleep() {
     this.dialog.close();
     this.letGo();
@@ -101,7 +101,7 @@ export class Manage {
     else if (words) note(words);
   }
 
-  /** The first press asks, the second one does it. */
+  /** Asks for confirmation on the first press and acts on the second. */
   sure(button, words, act) {
     if (button.dataset.sure) return act();
     this.unsure();

@@ -1,10 +1,10 @@
-// What the modules of the page share: the scene that is open, its frames, and the places for words over the view.
+// State shared by the modules of the page (the open scene and its frames), and the messages over the view.
 
 const NOTE_MS = 6000;
 
 export const $ = (id) => document.getElementById(id);
 
-/** Makes an element; attributes that begin with "on" are listeners, null and false leave one out. */
+/** Creates an element; attributes that start with "on" are listeners, and null or false omits an attribute. */
 export function node(name, attributes = {}, ...children) {
   const made = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
@@ -15,7 +15,7 @@ export function node(name, attributes = {}, ...children) {
   return made;
 }
 
-/** A text with a capital letter and a full stop. */
+/** Adds a capital letter and a full stop to a text. */
 export const sentence = (text) => text && text[0].toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
 
 export const page = {
@@ -23,20 +23,20 @@ export const page = {
   stream: null,
   status: null,
   rig: null,
-  reports: new Map(), // of finished frames, by index
-  frame: null, // chosen; null follows the newest
+  reports: new Map(), // reports of finished frames, keyed by index
+  frame: null, // index of the chosen frame; null follows the newest
   tracks: [],
-  lost: false, // the connection
-  opened: 0, // times that a scene was opened or closed; one that begins anew is the same scene, and its answers are others
+  lost: false, // whether the connection is lost
+  opened: 0, // number of times a scene was opened or closed; tells answers for a restarted reconstruction from earlier ones
 };
 
 export const inOrder = () => [...page.reports.values()].sort((a, b) => a.index - b.index);
 export const readable = () => inOrder().filter((report) => report.state === "committed" && !report.deleted);
 
 /**
- * Covers the view with words.
+ * Covers the view with a message.
  *
- * @param words { title, words, detail, share, actions }: share of the work, 0…1, null where it is not known; actions [[label, run]]
+ * @param words { title, words, detail, share, actions }: share of the work that is done, 0…1, null if unknown; actions [[label, run]]
  */
 export function curtain({ title, words = "", detail = "", share, actions = [] }) {
   const box = $("curtain");
@@ -46,7 +46,7 @@ export function curtain({ title, words = "", detail = "", share, actions = [] })
   bar.hidden = share === undefined;
   if (share === null) bar.removeAttribute("value");
   else if (share !== undefined) bar.value = share;
-  if (box.dataset.said === said) return; // status comes several times a second: what has the focus keeps it
+  if (box.dataset.said === said) return; // the status arrives several times a second; a focused button must keep the focus
   box.dataset.said = said;
   box.querySelector("h2").textContent = title;
   box.querySelector("p").textContent = words;
@@ -57,7 +57,7 @@ export function curtain({ title, words = "", detail = "", share, actions = [] })
 
 let fading = 0;
 
-/** Says something at the top of the view; with the id of what failed it stays until that goes well. */
+/** Shows a note at the top of the view; with the id of a failed subscription, it stays until that subscription succeeds. */
 export function note(words, id = null) {
   page.failed = words ? id : null;
   clearTimeout(fading);

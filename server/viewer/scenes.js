@@ -1,4 +1,4 @@
-// The list of scenes, the address of the page, and the token.
+// List of scenes, the URL of the page, and the token.
 
 import { call, token } from "./service.js";
 import { NO_SCENE, noService } from "./states.js";
@@ -6,7 +6,7 @@ import { $, curtain, node, page } from "./page.js";
 
 const LIST_EVERY_MS = 4000;
 
-/** What the address of the page names: scene, frame. */
+/** Scene and frame in the URL of the page. */
 export const wanted = () => Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
 
 export function remember() {
@@ -15,7 +15,7 @@ export function remember() {
   history.replaceState(null, "", `#${words}`);
 }
 
-/** Takes the token of a link out of the address, where others would see it. */
+/** Removes the token of a share link from the URL, where others could see it. */
 function takeToken() {
   const words = new URLSearchParams(location.hash.slice(1));
   if (!words.has("token")) return;
@@ -28,17 +28,17 @@ const called = (scene) => (scene.name ? `${scene.name} (${scene.id.slice(0, 6)})
 const beside = (scene) => (scene.state === "failed" ? " · failed" : scene.archived ? " · archived" : scene.asleep ? " · asleep" : "");
 
 export class SceneList {
-  /** @param open opens a scene by its status in the list; listed: called whenever the service has listed its scenes */
+  /** @param open opens a scene, given its status  @param listed called after each update of the list */
   constructor(open, listed) {
     Object.assign(this, { open, listed });
     takeToken();
-    this.gone = false; // the scene that was open is not there any more: what was said of it stays
+    this.gone = false; // whether the open scene no longer exists; the message about it stays
     $("scenes").addEventListener("change", (event) => this.choose(event.target.value));
     setInterval(() => this.look(), LIST_EVERY_MS);
     document.addEventListener("visibilitychange", () => document.hidden || this.look());
   }
 
-  /** Lists the scenes again, and opens the one that is wanted. */
+  /** Updates the list of scenes, and opens the requested one. */
   async look() {
     let scenes;
     try {
@@ -68,7 +68,7 @@ export class SceneList {
     const words = scenes.map((scene) => called(scene) + beside(scene));
     select.disabled = scenes.length === 0;
     const there = [...select.options].filter((option) => option.value);
-    if (there.map((option) => option.value).join() === scenes.map((scene) => scene.id).join()) { // it may be open
+    if (there.map((option) => option.value).join() === scenes.map((scene) => scene.id).join()) { // the list may be open, so keep its options
       words.forEach((text, i) => (there[i].textContent = text));
       return;
     }
@@ -81,30 +81,30 @@ export class SceneList {
     this.open(this.scenes.find((scene) => scene.id === id) ?? { id });
   }
 
-  /** The name of a scene; its id where it has none, or is not listed. */
+  /** Name of a scene, or its id if it has no name or is not listed. */
   called(id) {
     const scene = (this.scenes ?? []).find((one) => one.id === id);
     return scene ? called(scene) : id;
   }
 
-  /** Buttons for all scenes but one. */
+  /** Buttons for all scenes except one. */
   others(id) {
     return (this.scenes ?? []).filter((scene) => scene.id !== id).map((scene) => [scene.name || scene.id, () => this.choose(scene.id)]);
   }
 
-  /** The address names a scene that is not here. No other scene is opened in its place: it would be taken for it. */
+  /** Reports that the scene in the URL does not exist. No other scene is opened instead, since it would be mistaken for it. */
   missing(id) {
     const actions = this.others(id);
-    curtain({ title: "There is no such scene", words: `The service has no scene ${id}. ${actions.length ? "Choose one:" : "It has no others either."}`, actions });
+    curtain({ title: "There is no such scene", words: `The service has no scene ${id}. ${actions.length ? "Choose one:" : "It has no scenes at all."}`, actions });
   }
 
-  /** No scene is shown until one is chosen. */
+  /** Shows no scene until one is chosen. */
   leave() {
     this.gone = true;
     history.replaceState(null, "", location.pathname);
   }
 
-  /** The scene that was open is gone, or may not be looked at any more. */
+  /** Reports that the open scene no longer exists or may no longer be viewed. */
   async ended(id, reason, status) {
     this.leave();
     if (status === 401 || status === 403) this.askForToken(true);

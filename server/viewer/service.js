@@ -1,11 +1,11 @@
-// Requests to the service. A failure is an Error whose message is a sentence for a person.
+// Requests to the service. A failure is an Error with a human-readable message.
 
 const KEY = "scas4d.token";
 
 export class ServiceError extends Error {
   constructor(problem) {
     const end = problem.detail.endsWith(".") ? "" : ".";
-    super(capital(problem.detail + end + (problem.remedy ? ` To mend it: ${problem.remedy}.` : "")));
+    super(capital(problem.detail + end + (problem.remedy ? ` To fix it: ${problem.remedy}.` : "")));
     this.status = problem.status;
   }
 }
@@ -16,13 +16,13 @@ export const token = {
   get: () => sessionStorage.getItem(KEY),
   set: (value) => sessionStorage.setItem(KEY, value),
   forget: () => sessionStorage.removeItem(KEY),
-  /** Whether the bearer may look and not change anything. */
+  /** Whether the token is read-only. */
   reads: () => sessionStorage.getItem(KEY)?.startsWith("scas4d.read.") ?? false,
-  /** Whether the bearer may look at one scene alone; a token that reads all has a star in place of the scene. */
+  /** Whether the token grants access to one scene only; one for all scenes has a star in place of the scene. */
   readsOne: () => token.reads() && !sessionStorage.getItem(KEY).startsWith("scas4d.read.*."),
 };
 
-/** Sends a request; returns the answer, whatever media type it has. */
+/** Sends a request and returns the response, of any media type. */
 export async function fetched(method, path, body, signal) {
   const headers = {};
   if (token.get()) headers.Authorization = `Bearer ${token.get()}`;
@@ -32,15 +32,15 @@ export async function fetched(method, path, body, signal) {
     response = await fetch(path, { method, headers, signal, body: body === undefined ? undefined : JSON.stringify(body) });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new ServiceError({ status: 0, detail: "the service does not answer" });
+    throw new ServiceError({ status: 0, detail: "the service does not respond" });
   }
   if (response.ok) return response;
   const problem = await response.json().catch(() => null);
   throw new ServiceError(problem?.detail ? problem
-    : { status: response.status, detail: `the service answered ${response.status} ${response.statusText}` });
+    : { status: response.status, detail: `the service responded with ${response.status} ${response.statusText}` });
 }
 
-/** Sends a request; returns the JSON of the answer, null where it has none. */
+/** Sends a request and returns the JSON in the response, or null if there is none. */
 export async function call(method, path, body) {
   const response = await fetched(method, path, body);
   return response.status === 204 ? null : response.json();
@@ -48,7 +48,7 @@ export async function call(method, path, body) {
 
 export const scenePath = (id) => `/v1/scenes/${encodeURIComponent(id)}`;
 
-/** Subprotocol of a ticket for one WebSocket: a browser cannot send a token with it. Without a token, none is needed. */
+/** Subprotocol with a ticket for one WebSocket, since a browser cannot send a token with it; null if there is no token. */
 export async function ticket() {
   if (!token.get()) return null;
   return (await call("POST", "/v1/tickets")).subprotocol;

@@ -1,4 +1,4 @@
-// A scene's stream (docs/stream.md): subscriptions that outlive a broken connection.
+// Stream of a scene (docs/stream.md), whose subscriptions survive a broken connection.
 
 import { scenePath, ServiceError, call, ticket } from "./service.js";
 
@@ -8,7 +8,7 @@ const WAITS_S = [0.3, 0.6, 1.2, 2.5, 5];
 
 export class Stream {
   /**
-   * @param scene id
+   * @param scene id of the scene
    * @param on { state(name, seconds), scene(message), frame(message), bulk(head, bytes), error(message), gone(reason) }
    */
   constructor(scene, on) {
@@ -69,7 +69,7 @@ export class Stream {
     }
   }
 
-  /** Finds the reason of a refused handshake with a request for the scene: the browser does not report it. */
+  /** Requests the scene to find out why a handshake was refused, because the browser does not report the reason. */
   async broken() {
     if (this.closed) return;
     try {

@@ -12,17 +12,17 @@ from studies.options import Changes, Page, Repeated, write_page
 
 def cluster(
     capture: Repeated,
-    frames: Annotated[int, typer.Option(min=3, help="Frames of each scene.")] = 12,
-    scenes: Annotated[int, typer.Option(min=1, help="Scenes at a time, on three nodes.")] = 6,
-    turns: Annotated[int, typer.Option(min=1, help="Turns of each placement.")] = 3,
-    views: Annotated[int, typer.Option(min=1, help="Views a turn, of a scene at rest.")] = 60,
+    frames: Annotated[int, typer.Option(min=3, help="Frames per scene.")] = 12,
+    scenes: Annotated[int, typer.Option(min=1, help="Number of concurrent scenes on the three nodes.")] = 6,
+    turns: Annotated[int, typer.Option(min=1, help="Repetitions of each placement.")] = 3,
+    views: Annotated[int, typer.Option(min=1, help="Views rendered per turn, of an idle scene.")] = 60,
     work: Annotated[Path, typer.Option(help="Folder for the services' data; its contents are deleted.")] = Path(
         "out/cluster"
     ),
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Measures what a Ray cluster of three nodes, on this machine, adds to updates and views, against local processes.
+    """Measures how much a three-node Ray cluster on this machine slows updates and views, against local processes.
 
     Example: scripts/bench cluster samples/robot --set static.iterations=300 --set update.iterations=20
     """
@@ -44,10 +44,10 @@ def cluster(
 
 
 def head(
-    times: Annotated[int, typer.Option(min=1, help="Kills of the head.")] = 20,
+    times: Annotated[int, typer.Option(min=1, help="How often the head is killed.")] = 20,
     out: Page = None,
 ) -> None:
-    """Measures for how long nothing is placed when a cluster's head, with Redis, is killed and started again at once.
+    """Measures how long a Ray cluster cannot place work after its head is killed and immediately restarted, with Redis.
 
     Example: scripts/bench head --times 20
     """

@@ -1,6 +1,6 @@
 """``scripts/bench cluster``: overhead of Ray for updates and views, and scenes on three nodes versus one machine.
 
-Both services run on this machine, in turns: what differs is how processes are started and how messages go.
+Both services run on this machine and take turns. They differ only in how processes start and how messages are sent.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from studies.running.study import FrameSender, Study
 
 PLACEMENTS = ("local", "ray")
 EVERY_S = 0.01
-"""Between two looks at whether a frame is committed."""
+"""Interval at which the study checks whether a frame is committed."""
 
 
 @dataclass
@@ -28,8 +28,9 @@ class CostFigures:
     """Measurements of one placement.
 
     Attributes:
-        updates: seconds from a frame's acknowledgement to its commit, frame by frame. views: seconds of a view.
-        throughput: committed frames a second of all scenes together, one a turn.
+        updates: seconds from the acknowledgement of each frame to its commit.
+        views: seconds per view.
+        throughput: committed frames per second over all scenes together, one value per turn.
     """
 
     updates: list[float] = field(default_factory=list)
@@ -40,10 +41,15 @@ class CostFigures:
 def measure(
     study: Study, address: str, *, scenes: int, turns: int, views: int, echo: Echo = print
 ) -> dict[str, CostFigures]:
-    """Runs both placements in alternation.
+    """Measures both placements, in alternation.
 
     Args:
-        study: its frames are sent to each scene. address: of the cluster.
+        study: study whose frames are sent to each scene.
+        address: address of the Ray cluster.
+        scenes: number of scenes for the throughput.
+        turns: repetitions of each placement.
+        views: views rendered per turn.
+        echo: prints the progress.
     """
     figures = {name: CostFigures() for name in PLACEMENTS}
     services = {
@@ -77,9 +83,9 @@ def summarize(found: dict[str, CostFigures], scenes: int) -> str:
     local, ray = found["local"], found["ray"]
     ratios = [there / here for here, there in zip(local.updates, ray.updates, strict=True)]
     rows = [
-        ("an update, median, s", median(local.updates), median(ray.updates), 3),
-        ("a view, median, ms", 1e3 * median(local.views), 1e3 * median(ray.views), 1),
-        (f"{scenes} scenes, frames a second, median", median(local.throughput), median(ray.throughput), 2),
+        ("update, median, s", median(local.updates), median(ray.updates), 3),
+        ("view, median, ms", 1e3 * median(local.views), 1e3 * median(ray.views), 1),
+        (f"{scenes} scenes, frames per second, median", median(local.throughput), median(ray.throughput), 2),
     ]
     table = ["| | local | Ray | ratio | difference |", "|---|---|---|---|---|"]
     for name, here, there, digits in rows:
@@ -89,7 +95,7 @@ def summarize(found: dict[str, CostFigures], scenes: int) -> str:
     low, middle, high = np.percentile(ratios, (25, 50, 75))
     table += [
         "",
-        f"Of the {len(ratios)} updates, frame by frame: {middle:.3f} times (half of them {low:.3f} to {high:.3f})",
+        f"Ratio per frame over {len(ratios)} updates: median {middle:.3f} (half of them {low:.3f} to {high:.3f})",
     ]
     return "\n".join(table)
 
@@ -103,7 +109,7 @@ def _begun(study: Study, service: Service) -> str:
 
 
 def _views(service: Service, scene: str, camera: str, count: int) -> list[float]:
-    """Returns the seconds of each view of an idle scene, without the first one."""
+    """Returns the seconds of each view of an idle scene, excluding the first view."""
     seconds = []
     for _ in range(count + 1):
         began = time.monotonic()
@@ -115,7 +121,7 @@ def _views(service: Service, scene: str, camera: str, count: int) -> list[float]
 
 
 def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str, str]) -> dict[str, list[float]]:
-    """Returns the seconds of each update of one scene per service; the services alternate with every frame."""
+    """Returns the seconds of each update of one scene per service; the services take turns, frame by frame."""
     seconds: dict[str, list[float]] = {name: [] for name in scenes}
     for index in range(1, len(study.frames)):
         for name in (PLACEMENTS, PLACEMENTS[::-1])[index % 2]:
@@ -129,7 +135,7 @@ def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str,
 
 
 def _together(study: Study, service: Service, scenes: int) -> float:
-    """Returns the frames per second that several scenes commit together, after their first frames."""
+    """Returns the combined frames per second that several scenes commit after their first frames."""
     ids = [_begun(study, service) for _ in range(scenes)]
     threads = [threading.Thread(target=_send_all, args=(study, service, id)) for id in ids]
     for id in ids:

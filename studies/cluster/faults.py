@@ -1,4 +1,4 @@
-"""Node failures in a cluster: no acknowledged frame may be lost, and no bit of the states may differ."""
+"""Node failures in a cluster: no acknowledged frame may be lost, and the states must be bit-identical."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests,
 Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 
 GOES_ON_S = 30.0
-"""A scene works again so soon after its node is gone."""
+"""Time within which a scene must resume after its node is lost."""
 HEAD_GONE_S = 10.0
-"""The head is away for so long."""
+"""How long the head stays down."""
 WAITS_S = 5.0
-"""A worker that is not placed after so long waits for room; to start takes a few seconds without."""
+"""A worker that is not placed after this time is waiting for room; otherwise it starts within a few seconds."""
 SWEPT_S = 180.0
-"""Folders of workers before are gone after so long."""
+"""Time within which the folders of earlier workers must be removed."""
 
 
 def killed_nodes(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Kills the node of the scene's worker with `kill -9` `count` times, at random moments; a new node joins."""
+    """Kills the node of the scene's worker with `kill -9`, `count` times at random; a new node joins each time."""
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []
@@ -51,23 +51,23 @@ def killed_nodes(
                 nodes.kill(node)
                 began = time.monotonic()
                 nodes.add()
-                wait_until(partial(_works, service, scene, before), "the scene did not go on")
+                wait_until(partial(_works, service, scene, before), "the scene did not resume")
                 pauses.append(time.monotonic() - began)
-                echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
+                echo(f"killed the node at frame {index}: {len(pauses)} of {count}, resumed after {pauses[-1]:.1f} s")
             thread.join()
         service.finish(scene, len(study.frames))
         faults = _faults_of_kills(service, scene, sender, expected, pauses)
         lost = len(study.frames) - len(sender.receipts)
         longest = max(pauses, default=0.0)
-        summary = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
-        target = f"0 acknowledged frames lost, final state bit-identical, no frame to blame, on within {GOES_ON_S:g} s"
+        summary = f"{lost} acknowledged frames lost, {len(expected)} states compared, resumed within {longest:.1f} s"
+        target = f"0 acknowledged frames lost, final state bit-identical, no frame blamed, resumed in {GOES_ON_S:g} s"
         return ScenarioResult(f"a node killed at {count} random moments", target, summary, faults)
 
 
 def stopped_node(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
-    """Stops a node with SIGSTOP during an update and continues it after its scene has moved to another node."""
+    """Stops a node with SIGSTOP during an update and resumes it after its scene has moved to another node."""
     with running(study, "stopped") as (service, scene, sender):
         states = DataFolder(service.data).scene(scene).states
         _send(sender, _second_half(study, service, scene, sender))
@@ -77,9 +77,9 @@ def stopped_node(
         assert stale is not None
         nodes.stop(node)
         began, committed = time.monotonic(), service.status(scene).committed
-        wait_until(lambda: service.status(scene).committed > committed, "the scene did not go on")
+        wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume")
         pause = time.monotonic() - began
-        echo(f"on after {pause:.1f} s; the node is continued")
+        echo(f"the scene resumed after {pause:.1f} s; the old node now resumes")
         folder = epoch_folder(states, stale)
         before = _changed(folder)
         nodes.resume(node)
@@ -91,54 +91,54 @@ def stopped_node(
         service.finish(scene, len(study.frames))
         faults = sender.check() + compare(digests(states), expected)
         if not written:
-            faults.append("the old worker wrote nothing, so nothing was tried: run it again")
+            faults.append("the old worker wrote nothing, so nothing was tested: run it again")
         until = time.monotonic() + SWEPT_S
         while len(epochs(states)) > 1 and time.monotonic() < until:
             time.sleep(AGAIN_S)
         if still := sorted(epochs(states))[:-1]:
-            faults.append(f"the folders of epochs {still} are still there")
-        summary = f"on after {pause:.1f} s; then the old worker wrote {len(written)} files, which nothing read; removed"
-        target = "nothing it wrote is read; found and removed; final state bit-identical"
-        return ScenarioResult("a node stopped, and continued after its scene has moved", target, summary, faults)
+            faults.append(f"the folders of epochs {still} still exist")
+        summary = f"resumed after {pause:.1f} s; the old worker wrote {len(written)} files, all unread and removed"
+        target = "none of its files is read; they are found and removed; final state bit-identical"
+        return ScenarioResult("a node stopped, then resumed after its scene has moved", target, summary, faults)
 
 
 def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
-    """Kills the scene's node while other scenes occupy the remaining nodes, then deletes those scenes."""
+    """Kills the scene's node while other scenes fill the remaining nodes, then deletes those scenes."""
     with running(study, "full") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         others = _fill(study, service)
         node, _ = _node_of(service, nodes, scene)
         committed = service.status(scene).committed
         nodes.kill(node)
-        wait_until(lambda: _waits(service, scene), "the scene does not say that it waits")
+        wait_until(lambda: _waits(service, scene), "the scene does not report that it is waiting")
         said = str(service.status(scene).error)
         _send(sender, left)
         time.sleep(5 * update_s)
         faults = []
         if service.status(scene).committed > committed:
-            faults.append("the scene went on though nothing had room, so nothing was tried")
+            faults.append("the scene continued although no node had room, so nothing was tested")
         echo(f"{len(others)} scenes fill the nodes; waiting: {said}")
         began = time.monotonic()
         for other in others:
             service.http.delete(f"/v1/scenes/{other}").raise_for_status()
-        wait_until(lambda: service.status(scene).committed > committed, "the scene did not go on when there was room")
+        wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume once there was room")
         pause = time.monotonic() - began
         nodes.add()
         status = service.finish(scene, len(study.frames))
         faults += _faults_of_kills(service, scene, sender, expected, [pause])
         if status.degraded:
-            faults.append(f"the scene is degraded still: {status.error}")
+            faults.append(f"the scene is still degraded: {status.error}")
         summary = (
-            f"{len(left)} frames acknowledged while it waited and said why; the next committed {pause:.1f} s after"
+            f"{len(left)} frames acknowledged while it waited and reported why; next commit {pause:.1f} s after room"
         )
-        target = "frames are acknowledged, the scene says why it waits, goes on once there is room; bit-identical"
+        target = "frames are acknowledged, the scene reports why it waits and resumes once there is room; bit-identical"
         return ScenarioResult("a node killed while other scenes fill the rest", target, summary, faults)
 
 
 def restarted_head(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
-    """Kills the cluster's head with `kill -9` during an update, and restarts it later with the state kept by Redis."""
+    """Kills the cluster's head with `kill -9` during an update, and later restarts it from the state kept in Redis."""
     with running(study, "head") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         sending = threading.Thread(target=_send, args=(sender, left))
@@ -154,7 +154,7 @@ def restarted_head(
         service.finish(scene, len(study.frames))
         deaths = service.status(scene).worker_deaths
         node, _ = _node_of(service, nodes, scene)
-        nodes.kill(node)  # whether the head that came back places and watches
+        nodes.kill(node)  # tests whether the restarted head places and monitors workers
         nodes.add()
         wait_until(lambda: service.status(scene).worker_deaths > deaths, "a lost node was not noticed")
         wait_until(lambda: service.worker_pid(scene) is not None, "the scene was not placed again")
@@ -164,11 +164,11 @@ def restarted_head(
             f"placed on another; {len(expected)} states compared"
         )
         target = "0 acknowledged frames lost, final state bit-identical, scenes are placed again afterwards"
-        return ScenarioResult(f"the head killed, back after {HEAD_GONE_S:g} s (Redis)", target, summary, faults)
+        return ScenarioResult(f"the head killed, restarted after {HEAD_GONE_S:g} s (Redis)", target, summary, faults)
 
 
 def _second_half(study: Study, service: Service, scene: str, sender: FrameSender) -> range:
-    """Sends the first half of the frames and waits for them; returns the others."""
+    """Sends the first half of the frames, waits for their commits, and returns the indices of the other frames."""
     half = len(study.frames) // 2
     _send(sender, range(half))
     service.finish(scene, half)
@@ -176,18 +176,18 @@ def _second_half(study: Study, service: Service, scene: str, sender: FrameSender
 
 
 def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
-    """Returns the node and process id of the scene's worker, once it has one."""
+    """Waits until the scene has a worker; returns its node and process id."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         pid = service.worker_pid(scene)
         if pid is not None and (node := nodes.of(pid)) is not None:
             return node, pid
         time.sleep(AGAIN_S)
-    raise StudyError("the scene's worker is on no node")
+    raise StudyError("the scene's worker runs on none of the nodes")
 
 
 def _changed(folder: Path) -> dict[str, int]:
-    """Returns the last modification time of each file in a folder, by name; files that disappear are skipped."""
+    """Returns the modification time of each file in a folder, keyed by name; files that disappear are skipped."""
     changes = {}
     for name in os.listdir(folder) if folder.is_dir() else ():
         with suppress(FileNotFoundError):
@@ -196,11 +196,11 @@ def _changed(folder: Path) -> dict[str, int]:
 
 
 def _fill(study: Study, service: Service) -> list[str]:
-    """Creates scenes until one worker finds no room; returns them."""
+    """Creates scenes until a worker finds no room; returns the scene ids."""
     scenes: list[str] = []
     while not scenes or not _waits(service, scenes[-1]):
         scenes.append(study.create(service))
-        wait_until(partial(_is_placed_or_waits, service, scenes[-1]), "a scene is neither placed nor does it wait")
+        wait_until(partial(_is_placed_or_waits, service, scenes[-1]), "a scene is neither placed nor waiting")
     return scenes
 
 
@@ -209,7 +209,7 @@ def _is_placed_or_waits(service: Service, scene: str) -> bool:
 
 
 def _waits(service: Service, scene: str) -> bool:
-    """Returns whether the scene's worker finds no room on any node."""
+    """Returns whether the scene's worker is waiting because no node has room."""
     waiting = Cluster.model_validate_json(service.http.get("/v1/cluster").content).waiting
     return any(one.scene == scene and one.role == "worker" and one.seconds > WAITS_S for one in waiting)
 
@@ -217,11 +217,11 @@ def _waits(service: Service, scene: str) -> bool:
 def _faults_of_kills(
     service: Service, scene: str, sender: FrameSender, expected: Mapping[int, str], pauses: Sequence[float]
 ) -> list[str]:
-    """Returns the faults of a scene whose nodes were killed: frames, states, blamed frames, and pauses."""
+    """Returns the faults after nodes were killed: lost frames, differing states, blamed frames and long pauses."""
     faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
     if blamed := service.deaths(scene):
-        faults.append(f"a frame was held to blame for {blamed} of the nodes")
-    return faults + [f"the scene went on after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
+        faults.append(f"a frame was blamed for the loss of {blamed} nodes")
+    return faults + [f"the scene resumed only after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
 
 
 def _send(sender: FrameSender, indices: range) -> None:
@@ -230,7 +230,7 @@ def _send(sender: FrameSender, indices: range) -> None:
 
 
 def _works(service: Service, scene: str, before: int | None) -> bool:
-    """Returns whether a different worker than before has a frame, or no work is left."""
+    """Returns whether a new worker is processing a frame, or no frames are queued."""
     if service.worker_pid(scene) in (None, before):
         return False
     status = service.status(scene)
@@ -238,18 +238,23 @@ def _works(service: Service, scene: str, before: int | None) -> bool:
 
 
 ON_NODES = ("nodes", "stopped", "full")
-"""Scenarios of nodes by name."""
+"""Names of the node scenarios."""
 OF_THE_HEAD = "head"
-"""That of a head which has Redis, in a cluster of its own."""
+"""Name of the scenario whose head uses Redis; it runs in a cluster of its own."""
 AS_LOCALLY = ("kills", "beginnings", "log", "bits")
-"""Scenarios that run as on one machine; a full disk and strangers are the service's own, wherever workers run."""
+"""Scenarios shared with the single-machine study. The others test the service itself, wherever its workers run."""
 
 
 def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
-    """Runs the node scenarios on three nodes and those of `local`; compares the states with a run on one machine.
+    """Runs the node scenarios on three nodes and those of `local`; compares the states with a single-machine run.
 
     Args:
-        count: of kills. local: runs scenarios by name, over a study whose service is on the cluster.
+        study: study that defines the frames and the service.
+        count: number of kills.
+        seed: seed of the random moments.
+        parts: names of the scenarios to run.
+        local: runs the named scenarios of a study whose service uses the cluster.
+        echo: prints the progress.
     """
     outcomes = []
     if set(parts) & {*ON_NODES, OF_THE_HEAD}:
@@ -262,7 +267,7 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         elif len(parts) == 1:
             raise StudyError("part head needs redis-server: apt-get install redis-server")
         else:
-            echo("part head is left out: it needs redis-server")
+            echo("part head is skipped: it needs redis-server")
     if not set(parts) & {*ON_NODES, *AS_LOCALLY}:
         return outcomes
     with Nodes() as nodes:

@@ -1,4 +1,4 @@
-"""A Ray cluster of several nodes on one machine, whose nodes can be killed, stopped and continued."""
+"""A Ray cluster of several nodes on one machine, whose nodes can be killed, stopped and resumed."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from types import TracebackType
 from typing import Any, Self
 
 HEALTH = {"period_ms": 1000, "timeout_ms": 2000, "failure_threshold": 3, "initial_delay_ms": 1000}
-"""Ray's checks of its nodes: one that does not answer is lost after 3 to 9 s (defaults: about a minute)."""
+"""Ray's health checks: a node that does not respond is lost after 3 to 9 s (Ray's default: about a minute)."""
 REDIS, REDIS_S = "RAY_REDIS_ADDRESS", 10.0
 STORE_BYTES = 80 * 2**20
-"""Of a node's object store, which scenes do not use."""
+"""Size of each node's object store, which scenes do not use."""
 
 
 class Nodes:
-    """A head without room for scenes, and several nodes.
+    """A Ray cluster: a head without room for scenes, and several nodes.
 
     Args:
-        count: of nodes beside the head. cpus: of each. redis_server: program of that name, which keeps what the head
-            knows; None: its memory does.
+        count: number of nodes besides the head.
+        cpus: CPUs per node.
+        redis_server: path of the redis-server program that stores the head's state; in memory if None.
 
     Attributes:
-        address: of the head, for `--placement ray=ADDRESS`.
+        address: address of the head, for `--placement ray=ADDRESS`.
     """
 
     def __init__(self, count: int = 3, cpus: float = 2, redis_server: str | None = None) -> None:
@@ -61,7 +62,7 @@ class Nodes:
             del os.environ[REDIS]
 
     def add(self, labels: Mapping[str, str] | None = None) -> int:
-        """Adds a node with labels; returns the process id of its raylet."""
+        """Adds a node with the given labels; returns the process id of its raylet."""
         node = self._cluster.add_node(
             num_cpus=self._cpus, object_store_memory=STORE_BYTES, labels=dict(labels) if labels else None
         )
@@ -70,7 +71,7 @@ class Nodes:
         return pid
 
     def of(self, pid: int) -> int | None:
-        """Returns the node (its raylet) on which a process runs, or None if it runs elsewhere or has ended."""
+        """Returns the node on which a process runs, by its raylet's pid; None if it runs elsewhere or has ended."""
         while pid > 1:
             if pid in self._nodes:
                 return pid
@@ -82,7 +83,7 @@ class Nodes:
         tree = [node, *_below(node)]
         for pid in tree:
             _signal(pid, signal.SIGKILL)
-        with contextlib.suppress(Exception):  # it is gone as far as Ray is concerned
+        with contextlib.suppress(Exception):  # Ray may already consider it gone
             self._cluster.remove_node(self._nodes[node], allow_graceful=False)
         del self._nodes[node]
 
@@ -92,26 +93,26 @@ class Nodes:
             _signal(pid, signal.SIGSTOP)
 
     def kill_node_of_head(self) -> None:
-        """Kills the node of the head's machine with `kill -9`; services that joined through it lose their actors."""
+        """Kills the raylet on the head's machine with `kill -9`; services that joined through it lose their actors."""
         self._cluster.head_node.kill_raylet()
 
     def stop_head(self) -> None:
-        """Kills the head's process and its node with `kill -9`: `ray start --block` ends both when one does."""
+        """Kills the head and its raylet with `kill -9`, because `ray start --block` ends both when one ends."""
         self._cluster.head_node.kill_gcs_server()
         self.kill_node_of_head()
 
     def start_head(self) -> None:
-        """Restarts the head at its address; its node stays down, and services join through another node."""
+        """Restarts the head at its old address; its raylet stays down, and services join through another node."""
         self._cluster.head_node.start_gcs_server()
 
     def resume(self, node: int) -> None:
-        """Continues a node with SIGCONT, processes first, before their raylet learns that the node was given up."""
+        """Resumes a node with SIGCONT: workers first, before their raylet learns that the node was given up."""
         for pid in (*reversed(_below(node)), node):
             _signal(pid, signal.SIGCONT)
 
 
 def redis(program: str) -> subprocess.Popen[bytes]:
-    """Starts an in-memory Redis server, which Ray finds through the environment."""
+    """Starts an in-memory Redis server, whose address Ray reads from the environment."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -125,7 +126,7 @@ def redis(program: str) -> subprocess.Popen[bytes]:
             os.environ[REDIS] = f"127.0.0.1:{port}"
             return started
         if time.monotonic() > until:
-            raise TimeoutError(f"{program} does not listen after {REDIS_S:g} s")
+            raise TimeoutError(f"{program} is not listening after {REDIS_S:g} s")
         time.sleep(0.05)
 
 
@@ -135,7 +136,7 @@ def _signal(pid: int, number: signal.Signals) -> None:
 
 
 def _parent(pid: int) -> int:
-    """Returns 0 for a process that has ended."""
+    """Returns the parent process id, or 0 if the process has ended."""
     try:
         return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
     except (OSError, IndexError, ValueError):
@@ -143,7 +144,7 @@ def _parent(pid: int) -> int:
 
 
 def _below(pid: int) -> list[int]:
-    """Returns a process and its descendants, parents first."""
+    """Returns the descendants of a process, parents first."""
     parents = {each: _parent(each) for each in _pids()}
     pids, level = [], [pid]
     while level := [each for each, parent in parents.items() if parent in level]:

@@ -1,7 +1,7 @@
-"""``scripts/bench head``: downtime of a cluster's head that a supervisor restarts as soon as it ends.
+"""``scripts/bench head``: downtime of a cluster's head that a supervisor restarts whenever it ends.
 
-The head, with Redis, and a node run on this machine, each with process ids and an address of its own, as on two
-machines: `ray start --head` refuses to start beside processes of another node.
+The head, which uses Redis, and a node run on this machine. Each has its own process namespace and address, as on two
+machines, because `ray start --head` refuses to start next to processes of another node.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from studies.running.process import StudyError, wait_until
 HEAD, NODE, PORT = "127.0.0.1", "127.0.0.2", 6397
 APART = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 BETWEEN_S = (8.0, 14.0)
-"""The head is let alone for so long between two kills."""
+"""Shortest and longest pause between two kills."""
 PATIENCE_S = 60.0
 NOT_STARTED = "the cluster did not start"
 
 
 class SupervisedCluster:
-    """A head that is restarted when it ends, and a node."""
+    """A head that is restarted whenever it ends, and a node."""
 
     def __init__(self) -> None:
         if os.geteuid() != 0:
-            raise StudyError("this study needs root: it gives the head process ids of its own")
+            raise StudyError("this study needs root, to run the head in its own process namespace")
         if (program := shutil.which("redis-server")) is None:
             raise StudyError("this study needs redis-server: apt-get install redis-server")
         os.environ.update({f"RAY_health_check_{name}": str(value) for name, value in HEALTH.items()})
@@ -77,7 +77,7 @@ class SupervisedCluster:
             head.wait()
 
     def _start(self, *options: str) -> subprocess.Popen[bytes] | None:
-        """Starts a Ray node; returns None if the study is over."""
+        """Starts a Ray node; returns None if the study has ended."""
         store = ("--object-store-memory", str(STORE_BYTES), "--block", "--disable-usage-stats")
         with self._starting:
             if self._over:
@@ -101,7 +101,7 @@ class Answers:
 
 
 def silences(count: int, echo: Callable[[str], None]) -> list[float]:
-    """Kills the head `count` times; returns the seconds from each kill until a new actor answers."""
+    """Kills the head `count` times; returns the seconds from each kill until a new actor responds."""
     import ray
 
     gaps = []
@@ -128,14 +128,14 @@ def summarize(found: Sequence[float]) -> str:
     """Formats the result as a sentence."""
     ordered = sorted(found)
     return (
-        f"An actor asked for when the head had been killed answered after {ordered[len(ordered) // 2]:.1f} s "
+        f"An actor requested right after the head was killed answered after {ordered[len(ordered) // 2]:.1f} s "
         f"({ordered[0]:.1f} to {ordered[-1]:.1f} s; {len(ordered)} times)"
     )
 
 
 def _joined(ray: Any) -> bool:
-    """Returns whether this process has joined through the node, not the head, and an actor answers."""
-    with contextlib.suppress(Exception):  # whatever Ray raises while the node begins
+    """Returns whether this process has joined the cluster through the node, not the head, and an actor responds."""
+    with contextlib.suppress(Exception):  # whatever Ray raises while the node is starting
         ray.init(address=f"{HEAD}:{PORT}", _node_ip_address=NODE, log_to_driver=False, logging_level="ERROR")
         ray.get(ray.remote(Answers).options(num_cpus=0.1).remote().is_there.remote(), timeout=PATIENCE_S)
         return True

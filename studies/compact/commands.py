@@ -12,18 +12,16 @@ from studies.options import Page, write_page
 
 def compact(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of the capture.")],
-    states: Annotated[
-        Path, typer.Argument(metavar="STATES", help="Its committed states: `states` of `scas4d reconstruct`.")
-    ],
-    frames: Annotated[int, typer.Option(min=2, help="Frames of the file: the states back and forth.")] = 240,
-    key_every: Annotated[int | None, typer.Option(min=1, help="Frames from key to key.")] = None,
+    states: Annotated[Path, typer.Argument(metavar="STATES", help="Its committed states, from `scas4d reconstruct`.")],
+    frames: Annotated[int, typer.Option(min=2, help="Frames in the file; the states alternate back and forth.")] = 240,
+    key_every: Annotated[int | None, typer.Option(min=1, help="Frames between keyframes.")] = None,
     bounds: Annotated[
         list[str] | None,
-        typer.Option("--bound", metavar="NAME=VALUE", help="Another bound, as colour=0.02. May be repeated."),
+        typer.Option("--bound", metavar="NAME=VALUE", help="Changes an error bound: colour=0.02. May be repeated."),
     ] = None,
     page: Page = None,
 ) -> None:
-    """Writes states to a compact file: bytes a frame, dB and tracks lost, and what writing and reading take.
+    """Writes states to a compact file and measures its size, its PSNR and track errors, and the read and write times.
 
     Example: scas4d reconstruct captures/robot --out out/robot; scripts/bench compact captures/robot out/robot/states
     """
@@ -37,9 +35,9 @@ def compact(
 
 
 def opening(
-    frames: Annotated[int, typer.Option(min=200, help="Of the history; a day at one a second.")] = 86_400,
+    frames: Annotated[int, typer.Option(min=200, help="Frames in the history; default: a day at 1 Hz.")] = 86_400,
 ) -> None:
-    """Measures how long a history of many frames takes to open where older states are in compact files."""
+    """Measures how long it takes to open a long history whose older states are in compact files."""
     from studies.compact.opening import opening as measured
 
     print(measured(frames))

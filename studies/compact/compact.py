@@ -27,11 +27,11 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 POINTS = 1000
-"""Tracked, drawn from the Gaussians that move."""
+"""Number of tracked points, drawn from the moving Gaussians."""
 VIEWS = 6
-"""Frames whose test cameras are rendered, evenly spread over the capture."""
+"""Number of frames whose test cameras are rendered, spread evenly over the capture."""
 READS = 40
-"""Frames that are read at random."""
+"""Number of frames read in random order."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,22 @@ class CompactFigures:
     """Measurements of one capture.
 
     Attributes:
-        gaussians, moving: how many. frames: of the file. exact: bytes a frame of the exact states on disk.
-        size: bytes a frame of the file, head, born and index shared. sizes: mean bytes of a record by its kind.
-        psnr: dB of the test cameras over those of the exact states, mean of ``VIEWS`` frames; None without any.
-        worst: of one frame.
-        tracks: median over points and frames of the distance of tracks, % of the extent.
-        write: milliseconds of the processor to write a frame, median. read: of a frame at random, median; read_worst.
-        opening: milliseconds to open the file; unindexed: the same without its index.
-        errors: largest, by attribute.
+        gaussians: number of Gaussians.
+        moving: number of moving Gaussians.
+        frames: number of frames in the file.
+        exact: bytes per frame of the exact states on disk.
+        size: bytes per frame of the compact file, including its header, births and index.
+        sizes: mean size of a record in bytes, keyed by record kind.
+        psnr: mean PSNR on the test cameras minus that of the exact states, over ``VIEWS`` frames, in dB. None without
+            test cameras.
+        worst: lowest such PSNR difference of a single frame, in dB.
+        tracks: median distance between decoded and exact tracks over points and frames, in % of the moving extent.
+        write: median CPU time to write a frame, in ms.
+        read: median CPU time to read a random frame, in ms.
+        read_worst: longest CPU time to read a random frame, in ms.
+        opening: time to open the file, in ms.
+        unindexed: time to open the file without its index, in ms.
+        errors: largest error of each attribute.
     """
 
     capture: str
@@ -68,7 +76,7 @@ class CompactFigures:
 
 
 def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
-    """Yields ``count`` indices that alternate between forward and backward order.
+    """Returns ``count`` indices that alternate between forward and backward order.
 
     >>> back_and_forth([0, 1, 2], 7)
     [0, 1, 2, 1, 0, 1, 2]
@@ -79,15 +87,15 @@ def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
 def measure(
     folder: Path, states: Path, frames: int, bounds: Mapping[str, float], key_every: int | None
 ) -> CompactFigures:
-    """Writes the states of a capture back and forth to a file, and compares the file with them."""
+    """Writes the states of a capture back and forth to a compact file, and compares the file with them."""
     capture = open_source(folder)
     history = History.load(states)
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
     head = FileHeader(world, Bounds(**bounds), background=history.background)
     if frames < len(history):
-        raise InputError(f"frames is {frames}", f"give {len(history)} at least: every state is compared")
+        raise InputError(f"frames is {frames}", f"give at least {len(history)}: every state is compared")
     grows = history.count > len(history.gaussians(history.indices[0]))
-    order = history.indices if grows else back_and_forth(history.indices, frames)  # the born are not unborn
+    order = history.indices if grows else back_and_forth(history.indices, frames)  # births cannot be played back
     exact = float(np.mean([path.stat().st_size for path in states.glob("frame_*.npz")]))
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / "states.s4d"
@@ -139,13 +147,13 @@ def summarize(found: CompactFigures) -> str:
         [
             f"**{found.capture}**: {found.gaussians:,} Gaussians, {found.moving:,} move; {found.frames} frames",
             "",
-            "| kB a frame | exact | dB of the test cameras | tracks, % of the extent | write ms | read ms | open ms |",
+            "| kB per frame | exact | test PSNR, dB | tracks, % of the extent | write ms | read ms | open ms |",
             "|---|---|---|---|---|---|---|",
             f"| {found.size / 1e3:.1f} | {found.exact / 1e3:.0f} | {pictures} | {found.tracks:.4f} | {found.write:.1f} "
             f"| {found.read:.1f} (worst {found.read_worst:.1f}) "
             f"| {found.opening:.1f} ({found.unindexed:.1f} without index) |",
             "",
-            f"kB of a record: {kinds}. Largest errors: {errors}.",
+            f"kB per record: {kinds}. Largest errors: {errors}.",
         ]
     )
 
@@ -168,7 +176,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _reads(reader: CompactReader) -> list[float]:
-    """Returns the CPU seconds for reading frames in random order; the frames they depend on are read before."""
+    """Returns the CPU seconds of reading frames in random order, after the last frame has been read once."""
     draw = np.random.default_rng(0)
     seconds = []
     reader.state(reader.frames[-1])
@@ -218,6 +226,6 @@ def _scene(world: WorldFrame, states: Mapping[int, Gaussians], limits: Limits = 
     history = History()
     for index, state in states.items():
         known = history.ids if len(history) else state.ids
-        born = np.full(len(state) - len(known), UNBORN, np.int64)  # they get ids of this history
+        born = np.full(len(state) - len(known), UNBORN, np.int64)  # this history gives them new ids
         history.append(index, float(index), state.replace(ids=np.concatenate([known, born])))
     return CommittedScene(history, world, limits)

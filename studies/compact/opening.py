@@ -1,4 +1,4 @@
-"""``scripts/bench opening``: time to open and to read a history of many frames in compact files."""
+"""``scripts/bench opening``: time to open and read a history of many frames in compact files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from scas4d_core.storage.compaction import CHUNK_FRAMES
 from scas4d_core.storage.history import History
 
 GAUSSIANS = 200
-"""Of each state: opening reads where states are, whatever their size."""
+"""Gaussians per state. Opening a history only locates its states, so their size does not matter."""
 EXACT, TURNS, READS = 48, 5, 200
 
 
 def opening(frames: int) -> str:
-    """Creates a history with a number of frames and measures it; returns the figures as a sentence."""
+    """Creates a history of ``frames`` frames and measures it; returns the figures as a sentence."""
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "states"
         _fill(folder, frames)
@@ -40,13 +40,13 @@ def opening(frames: int) -> str:
         files = len(list(folder.glob("states_*.s4d")))
     return (
         f"{frames:,} frames, {frames - EXACT - 1:,} of them in {files} compact files: opened in "
-        f"{median(seconds):.2f} s of the processor (median of {TURNS}); one of {GAUSSIANS} Gaussians read at random in "
+        f"{median(seconds):.2f} s of CPU time (median of {TURNS}); a random state of {GAUSSIANS} Gaussians read in "
         f"{1e3 * median(reads):.1f} ms"
     )
 
 
 def _fill(folder: Path, frames: int) -> None:
-    """Writes a history as a service does: the first and newest frames exact, the others in compact files."""
+    """Writes a history as the service does: the first and newest frames exact, the others in compact files."""
     state = Gaussians.of_points(np.random.default_rng(0).uniform(-1, 1, (GAUSSIANS, 3)), 0.02)
     history = History(folder)
     history.append(0, 0.0, state, report={})

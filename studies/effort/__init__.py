@@ -1,1 +1,1 @@
-"""Studies of time budgets, and of iterations saved on frames without changes."""
+"""Studies of time budgets, and of iterations saved on unchanged frames."""

@@ -16,21 +16,21 @@ def effort(
     captures: Captures,
     out: Annotated[Path, typer.Option(help="Folder of the study, shared with frontier.")] = FRONTIER,
     milliseconds: Annotated[
-        list[float] | None, typer.Option(min=1, help="A budget; 500, 1000 and 2000 when left out. May be repeated.")
+        list[float] | None, typer.Option(min=1, help="Time budget; default 500, 1000 and 2000. May be repeated.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=5, help="Played back and forth under each budget.")] = 50,
-    updates: Annotated[int, typer.Option(min=1, help="For the adaptive preset; all of the capture at most.")] = 100,
+    frames: Annotated[int, typer.Option(min=5, help="Frames played back and forth under each budget.")] = 50,
+    updates: Annotated[int, typer.Option(min=1, help="Updates for the adaptive preset; at most the capture.")] = 100,
     only: Annotated[list[str] | None, typer.Option(help="Only report, budgets or adaptive. May be repeated.")] = None,
 ) -> None:
-    """Measures the cost of reports, how budgets in milliseconds are kept, and what the adaptive preset saves.
+    """Measures the cost of reports, how closely time budgets are met, and how much the adaptive preset saves.
 
-    Wants a quiet machine. The answers become a part of the page that `scripts/bench frontier --only page` writes.
+    Needs an idle machine. The results become part of the page that `scripts/bench frontier --only page` writes.
 
     Example: scripts/bench effort captures/robot --milliseconds 500
     """
     for part in only or ():
         if part not in PARTS:
-            raise typer.BadParameter(f"part {part!r} is unknown; choose of {', '.join(PARTS)}")
+            raise typer.BadParameter(f"part {part!r} is unknown; choose from {', '.join(PARTS)}")
     from scas4d_core.warm_up import compile_in_processes
     from studies.effort.effort import measure_adaptive, measure_budgets
     from studies.effort.report import measure_report

@@ -1,4 +1,4 @@
-"""Budgets and adaptive effort: how well budgets in milliseconds are kept, and what an adaptive preset saves."""
+"""Budgets and adaptive effort: how closely time budgets are met, and how much an adaptive preset saves."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TOLERANCE = 0.05
-"""Of a budget that a frame may be off, or one iteration if that is more."""
+"""Fraction of the budget by which a frame may be off; one iteration if that is more."""
 FRAMES = 50
-"""Of a capture played back and forth."""
+"""Number of frames of a capture played back and forth."""
 FEW = 8
-"""Updates of a capture at most whose frames are repeated, or slowed."""
+"""Maximum number of updates per capture with repeated or slowed frames."""
 SEEDS = 3
-"""Of the updates of a capture as it is."""
+"""Number of seeds for the updates of a capture as recorded."""
 SEEN_DB = 45.0
-"""What a picture has beyond it nobody sees; slowed captures have up to 54 dB."""
+"""PSNR cap: differences above it are invisible; slowed captures reach 54 dB."""
 COUNTED_FROM = 2
-"""Updates before are not counted: the first has no motion to start from and knows no speed."""
+"""First update that counts: the earlier ones lack a motion to start from and a measured speed."""
 
 
 @dataclass
 class Kept:
-    """Measured frames under one budget: seconds and iterations of each, and the seconds of one iteration."""
+    """Frames measured under one budget: seconds, iterations and seconds per iteration of each frame."""
 
     milliseconds: float
     seconds: list[float] = field(default_factory=list)
@@ -48,15 +48,15 @@ class Kept:
     each: list[float] = field(default_factory=list)
 
     def off(self) -> list[float]:
-        """Returns the difference in milliseconds of each frame from the budget."""
+        """Returns the deviation of each frame from the budget, in milliseconds."""
         return [1000 * seconds - self.milliseconds for seconds in self.seconds]
 
     def allowed(self) -> list[float]:
-        """Returns the tolerance of each frame in milliseconds."""
+        """Returns the tolerance for each frame, in milliseconds."""
         return [max(TOLERANCE * self.milliseconds, 1000 * each) for each in self.each]
 
     def row(self) -> Row:
-        """Returns the result for one budget; shares are fractions of the frames."""
+        """Returns the result for one budget; shares are fractions of the number of frames."""
         off, allowed = np.array(self.off()), np.array(self.allowed())
         return {
             "milliseconds": self.milliseconds,
@@ -75,10 +75,14 @@ def measure_budgets(
 ) -> Row:
     """Plays a capture back and forth under each budget; writes ``out/effort/<capture>-budgets.json``.
 
-    A frame's time goes from before its pictures are decoded to the end of its commit, on disk and synced.
+    The time of a frame runs from before its images are decoded until its commit is synced to disk.
 
     Args:
-        folder: of the capture. out: folder of a study, with its frames 0. milliseconds: the budgets.
+        folder: folder of the capture.
+        out: folder of a study that contains the states of frame 0.
+        milliseconds: time budgets.
+        frames: number of frames played under each budget.
+        report: prints the progress.
     """
     capture = open_measured(folder)
     kept = []
@@ -114,8 +118,12 @@ def measure_adaptive(
     Writes ``out/effort/<capture>-<name>.json``.
 
     Args:
-        folder: of a capture with test cameras. out: folder of a study, with its frames 0. updates: of the capture.
-        seeds: of the updates, tried on the capture as it is; what the first update finds or loses goes by chance.
+        folder: folder of a capture with test cameras.
+        out: folder of a study that contains the states of frame 0.
+        name: name of the adaptive preset.
+        updates: number of updates of the capture.
+        seeds: number of seeds for the capture as recorded, because results of the first update vary by chance.
+        report: prints the progress.
     """
     capture = open_measured(folder)
     few = min(updates, FEW)
@@ -139,10 +147,10 @@ def measure_adaptive(
 
 
 class Turns:
-    """Two settings on the same frames in alternation: seconds and PSNR of each frame.
+    """Two settings that process the same frames in alternation, with the seconds and PSNR of each frame.
 
     Args:
-        names: of the settings; the first is what the other is compared with.
+        names: names of the two settings; the first is the baseline.
     """
 
     def __init__(self, names: tuple[str, str]) -> None:
@@ -153,7 +161,7 @@ class Turns:
         self._repeats: list[bool] = []
 
     def take(self, capture: Capture, settings: tuple[Settings, Settings], frames: Iterator[Shown], out: Path) -> None:
-        """Adds a sequence of frames that each setting processes from frame 0."""
+        """Runs both settings on a sequence of frames, starting from frame 0, and records the results."""
         pair = {name: started(capture, one, out) for name, one in zip(self.names, settings, strict=True)}
         for values in self._psnr.values():
             values.append([])
@@ -168,7 +176,7 @@ class Turns:
             self._repeats.append(shown.repeats)
 
     def row(self) -> Row:
-        """Returns the result over all sequences: ``psnr`` and ``psnr_each`` in dB, times relative to the first."""
+        """Returns the results over all sequences: PSNR in dB, and times relative to the first setting."""
         full, spared = (np.array(self._seconds[name]) for name in self.names)
         again = np.array(self._repeats)
         each = {name: [float(np.mean(values)) for values in self._psnr[name]] for name in self.names}
@@ -202,12 +210,12 @@ def _each(report: Any) -> float:
 
 
 def changed(settings: Settings, **changes: Any) -> Settings:
-    """Returns the settings with some update settings replaced."""
+    """Returns a copy of the settings with some update settings changed."""
     return settings.model_copy(update={"update": settings.update.model_copy(update=changes)})
 
 
 def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
-    """Writes a result to ``out/effort/<name>.json``, with the machine and sources that it was measured on."""
+    """Writes a result to ``out/effort/<name>.json``, with the machine and source version it was measured on."""
     from scas4d_core.kernels.jit import threads
 
     row: Row = {

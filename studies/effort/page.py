@@ -13,13 +13,13 @@ from studies.effort.effort import SEEDS, TOLERANCE
 from studies.effort.report import TARGET
 
 KEPT = 0.95
-"""Share of the frames that have to keep a budget."""
+"""Share of the frames that must meet a budget."""
 TIME, LOSS_DB, REPEATS = 0.60, 0.10, 0.10
-"""The adaptive preset may take so much of the time of the fixed one, lose so much, and take so much for repeats."""
+"""Targets of the adaptive preset against the fixed one: share of its time, PSNR loss, share of its time on repeats."""
 
 
 def effort_text(out: Path, captures: Sequence[str]) -> str:
-    """Returns the sections with measurements as Markdown, or an empty text."""
+    """Returns the Markdown sections for which measurements exist; an empty string if there are none."""
     budgets = _rows(out, captures, "budgets")
     adaptive = _rows(out, captures, "adaptive")
     report = _rows(out, captures, "report")
@@ -41,10 +41,10 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Budgets in milliseconds",
         "",
-        "A capture played back and forth under each budget (`scripts/bench effort`), timed from before the decoding to",
-        "the end of the commit on disk, without the first two frames. The tolerance is the larger of "
+        "Each capture is played back and forth under each budget (`scripts/bench effort`). Times run from before",
+        "decoding to the end of the commit on disk, without the first two frames. The tolerance is the larger of "
         f"{100 * TOLERANCE:.0f} % of the budget",
-        f"and one iteration; {100 * KEPT:.0f} % of the frames have to keep it.",
+        f"and one iteration; {100 * KEPT:.0f} % of the frames must stay within it.",
         "",
         "| capture | budget ms | within, both ways | not over | median off ms | worst over ms | iterations, median | |",
         "|---|---|---|---|---|---|---|---|",
@@ -64,8 +64,8 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Adaptive effort",
         "",
-        "Preset `adaptive` against `scas4d` with 100 iterations for every frame, in turns. *Repeats*: time of a frame",
-        "that is shown again (every frame twice, one four times). *Slowed*: a third of the speed, rendered from",
+        "Preset `adaptive` against `scas4d` with 100 iterations for every frame, in alternation. *Repeats*: time of a",
+        "repeated frame (every frame is shown twice, one four times). *Slowed*: a third of the speed, rendered from",
         "interpolated states of a reconstruction. Unchanged captures are run with "
         f"{SEEDS} seeds; ± is their standard deviation.",
         "",
@@ -102,7 +102,7 @@ def _report(rows: Sequence[Row]) -> list[str]:
         "",
         "Stage `report` of an update of `scas4d`: stage timers, losses for the curve alone, colour shifts, and",
         "assembling, writing and publishing the report. *With : without* is the CPU time of the same updates with and",
-        "without the optional work in the iterations, in turns; median and quartiles.",
+        "without the optional work in the iterations, in alternation; median and quartiles.",
         "",
         "| capture | updates | report ms | report: % of an update | worst update | with : without | |",
         "|---|---|---|---|---|---|---|",
@@ -123,5 +123,5 @@ def _gain(one: Row) -> float:
 
 
 def _told(one: Row, name: str) -> str:
-    """Returns the PSNR in dB of a setting, and its spread over seeds."""
+    """Returns the PSNR of a setting in dB, and its standard deviation over seeds."""
     return f"{one['psnr'][name]:.2f} ± {np.std(one['psnr_each'][name]):.2f}"

@@ -1,9 +1,9 @@
-"""Cost of an update's own report: the share of its stage, and a check that the stage is complete.
+"""Cost of an update's report: the share of its stage, and a check that the stage covers the whole cost.
 
-The stage ``report`` has the stage timers themselves, losses that nothing but the curve asks for, the cameras' colour
-shifts, and assembling and writing the record; publishing it, as a worker does, is timed here and belongs to it. What is
-interleaved with the iterations can be left out (``FrameUpdate.curve``): the same frames with and without it, in turns,
-say what it takes in all, whatever the timers say.
+The stage ``report`` covers the stage timers, losses that are computed only for the curve, the cameras' colour shifts,
+and assembling and writing the record. Publishing the record, as a worker does, is timed here and added to the stage.
+The work that is interleaved with the iterations can be switched off (``FrameUpdate.curve``). Running the same frames
+with and without it, in alternation, measures its whole cost independently of the timers.
 """
 
 from __future__ import annotations
@@ -26,15 +26,17 @@ from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TARGET = 0.02
-"""Share of an update that its report may cost."""
+"""Largest share of an update that its report may cost."""
 
 
 def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report = print) -> Row:
     """Runs updates of ``scas4d`` with and without a full report; writes ``out/effort/<capture>-report.json``.
 
     Args:
-        folder: of the capture. out: folder of a study, with its frames 0.
-        updates: of the capture; the first ones are not counted.
+        folder: folder of the capture.
+        out: folder of a study that contains the states of frame 0.
+        updates: number of updates of the capture; the first ones are not counted.
+        report: prints the progress.
     """
     from scas4d_core.update.frame_update import FrameUpdate
 
@@ -47,7 +49,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
         scenes = {full: started(capture, settings, out, Path(directory) / str(full)) for full in (True, False)}
         for index in range(1, min(updates, capture.frame_count - 1) + 1):
             frame = capture.frame(index)
-            dict(frame.images), dict(frame.masks)  # decoded before, so that both find them so
+            dict(frame.images), dict(frame.masks)  # decoded in advance, so that neither run pays for it
             for full in (True, False) if index % 2 else (False, True):
                 began = time.process_time()
                 FrameUpdate.curve = full
@@ -77,16 +79,16 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     low, high = answer["ratio_quartiles"]
     report(
         f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * TARGET:.0f} %), "
-        f"{answer['milliseconds']:.1f} ms; with what can be left out {answer['ratio']:.3f} × the CPU time without "
+        f"{answer['milliseconds']:.1f} ms; with the optional work {answer['ratio']:.3f} × the CPU time without it "
         f"(quartiles {low:.3f}, {high:.3f})"
     )
     return leave(out, f"{capture.name}-report", capture, answer)
 
 
 def _published(scene: Any, index: int) -> float:
-    """Returns the seconds that a worker needs to publish a record: reading it from the commit and sending it."""
+    """Returns the seconds a worker takes to publish a record: reading it from the commit and pickling it."""
     began = time.perf_counter()
-    ForkingPickler.dumps(scene.history.report(index))  # as a pipe does
+    ForkingPickler.dumps(scene.history.report(index))  # as for a pipe
     return time.perf_counter() - began
 
 

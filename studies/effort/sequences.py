@@ -18,7 +18,7 @@ from studies.quality.settings import settings_of
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame of a sequence, the test cameras' pictures, and whether it repeats the previous frame."""
+    """A frame of a sequence, the images of the test cameras, and whether it repeats the previous frame."""
 
     frame: Frame
     truth: Mapping[str, NDArray[np.float32]]
@@ -26,7 +26,7 @@ class Shown:
 
 
 def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
-    """Returns a number of frames after the first, played back and forth with increasing times."""
+    """Yields ``frames`` frames after the first, played back and forth with increasing times."""
     count = capture.frame_count
     first, second = capture.frame(0), capture.frame(1)
     step = second.time - first.time
@@ -36,13 +36,13 @@ def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
 
 
 def as_it_is(capture: Capture, updates: int) -> Iterator[Shown]:
-    """Returns the first updates of a capture."""
+    """Yields the first updates of a capture."""
     for index in range(1, min(updates + 1, capture.frame_count)):
         yield Shown(capture.frame(index), _truth(capture, index))
 
 
 def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
-    """Returns the sequence with every frame sent twice, as by a camera at half the rate, and one held for three."""
+    """Yields every frame twice, as from a camera at half the rate, and frame 3 four times."""
     step = capture.frame(1).time - capture.frame(0).time
     number = 0
     for index in range(1, min(updates + 1, capture.frame_count)):
@@ -56,12 +56,12 @@ def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
 def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterator[Shown]:
     """Renders a capture at a third of its speed from its reconstruction, with interpolated states.
 
-    Training pictures and truth are both rendered, so that its figures compare with each other and with no others.
+    Both the training images and the truth are rendered, so the results are comparable only with each other.
     """
     source = started(capture, settings_of("scas4d"), out)
     for index in range(1, min(updates + 1, capture.frame_count)):
         source.step(capture.frame(index))
-    drawn = started(capture, settings_of("scas4d"), out)  # draws the states in between
+    drawn = started(capture, settings_of("scas4d"), out)  # renders the states in between
     step = capture.frame(1).time - capture.frame(0).time
     number = 0
     for index in range(1, min(updates + 1, capture.frame_count)):
@@ -81,13 +81,13 @@ def _truth(capture: Capture, index: int) -> dict[str, NDArray[np.float32]]:
 
 
 def _levels(colour: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Returns a rendering as a camera would have stored it."""
+    """Converts a render to 8 bits, as a camera would store it."""
     levels: NDArray[np.uint8] = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
     return levels
 
 
 def _between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-    """Interpolates linearly between two states of nearby frames."""
+    """Interpolates linearly between the states of two neighbouring frames."""
     mixed = {
         name: ((1 - share) * getattr(before, name) + share * getattr(after, name)).astype(np.float32)
         for name in ("means", "factors", "colours")

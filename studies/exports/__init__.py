@@ -1,1 +1,1 @@
-"""Studies of exports, read back with third-party readers and rendered."""
+"""Studies of exports, which are read back with third-party readers and rendered."""

@@ -12,17 +12,15 @@ from studies.options import Page, write_page
 
 def exports(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of the capture.")],
-    states: Annotated[
-        Path, typer.Argument(metavar="STATES", help="Its committed states: `states` of `scas4d reconstruct`.")
-    ],
+    states: Annotated[Path, typer.Argument(metavar="STATES", help="Its committed states, from `scas4d reconstruct`.")],
     sheet: Annotated[
-        Path | None, typer.Option(help="Write a contact sheet here: state | export | difference of each format.")
+        Path | None, typer.Option(help="Contact sheet to write: state | export | difference per format.")
     ] = None,
     page: Page = None,
 ) -> None:
-    """Exports the last state in every format of splats, reads it with another reader, and renders it beside the state.
+    """Exports the last state in every splat format, reads it with a third-party reader, and renders it for comparison.
 
-    With ground truth, the moving parts of the whole capture's `glb-parts` are compared with the truth's poses.
+    With ground truth, the moving parts in the `glb-parts` export of the whole capture are compared with the true poses.
     Needs the extras `exports` and `dev`. Example: scripts/bench exports captures/robot out/robot/states
     """
     from studies.exports.exports import measure, summarize
@@ -32,7 +30,7 @@ def exports(
     figures = measure(capture, states)
     text = summarize(figures)
     if asset := measure_asset(capture, states):
-        text += f"\n\nArticulated asset against the truth's poses:\n\n{told_asset(asset)}"
+        text += f"\n\nArticulated asset against the true poses:\n\n{told_asset(asset)}"
     print(text)
     if sheet is not None:
         sheet_of(figures).save(sheet)

@@ -32,7 +32,7 @@ Y_UP = np.array([1.0, -1.0, -1.0])
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SPLAT = "KHR_gaussian_splatting"
 TITLE, GAP = 24, 12
-"""Pixels of a contact sheet."""
+"""Height of a title and gap between images on a contact sheet, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,12 @@ class Found:
     opacities: Float
 
     def gaussians(self, axes: Float, world: WorldFrame, metres: bool) -> Gaussians:
-        """Converts the Gaussians to the internal world.
+        """Converts the Gaussians to internal world coordinates.
 
         Args:
-            axes: signs of the file's axes in ours. metres: the file is in metres, not in the user's unit.
+            axes: signs that convert the file's axes to ours.
+            world: world frame of the scene.
+            metres: whether the file is in metres rather than in the user's unit.
         """
         unit = 1.0 if metres else world.metres_per_unit
         turned = Rotation.from_quat(self.rotations).as_matrix() * self.scales[:, None, :] * unit
@@ -65,7 +67,10 @@ class ExportFigures:
     """Measurements of one format.
 
     Attributes:
-        size: bytes of the file. psnr: dB of its rendering against the state's, mean over cameras. reader: its name.
+        format: name of the format.
+        size: size of the file in bytes.
+        psnr: PSNR of its render against the render of the state, averaged over cameras, in dB.
+        reader: name of the reader.
         picture: state | export | difference in the first camera.
     """
 
@@ -77,9 +82,9 @@ class ExportFigures:
 
 
 def measure(folder: Path, states: Path) -> list[ExportFigures]:
-    """Exports the last committed state of a capture, and renders what readers return in all test cameras.
+    """Exports the last committed state of a capture in every format, and renders what the readers return.
 
-    Of the moving parts that is the first state, as the animation of the whole capture has it in the end.
+    It renders all test cameras. In `glb-parts`, the last state is the first one moved to the end of the animation.
     """
     capture = open_source(folder)
     history = History.load(states)
@@ -93,7 +98,7 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
             single = FORMATS[name].numbered
             out = Path(temporary) / (name if single else f"{name}{FORMATS[name].suffixes[0]}")
             labels = parts(history) if FORMATS[name].needs_parts else None
-            chosen = history.indices if labels is not None else [index]  # an asset has all of the motion
+            chosen = history.indices if labels is not None else [index]  # an asset contains the whole motion
             coming = ((each, history.time(each), history.gaussians(each)) for each in chosen)
             (file,) = export_sequence(coming, name, out, world=world, parts=labels)
             metres = FORMATS[name].unit.startswith("metre")
@@ -179,7 +184,7 @@ def _by_gsply(file: Path) -> Found:
 
 
 def _by_pygltflib(file: Path) -> Found:
-    """Returns all nodes at the end of the animation, if there is one."""
+    """Returns the Gaussians of all nodes, at the end of the animation if there is one."""
     from pygltflib import GLTF2
 
     document = GLTF2().load(str(file))
@@ -241,4 +246,4 @@ READERS: Mapping[str, tuple[str, Callable[[Path], Found], bool]] = {
     "glb-parts": ("pygltflib", _by_pygltflib, True),
     "usd": ("pxr", _by_pxr, True),
 }
-"""By format: the reader's name, the reader, and whether the file's y axis is up."""
+"""Maps each format to the name of its reader, the reader, and whether the file's y axis points up."""

@@ -1,7 +1,8 @@
-"""Moving parts of an exported asset, read back by pygltflib, compared with the true poses of the parts.
+"""Comparison of the moving parts of an exported asset, read back with pygltflib, with their true poses.
 
-A part of the truth is matched with the node that holds most of its points in frame 0, one to one (Hungarian). Compared
-is the motion since frame 0: the angle of the rotation that is left, and the mean distance at the part's own points.
+Each true part is matched one to one (Hungarian algorithm) with the node that contains most of its points in frame 0.
+The comparison covers the motion since frame 0: the angle of the residual rotation, and the mean distance at the points
+of the part.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ Float = NDArray[np.float64]
 
 Y_UP = np.diag([1.0, -1.0, -1.0])
 COVERED = 0.5
-"""Share of a truth part's points that its node must hold to count as found."""
+"""Share of a true part's points that its node must contain for the part to count as found."""
 BAR_PERCENT, BAR_DEGREES = 1.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A node of the asset: [N, 3] positions of its Gaussians in frame 0, and [T, 4, 4] motion, in the user's world."""
+    """A node of the asset: [N, 3] positions of its Gaussians in frame 0, and [T, 4, 4] motion, in user coordinates."""
 
     name: str
     places: Float
@@ -43,12 +44,16 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class PartFigures:
-    """A part of the ground truth.
+    """Errors of one part of the ground truth.
 
     Attributes:
-        static: whether it stands in the truth. node: its name in the asset, or "none".
-        share: of the part's points that the node holds.
-        degrees, percent: [T − 1] errors after frame 0: of the rotation, and at its points, in percent of the extent.
+        part: name of the part.
+        static: whether the part is static in the ground truth.
+        points: number of its points.
+        node: name of the matching node of the asset, or "none".
+        share: share of the points that the node contains.
+        degrees: [T − 1] rotation error in each frame after the first.
+        percent: [T − 1] mean distance at the points in each frame after the first, in percent of the extent.
     """
 
     part: str
@@ -61,23 +66,23 @@ class PartFigures:
 
     @property
     def covered(self) -> bool:
-        """Whether the asset contains this part."""
+        """Whether the asset contains the part."""
         return self.share >= COVERED
 
 
 @dataclass(frozen=True, eq=False)
 class AssetFigures:
-    """Measurements of an asset: how its parts were chosen, their number, and the parts of the ground truth."""
+    """Measurements of an asset: how its number of parts was chosen, that number, and the errors of the true parts."""
 
     count: str
     nodes: int
     parts: list[PartFigures]
 
     def medians(self, moving: bool = False) -> tuple[float, float]:
-        """Returns the error in degrees and percent of the extent, over the covered parts and their frames.
+        """Returns the median errors in degrees and percent of the extent, over the covered parts and their frames.
 
         Args:
-            moving: only the parts that move in the truth.
+            moving: whether to use only the parts that move in the ground truth.
         """
         chosen = [one for one in self.parts if one.covered and not (moving and one.static)]
         if not chosen:
@@ -87,11 +92,11 @@ class AssetFigures:
 
 
 def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
-    """Exports the asset of a whole capture, with the number of parts chosen by rule and as in the ground truth.
+    """Exports the asset of a whole capture, with the number of parts chosen by rule and then as in the ground truth.
 
     Args:
-        folder: of a capture; without ground truth of moving rigid parts nothing is measured.
-        states: its committed states.
+        folder: folder of a capture. Without ground truth of moving rigid parts, the result is empty.
+        states: folder of its committed states.
     """
     capture = open_source(folder)
     truth = capture.ground_truth
@@ -120,7 +125,8 @@ def read_asset(file: Path, seconds: Float) -> list[Node]:
     """Reads the nodes of an asset and their animated poses.
 
     Args:
-        file: of format `glb-parts`. seconds: [T] since its first frame, the first is 0.
+        file: file in format `glb-parts`.
+        seconds: [T] time of each frame since the first, which is 0.
     """
     from pygltflib import GLTF2
 
@@ -147,7 +153,7 @@ def read_asset(file: Path, seconds: Float) -> list[Node]:
         own = accessor(document.meshes[node.mesh].primitives[0].attributes.POSITION)
         poses = np.tile(np.eye(4), (len(seconds), 1, 1))
         if number in keyed:
-            poses[:] = np.nan  # where a part is not there it has no key
+            poses[:] = np.nan  # a part has no key where it is absent
             for path, (times, values) in keyed[number].items():
                 rows = np.abs(seconds[:, None] - times[None]).argmin(axis=0)
                 if path == "rotation":
@@ -168,10 +174,15 @@ def compare(
     frames: list[int],
     extent: float,
 ) -> list[PartFigures]:
-    """Matches the parts of the ground truth with nodes, and compares their motion.
+    """Matches the parts of the ground truth with nodes and compares their motions.
 
     Args:
-        points: [P, 3] of the truth in frame 0. part_id: [P] of each. frames: T, of the capture. extent: user's unit.
+        nodes: nodes of the asset.
+        wanted: parts of the ground truth.
+        points: [P, 3] true points in frame 0.
+        part_id: [P] part of each point.
+        frames: the T frames of the capture.
+        extent: extent of the scene in the user's unit.
     """
     places = np.concatenate([node.places for node in nodes])
     of_node = np.repeat(np.arange(len(nodes)), [len(node.places) for node in nodes])
@@ -196,8 +207,13 @@ def compare(
 
 
 def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Float, Float]:
-    """Returns [T − 1] degrees and [T − 1] percent of the extent between motions [T, 4, 4], at points [M, 3] of frame 0.
+    """Returns the errors after frame 0: [T − 1] in degrees, and [T − 1] at the points in percent of the extent.
 
+    Args:
+        found: [T, 4, 4] reconstructed motion.
+        true: [T, 4, 4] true motion.
+        points: [M, 3] points in frame 0.
+        extent: extent of the scene in the unit of the points.
     >>> turned = np.tile(np.eye(4), (2, 1, 1))
     >>> turned[1, :3, :3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     >>> degrees, percent = errors(turned, np.tile(np.eye(4), (2, 1, 1)), np.array([[1.0, 0, 0]]), 2.0)
@@ -213,10 +229,8 @@ def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Flo
 
 
 def told_asset(figures: list[AssetFigures]) -> str:
-    """Formats the figures as Markdown: one row per part, and one for all covered parts."""
-    head = (
-        "| parts | part of the truth | points | node holds | rotation, median (worst) | at its points, median (worst) |"
-    )
+    """Formats the figures as Markdown: one row per part, and one row for all covered parts."""
+    head = "| parts | true part | points | in the node | rotation, median (worst) | at its points, median (worst) |"
     rows = [head, "|---|---|---|---|---|---|"]
     for one in figures:
         for part in one.parts:

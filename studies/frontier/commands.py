@@ -15,33 +15,31 @@ STEPS = ("rows", "times", "convergence", "page")
 
 def frontier(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to continue.")] = FRONTIER,
-    axes: Annotated[
-        list[str] | None, typer.Option(help="Only this axis, as iterations or layers. May be repeated.")
-    ] = None,
-    updates: Annotated[int, typer.Option(min=1, help="Updates of each row.")] = 5,
-    most_iterations: Annotated[int | None, typer.Option(min=1, help="Leave out settings with more iterations.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the study. A second run continues it.")] = FRONTIER,
+    axes: Annotated[list[str] | None, typer.Option(help="Only this axis, for example layers. May be repeated.")] = None,
+    updates: Annotated[int, typer.Option(min=1, help="Updates per row.")] = 5,
+    most_iterations: Annotated[int | None, typer.Option(min=1, help="Skip settings with more iterations.")] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Only this step: rows, times, convergence or page. May be repeated.")
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of timing; every setting once in each.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Timing rounds; each times every setting once.")] = 5,
     page: Annotated[
-        Path | None, typer.Option(help="The page, as Markdown; plots go into a folder of its name. [OUT/frontier.md]")
+        Path | None, typer.Option(help="Markdown page; its plots go into a folder of that name. [OUT/frontier.md]")
     ] = None,
 ) -> None:
-    """Measures accuracy against time: iterations by method, and one setting at a time around the default.
+    """Measures accuracy against time: iterations of each method, and one setting at a time around the default.
 
-    Rows (accuracy) may be measured beside other work; times are measured in turns and want a quiet machine. Then the
-    page with its plots is written from all that the study's folder holds.
+    Rows (accuracy) can be measured on a busy machine. Times are measured in alternation and need an idle machine. The
+    page and its plots are then written from everything in the study's folder.
 
     Example: scripts/bench frontier captures/robot --axes iterations --axes layers
     """
     for step in only or ():
         if step not in STEPS:
-            raise typer.BadParameter(f"step {step!r} is unknown; choose of {', '.join(STEPS)}")
+            raise typer.BadParameter(f"step {step!r} is unknown; choose from {', '.join(STEPS)}")
     steps = only or STEPS
     if "page" in steps:
-        import_module("matplotlib")  # missing, it is named now and not after hours of measuring
+        import_module("matplotlib")  # if missing, fail now and not after hours of measuring
     from studies.frontier.convergence import measure_convergence
     from studies.frontier.frontier import measure_frontier, variants
     from studies.frontier.page import write_page

@@ -1,7 +1,7 @@
 """Convergence of an update: PSNR of the test cameras after some of its iterations.
 
-Rates fall and layers begin by shares of an update's iterations, so the curve of a long update does not run through the
-ends of shorter ones. The test cameras are rendered beside the update and never reach it.
+Learning rates and layer starts depend on the fraction of completed iterations, so the curve of a long update does not
+pass through the end points of shorter ones. The test cameras are only rendered; the update never uses them.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from studies.machine import core_version
 from studies.quality.first_frame import started
 
 CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
-"""Iterations after which the state is looked at, as far as an update has them; its end is looked at in any case."""
+"""Iterations after which the state is evaluated, if the update has that many. Its last state is always evaluated."""
 WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
-"""Preset and iterations."""
+"""Pairs of preset and number of iterations."""
 
 Look = Callable[[int, UpdateEngine], None]
-"""Called with the iterations done, and the engine after them."""
+"""Called with the number of completed iterations and the engine after them."""
 
 
 class WatchedEngine:
-    """A wrapper of an update's engine that calls an observer before each iteration."""
+    """Wraps the engine of an update and calls an observer before each iteration."""
 
     def __init__(self, inner: UpdateEngine, look: Look) -> None:
         self.inner, self._look = inner, look
@@ -58,11 +58,11 @@ def measure_convergence(
     """Observes the first updates of a capture and writes the curves to ``out/convergence/<capture>.json``.
 
     Args:
-        folder: of a capture with test cameras.
-        out: folder of the study, with its frames 0.
-        updates: whose curves are averaged.
-        variants: none: those of ``WATCHED``.
-        report: takes the lines that are printed.
+        folder: folder of a capture with test cameras.
+        out: folder of the study, which contains the states of frame 0.
+        updates: number of updates over which the curves are averaged.
+        variants: settings to measure; ``WATCHED`` if empty.
+        report: prints the progress.
     """
     compile_in_processes()
     capture = open_measured(folder)
@@ -92,18 +92,18 @@ def measure_convergence(
 
 
 def read_convergence(out: Path, capture: str) -> Row | None:
-    """Reads the measurements of ``measure_convergence`` for a capture, or returns None if there are none."""
+    """Returns the measurements that ``measure_convergence`` wrote for a capture, or None if there are none."""
     return read_row(out / "convergence" / f"{capture}.json")
 
 
 def once(settings: Settings) -> Settings:
-    """Returns the settings with one attempt per frame and a fixed number of iterations, in the first frame too."""
+    """Returns the settings with one attempt per frame and a fixed number of iterations, including the first frame."""
     update = settings.update.model_copy(update={"reject_outliers": False, "cold_start_iterations": 1.0})
     return settings.model_copy(update={"update": update})
 
 
 def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> list[dict[int, float]]:
-    """Returns, for each update, the mean PSNR in dB of the test cameras by number of iterations."""
+    """Returns one curve per update: mean PSNR of the test cameras in dB, keyed by number of iterations."""
     reconstruction = started(capture, once(variant.settings), out)
     curves: list[dict[int, float]] = []
     for index in range(1, updates + 1):
@@ -124,7 +124,7 @@ def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> lis
 
 
 def _psnr(reconstruction: Any, capture: Capture, state: Gaussians, true: Any) -> float:
-    """Returns the mean PSNR over the test cameras of a state, which need not be committed."""
+    """Returns the mean PSNR of a state over the test cameras; the state need not be committed."""
     from scas4d_core.query.committed import CommittedScene
     from scas4d_core.storage.history import History
 

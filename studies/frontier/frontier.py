@@ -1,10 +1,10 @@
 """``scripts/bench frontier``: accuracy against time, setting by setting.
 
-Iterations by method, and one axis at a time around the default of 100 iterations of ``scas4d``. A row is one capture,
-one setting and one seed over the same first updates, so that all rows of a capture can be compared; every row is a row
-of ``bench.quality``, and rows on disk are not measured again. Frame 0 is fitted once for each capture and budget of
-Gaussians. The seconds that count are those of ``bench.timing``, which measures settings in turns: rows may be measured
-on a machine that does other things.
+The study varies the iterations of each method, and one axis at a time around the default of 100 iterations of
+``scas4d``. A row is one capture, one setting and one seed over the same first updates, so that all rows of a capture
+are comparable. Rows are those of ``studies.quality``, and rows on disk are not measured again. Frame 0 is fitted once
+per capture and Gaussian budget. The reported seconds come from ``studies.frontier.timing``, which measures settings in
+alternation, so rows may be measured on a busy machine.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ METHODS = ("scas4d", "dynamic3dgs")
 ITERATIONS = (10, 25, 50, 100, 200, 300, 500, 1000, 2000)
 DEFAULT_ITERATIONS = 100
 UPDATES = 5
-"""Of each row."""
+"""Updates per row."""
 SEEDS = (0, 1, 2)
-"""Of the updates, on the axis "seeds"; every other row has the first."""
+"""Seeds of the updates on the axis "seeds"; all other rows use the first."""
 DRIFT = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
-"""Preset and iterations of the rows that go through a whole capture."""
+"""Preset and number of iterations of the rows that cover a whole capture."""
 MAX_SCALE = "scas4d_core.engines.plan.MAX_SCALE"
-"""The constant of the axis "max-scale"."""
+"""Constant that the axis "max-scale" varies."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,13 @@ class Variant:
     """One setting of the study.
 
     Attributes:
-        label: in words, for plots and tables.
-        preset: name. iterations: of an update. changes: further settings, as ``"update.clusters=[64]"``.
-        seed: of the updates alone: frame 0 is the same for all.
-        whole: through all frames of the capture.
-        constants: of the method, by dotted name, with another value (``studies.constants``).
+        label: short description for plots and tables.
+        preset: name of the preset.
+        iterations: iterations per update.
+        changes: further settings, such as ``"update.clusters=[64]"``.
+        seed: seed of the updates; frame 0 is the same for all seeds.
+        whole: whether to process all frames of the capture.
+        constants: changed constants of the method, as pairs of dotted name and value (``studies.constants``).
     """
 
     label: str
@@ -61,7 +63,7 @@ class Variant:
         return settings_of(self.preset, self.iterations, changes=[f"update.seed={self.seed}", *self.changes])
 
     def job(self, capture: Path, updates: int) -> Job:
-        """Returns the row of a capture over a number of updates, or over all."""
+        """Returns the job that measures a capture with this setting, over a number of updates or all frames."""
         frames = None if self.whole else updates + 1
         return Job(capture, self.preset, self.settings, frames, pictures=(-1,), constants=self.constants)
 
@@ -76,14 +78,14 @@ def _changed(label: str, name: str, value: object, *more: str) -> Variant:
 
 
 DEFAULT = Variant("scas4d 100")
-"""What the other axes go through, and what times are compared with."""
+"""Setting around which the other axes vary, and the reference for times."""
 
 AXES: Mapping[str, tuple[Variant, ...]] = {
     "iterations": tuple(Variant(f"{name} {count}", name, count) for count in ITERATIONS for name in METHODS),
     "adaptive": tuple(
         Variant(f"{name} {PRESETS[name].update.iterations}", name, PRESETS[name].update.iterations)
         for name in PRESETS
-        if name not in METHODS and not PRESETS[name].effects  # those by kind of scene have a figure in docs/effects.md
+        if name not in METHODS and not PRESETS[name].effects  # docs/effects.md has presets per kind of scene
     ),
     "layers": (
         _changed("K=1: 64", "update.clusters", [64]),
@@ -109,24 +111,26 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     ),
     "drift": tuple(Variant(f"{name} {count}", name, count, whole=True) for name, count in DRIFT),
 }
-"""One setting at a time; layers in between are spaced evenly in their logarithm, and the default is on every axis.
+"""Axes of the study, each of which varies one setting and includes the default.
 
-A separate covariance is all ΔR and Δs: there each Gaussian's own begins at once, with the first layer.
+Additional layers are evenly spaced in log scale. A separate covariance consists of ΔR and Δs alone, so the deltas of
+each Gaussian start immediately, with the first layer.
 """
 
 
 def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
-    """Returns the settings of some axes without duplicates, the default first; all axes if none are given.
+    """Returns the settings of some axes without duplicates, the default first; of all axes if none are given.
 
     Args:
-        axes: of ``AXES``. most_iterations: leave out settings with more.
+        axes: names from ``AXES``.
+        most_iterations: settings with more iterations are left out.
 
     Raises:
-        ValueError: an unknown axis.
+        ValueError: an axis is unknown.
     """
     for name in axes:
         if name not in AXES:
-            raise ValueError(f"axis {name!r} is unknown; choose of {', '.join(AXES)}")
+            raise ValueError(f"axis {name!r} is unknown; choose from {', '.join(AXES)}")
     asked = [variant for name in axes or AXES for variant in AXES[name]]
     return list(
         dict.fromkeys([DEFAULT, *(v for v in asked if most_iterations is None or v.iterations <= most_iterations)])
@@ -142,20 +146,21 @@ def measure_frontier(
     most_iterations: int | None = None,
     report: Report = print,
 ) -> list[Row]:
-    """Measures the missing rows, the cheapest rows of all captures first.
+    """Measures the missing rows, starting with the cheapest over all captures.
 
     Args:
-        captures: folders with test cameras. out: folder of the study.
-        axes: of ``AXES``; none: all.
-        updates: of each row, but for the axis "drift", which goes through whole captures.
-        most_iterations: leave out settings with more.
-        report: takes the lines that are printed.
+        captures: folders of captures with test cameras.
+        out: folder of the study.
+        axes: names from ``AXES``; all axes if empty.
+        updates: updates per row, except on the axis "drift", which covers whole captures.
+        most_iterations: settings with more iterations are left out.
+        report: prints the progress.
 
     Returns:
-        The rows that this call has measured; failed ones have ``error`` and are tried again next time.
+        The rows measured by this call; failed rows have an ``error`` and are retried next time.
 
     Raises:
-        ValueError: an unknown axis.
+        ValueError: an axis is unknown.
     """
     chosen = variants(axes, most_iterations)
     return measure_variants(captures, chosen, out, updates=updates, report=report)
@@ -164,7 +169,7 @@ def measure_frontier(
 def measure_variants(
     captures: Sequence[Path], chosen: Sequence[Variant], out: Path, *, updates: int = UPDATES, report: Report = print
 ) -> list[Row]:
-    """Measures the missing rows of some settings, see ``measure_frontier``."""
+    """Measures the missing rows of the given settings; see ``measure_frontier``."""
     known = list(Store(out).rows())
     wanted = [(variant, capture) for variant in chosen for capture in captures]
     jobs = [
@@ -179,8 +184,8 @@ def measure_variants(
 def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) -> Row | None:
     """Returns the row of a setting on a capture, or None if it was not measured.
 
-    A row belongs to a setting where its settings are, to the last number, those that the setting has today, and where
-    it has exactly so many updates, or all of the capture.
+    A row belongs to a setting if its stored settings equal the current ones exactly, and if it covers exactly the given
+    number of updates, or the whole capture.
     """
     settings = variant.record
     for row in rows:

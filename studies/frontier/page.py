@@ -26,13 +26,13 @@ from studies.frontier.tradeoff import (
 from studies.machine import in_words
 
 PREVIEW_LOSS_DB = 4.0
-"""A preview may lose so much against the default."""
+"""Largest PSNR loss of a preview against the default."""
 LIVE_GAIN_DB = 1.0
-"""A live show goes on to a slower setting while it gains this much for each doubling of the time."""
+"""A live show moves to a slower setting while each doubling of the time gains at least this much."""
 ARCHIVE_GAIN_DB = 0.1
-"""An archive takes the fastest setting within this of the best."""
+"""An archive uses the fastest setting within this distance of the best."""
 STAGE_ROWS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
-"""Labels of the settings whose stages are drawn."""
+"""Labels of the settings whose stages are plotted."""
 AXIS_WORDS: Mapping[str, str] = {
     "adaptive": "Other presets",
     "layers": "Layers",
@@ -51,7 +51,7 @@ COLUMNS = (
     ("2D %", "mte_2d", ".2f"),
     ("parts ARI", "parts_ari", ".3f"),
 )
-"""Heading, name in ``Point.scores``, form."""
+"""Column heading, name in ``Point.scores``, and number format."""
 
 
 class NothingMeasured(ValueError):
@@ -59,17 +59,19 @@ class NothingMeasured(ValueError):
 
 
 def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES) -> str:
-    """Draws the plots into a folder named after the page, and writes the page.
+    """Draws the plots into a folder named after the page and writes the page.
 
     Args:
-        out: folder of the study. captures: names; those without rows are left out.
-        page: Markdown file. updates: that the rows cover.
+        out: folder of the study.
+        captures: names of captures; those without rows are left out.
+        page: Markdown file to write.
+        updates: number of updates that the rows cover.
 
     Returns:
-        The page's text.
+        The text of the page.
 
     Raises:
-        NothingMeasured: no capture has a row of both methods.
+        NothingMeasured: no capture has rows of both methods.
     """
     points = read_points(out, captures, updates)
     there = [name for name in captures if all(curve(points, method, name) for method in METHODS)]
@@ -84,10 +86,10 @@ def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UP
 
 
 def chosen(means: Sequence[Point]) -> dict[str, Point]:
-    """Returns a setting each for a preview, a live show and an archive, selected by the rules of the page.
+    """Returns one setting each for a preview, a live show and an archive, selected by the rules on the page.
 
     Args:
-        means: points of every setting, on one capture or averaged; the default among them.
+        means: points of every setting, on one capture or averaged; the default must be among them.
     """
     best = undominated([p for p in means if p.variant.seed == DEFAULT.seed and not p.variant.whole])
     default = next(point for point in means if point.variant == DEFAULT)
@@ -121,7 +123,7 @@ def score_table(points: Sequence[Point], default: Point | None = None, counts: b
 
 
 def equal_table(compared: Sequence[EqualSeconds]) -> str:
-    """Returns a Markdown table of captures by budgets, "lead (ours against the baseline's)" in each cell."""
+    """Returns a Markdown table of captures by budgets; each cell shows the lead and both PSNR values."""
     budgets = sorted({one.iterations for one in compared})
     head = ["capture", *(f"{count} iterations" for count in budgets)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
@@ -132,7 +134,7 @@ def equal_table(compared: Sequence[EqualSeconds]) -> str:
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
-    """Describes in how many comparisons ``scas4d`` leads, and its smallest lead."""
+    """Describes at how many budgets ``scas4d`` leads, and its smallest lead."""
     leads = [one.lead for one in compared if one.lead is not None]
     missing = len(compared) - len(leads)
     if not leads:
@@ -164,7 +166,7 @@ def _draw(
 
 
 def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
-    """Returns, by method, the standard deviation in dB over seeds of a mean over captures with independent seeds."""
+    """Returns, per method, the standard deviation of the mean over captures in dB, over independent seeds."""
     deviations = {method: [spread(points, method, name) for name in captures] for method in METHODS}
     return {
         method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)
@@ -198,7 +200,7 @@ def _text(
 
 {_provenance(out, captures)}
 
-An iteration is one forward and backward render of one training view, or of several where a row says so. Each row
+An iteration is one forward and backward render of one training view, or of several if a row says so. Each row
 covers the first {updates} updates of a capture, from the same frame 0; accuracy is the mean over these updates and the
 test cameras. Definitions: [quality.md](quality.md), `scas4d_core/metrics/evaluation.py`. Seconds are medians of
 one update, decoding and commit included. A setting is dominated if another one is at least as fast and more accurate.
@@ -283,7 +285,7 @@ def _choice(means: Sequence[Point], default: Point) -> str:
 
 
 def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> tuple[list[Point], Point | None]:
-    """Returns the means of the default and of an axis over the captures that have the axis."""
+    """Returns the means of the default and of an axis, over the captures on which the axis was measured."""
     on = _captures_of(points, axis, captures)
     if not on:
         return [], None
@@ -293,7 +295,7 @@ def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> 
 
 
 def _captures_of(points: Sequence[Point], axis: str, captures: Sequence[str]) -> list[str]:
-    """Returns the captures on which a whole axis was measured."""
+    """Returns the captures on which the complete axis was measured."""
     needed = set(AXES[axis])
 
     def has(capture: str) -> set[Variant]:
@@ -308,7 +310,7 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
 
 
 def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
-    """Returns the random variation: the standard deviation over the seeds of the updates."""
+    """Returns a sentence with the standard deviation of the PSNR over the seeds of the updates."""
     spreads = []
     for method in METHODS:
         by_capture = {name: spread(points, method, name) for name in captures}
@@ -328,7 +330,7 @@ def _provenance(out: Path, captures: Sequence[str]) -> str:
     cores = sorted({str(row["core"]) for row in [*rows, *times]})
     where = (
         "; ".join(sorted({in_words(row["machine"]) for row in times}))
-        or "not in turns, but CPU seconds of rows on one thread"
+        or "not in alternation, but CPU seconds of rows on one thread"
     )
     accuracy = "; ".join(sorted({in_words(row["machine"]) for row in rows}))
     return (

@@ -1,8 +1,8 @@
-"""Plots of the frontier as PNG files: accuracy over time, within an update and over frames, and time by stage.
+"""Plots of the frontier as PNG files: accuracy against time, within an update and over frames, and time per stage.
 
-They are as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that width.
-Colours are those of Okabe and Ito, distinguishable with any colour vision; shapes and labels repeat them. A colour is
-a method's, an axis's or a stage's, and a dash is a number of iterations, in every plot.
+Each plot is as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that
+width. The palette of Okabe and Ito is distinguishable with any colour vision; shapes and labels repeat it. In every
+plot, a colour stands for the same method, axis or stage, and a dash pattern for the same number of iterations.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ OTHER_AXES = {
     "gaussians": ("budget of Gaussians", "v", OKABE_ITO[4]),
     "adaptive": ("other presets", "*", OKABE_ITO[7]),
 }
-"""In words, marker and colour."""
+"""Name, marker and colour of each axis."""
 STAGES = {
     "render backward": "#332288",
     "render": "#88CCEE",
@@ -47,11 +47,11 @@ STAGES = {
     REPORT: "#000000",
     "rest": "#BBBBBB",
 }
-"""Colours of the stages (Paul Tol's "muted"), none of them a method's."""
+"""Colours of the stages (Paul Tol's "muted"), distinct from those of the methods."""
 ABOUT = (0.7, 1.6)
-"""Times the default's seconds: settings in between are drawn about it, others among the iterations."""
+"""Range of times relative to the default. Settings within it get a panel of their own."""
 COLUMN, PAGE = 3.45, 7.0
-"""Inches."""
+"""Widths of the figures in inches."""
 STYLE = {
     "font.size": 8,
     "axes.titlesize": 8,
@@ -77,30 +77,30 @@ STYLE = {
 SECONDS = "seconds per frame"
 PSNR = "PSNR on the test cameras (dB)"
 DASHES = {25: ":", 100: "-", 300: "--"}
-"""By iterations."""
+"""Line style of each number of iterations."""
 SMALL_STAGES = 0.02
-"""Of the longest bar: stages that are shorter in every bar are drawn as one, but for the report's."""
+"""Share of the longest bar: stages that are shorter in every bar are combined, except the report."""
 DEVIATION = "± 1 standard deviation over seeds"
 SIDES = (
     *((5, 0, "left", "center"), (-5, 0, "right", "center"), (0, 4, "center", "bottom"), (0, -4, "center", "top")),
     *((5, 5, "left", "bottom"), (5, -5, "left", "top"), (-5, 5, "right", "bottom"), (-5, -5, "right", "top")),
     *((3, 11, "left", "bottom"), (3, -11, "left", "top"), (-3, 11, "right", "bottom"), (-3, -11, "right", "top")),
 )
-"""Where a name may stand beside its point: offset in points, alignments; what comes first is preferred."""
+"""Candidate label positions: offset from the point in points, and alignments, in order of preference."""
 FAR = 150
-"""What a place that is far off its point counts: more than a line that is crossed, less than a name that is hidden."""
+"""Cost of a label far from its point: more than crossing a line, less than hiding another label."""
 LABEL_GAP = 8.5
-"""Points between the middles of labels that stand one above the other."""
+"""Vertical distance between the centres of stacked labels, in points."""
 
 
 def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: Mapping[str, float]) -> None:
-    """Plots accuracy over seconds: both methods by iterations, and variations of the default's settings.
+    """Plots accuracy against time: both methods by iterations, and variations of the default settings.
 
     Args:
-        points: of one capture, or means over several.
-        title: what was measured.
-        file: PNG.
-        deviations: by method, dB, standard deviation of ``points`` over seeds, where known.
+        points: points of one capture, or means over several.
+        title: description of what was measured.
+        file: PNG file to write.
+        deviations: standard deviation of ``points`` over seeds in dB, keyed by method, where known.
     """
     plt = _pyplot()
     default = next((point for point in points if point.variant == DEFAULT), None)
@@ -148,7 +148,7 @@ def _draw_about_default(
     plt: Any, axes: Any, points: Sequence[Point], others: Mapping[str, list[Point]], best: Sequence[Point],
     deviation: float | None,
 ) -> None:  # fmt: skip
-    """Plots one setting at a time, with labels, and the curve through the default."""
+    """Plots one setting at a time with labels, and the curve through the default."""
     method = METHODS[0]
     _steps(axes, best)
     _curve(axes, points, method, best, deviation)
@@ -164,7 +164,7 @@ def _draw_about_default(
     room = 0.12 * (max(psnr) - min(psnr)) + 0.1
     axes.set_ylim(min(psnr) - room, max(psnr) + room)
     axes.set_xlabel(SECONDS)
-    axes.set_title("b  one setting at a time about the default", loc="left")
+    axes.set_title("b  one setting at a time around the default", loc="left")
     keys = [
         _key(plt, OTHER_AXES[axis][1], OTHER_AXES[axis][2], OTHER_AXES[axis][0])
         for axis in others
@@ -215,7 +215,7 @@ def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) 
 
 
 def draw_convergence(row: Row, file: Path) -> None:
-    """Plots the test cameras' PSNR within an update, from the result of ``measure_convergence``."""
+    """Plots the PSNR of the test cameras within an update, from the result of ``measure_convergence``."""
     plt = _pyplot()
     figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
     longest = max(drawn["iterations"][-1] for drawn in row["curves"])
@@ -262,9 +262,9 @@ def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
     """Plots the time of a frame by stage, with one bar per setting.
 
     Args:
-        points: in the order of the bars, the first on top.
-        title: what was measured.
-        file: PNG.
+        points: points in the order of the bars, the first on top.
+        title: description of what was measured.
+        file: PNG file to write.
     """
     plt = _pyplot()
     stages = _grouped_stages(points)
@@ -314,7 +314,7 @@ def _colour(preset: str) -> str:
 
 
 def _steps(axes: Any, best: Sequence[Point]) -> Any:
-    """Draws the frontier in the background."""
+    """Draws the frontier in the background and returns its line."""
     (line,) = axes.step(
         [p.seconds for p in best], [p.psnr for p in best], where="post", color="#d4d4d4", linewidth=4, zorder=1,
         solid_capstyle="round", label="not dominated",
@@ -353,7 +353,7 @@ def _key(plt: Any, marker: str, colour: str, words: str, line: bool = False) -> 
 
 
 def _log_seconds(axes: Any, label: bool = True) -> None:
-    """Creates a logarithmic axis; without a label, it is for a small panel and has fewer ticks."""
+    """Makes the time axis logarithmic; without a label, it gets fewer ticks, for a small panel."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -371,7 +371,7 @@ def _whole_decibels(axes: Any) -> None:
 
 
 def _up_to(axes: Any, last: float) -> None:
-    """Ends the axis at the last value, with space for labels after it."""
+    """Ends the x axis at the last value, because labels follow to its right."""
     from matplotlib.ticker import MaxNLocator
 
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
@@ -379,7 +379,7 @@ def _up_to(axes: Any, last: float) -> None:
 
 
 def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
-    """Draws the names of curves at their ends (x, y, name, colour), without overlaps."""
+    """Labels curves at their ends (x, y, name, colour), without overlaps."""
     axes.figure.draw_without_rendering()
     scale = 72 / axes.figure.dpi
     heights = {end: scale * axes.transData.transform(end[:2])[1] for end in ends}
@@ -395,10 +395,12 @@ def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
 
 
 def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Sequence[Any] = ()) -> None:
-    """Draws names next to points (x, y, name, colour), on the side where they hide the fewest points and lines.
+    """Labels points on the side where the name hides the fewest points and lines.
 
     Args:
-        avoided: lines, x and y of their vertices.
+        axes: axes to draw on.
+        named: x, y, name and colour of each point.
+        avoided: lines to keep visible, as the x and y coordinates of their vertices.
     """
     from matplotlib.patheffects import withStroke
     from matplotlib.transforms import Bbox
@@ -415,7 +417,7 @@ def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Se
     taken = [] if legend is None else [legend.get_window_extent()]
     taken += [text.get_window_extent() for text in axes.texts] + [around(one[:2]) for one in named]
     crossed = [around(point) for line in avoided for point in _along(line)]
-    for x, y, words, colour in sorted(named, key=lambda one: -len(one[2])):  # long ones find room while there is some
+    for x, y, words, colour in sorted(named, key=lambda one: -len(one[2])):  # long names first, while there is room
         tried = []
         for across, up, ha, va in SIDES:
             label = axes.annotate(
@@ -436,14 +438,14 @@ def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Se
 
 
 def _along(line: tuple[Any, Any]) -> list[tuple[float, float]]:
-    """Returns points of a line, including points between its vertices."""
+    """Returns points along a line, including points between its vertices."""
     x, y = (np.asarray(values, float) for values in line)
     where = np.linspace(0, len(x) - 1, 20 * len(x))
     return list(zip(np.interp(where, range(len(x)), x), np.interp(where, range(len(y)), y), strict=True))
 
 
 def _grouped_stages(points: Sequence[Point]) -> Mapping[str, list[float]]:
-    """Returns the seconds of each stage per point, the slowest stage first; short stages are combined as "rest"."""
+    """Returns the seconds of each stage per point, slowest stage first; short stages are combined as "rest"."""
     names = dict.fromkeys(name for point in points for name in point.stages)
     by_name = {name: [point.stages.get(name, 0.0) for point in points] for name in names}
     longest = max(sum(point.stages.values()) for point in points)

@@ -1,9 +1,9 @@
-"""Times of settings that are measured in alternation, so that other load on the machine affects all equally.
+"""Times of settings, measured in alternation so that other load on the machine affects all of them equally.
 
-Every setting has a reconstruction of its own, all in one process, from the frame 0 that the rows of the study share.
-In each round every setting updates to the next frame, in an order that turns from round to round. The first round loads
-kernels and starts without a motion; it is not counted. Settings of many iterations are counted once. What is kept is
-the median, and the median over the rounds of the ratio to the first setting.
+Each setting has its own reconstruction, all in one process, starting from the frame 0 that the rows of the study share.
+In each round, every setting processes the next frame, in an order that rotates from round to round. The first round is
+not counted, because it loads kernels and has no motion to start from. Settings with many iterations are counted once.
+The result is the median time, and the median over the rounds of the ratio to the first setting.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from studies.frontier.frontier import Variant
 from studies.machine import core_version, machine
 
 ROUNDS = 5
-"""That are counted."""
+"""Number of counted rounds."""
 MANY_ITERATIONS = 500
-"""Settings with more are counted once: their seconds vary little, and a round of them takes a minute."""
+"""Settings with more are counted once: their times vary little, and a round of them takes a minute."""
 
 
 @dataclass
@@ -44,7 +44,7 @@ class TimedVariant:
     stages: list[dict[str, float]] = field(default_factory=list)
 
     def step(self, capture: Capture, index: int, *, counts: bool) -> float:
-        """Reads a frame and updates the reconstruction; records the seconds of both if it ``counts``."""
+        """Reads a frame and updates the reconstruction; returns the seconds, and records them if it ``counts``."""
         started, cpu = time.perf_counter(), time.process_time()
         with all_varied(self.variant.constants):
             done = self.reconstruction.step(capture.frame(index))
@@ -61,24 +61,24 @@ def measure_times(
 ) -> Row:
     """Times settings on a capture and writes the result to ``out/timing/<capture>.json``.
 
-    What was timed there before, and is not now, stays: its seconds times what the first setting's are to its own then.
+    Settings that only an earlier run measured are kept. Their times are scaled like that of the first setting.
 
     Args:
-        folder: of the capture.
-        variants: the first is what the others are compared with; those whose frame 0 is not kept yet have it fitted.
+        folder: folder of the capture.
+        variants: settings to time; the first is the baseline. A missing frame 0 is fitted.
         out: folder of the study.
-        rounds: that are counted.
-        report: takes the lines that are printed.
+        rounds: number of counted rounds.
+        report: prints the progress.
 
     Raises:
-        ValueError: no setting, fewer than 1 round, or a capture of fewer than 3 frames.
+        ValueError: there is no setting, fewer than 1 round, or a capture of fewer than 3 frames.
     """
     if not variants:
         raise ValueError("variants is empty; give at least one setting to time")
     if rounds < 1:
         raise ValueError(f"rounds is {rounds}; give at least 1")
     compile_in_processes()
-    # These bring the kernels.
+    # These imports load the kernels.
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import started
 
@@ -115,12 +115,12 @@ def measure_times(
 
 
 def read_times(out: Path, capture: str) -> Row | None:
-    """Reads the times of ``measure_times`` for a capture, or returns None if there are none."""
+    """Returns the times that ``measure_times`` wrote for a capture, or None if there are none."""
     return read_row(out / "timing" / f"{capture}.json")
 
 
 def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
-    """Returns the results of an earlier run that are missing today, scaled to today's times; none if incompatible."""
+    """Returns results that only an earlier run has, scaled to the current times; none if the runs are incompatible."""
     if before is None:
         return []
     first, *others = before["settings"]
@@ -152,7 +152,7 @@ def time_of(times: Row | None, variant: Variant) -> Row | None:
 
 
 def _distinct(variants: Sequence[Variant]) -> list[Variant]:
-    """Selects one setting per group that differs only in seeds and frame counts, which do not affect the time."""
+    """Selects one setting of each group that differs only in seeds and frame counts, which do not affect the time."""
     by_settings = {json.dumps(_unseeded(v.record), sort_keys=True): v for v in variants[::-1]}
     chosen = set(by_settings.values())
     return [variant for variant in variants if variant in chosen]

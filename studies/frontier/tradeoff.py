@@ -1,9 +1,9 @@
 """Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal time.
 
-Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
-there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.
-A setting that was not timed on a capture where others were has the seconds of its row, times what the default's timed
-seconds are to those of its row: so all seconds of a capture mean the same.
+Accuracy comes from the rows, which cover the same updates for all settings of a capture. Seconds come from
+``studies.frontier.timing``. A setting that was not timed has the seconds of its row: CPU seconds if the row ran on one
+thread, because other load on the machine hardly affects them. If the default was timed on the capture, these seconds
+are scaled by the ratio of its timed seconds to the seconds of its row, so that all times of a capture are comparable.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ SCORES = (
     "parts_ari",
     "flicker",
 )
-"""Of a row, by name."""
+"""Names of the scores in a row."""
 BUDGETS = (25, 50, 100, 200, 300)
-"""Iterations of the baseline whose seconds are compared at."""
+"""Numbers of baseline iterations at whose times the methods are compared."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,16 @@ class Point:
     """One setting on one capture, or its mean over several captures.
 
     Attributes:
-        capture: name, or what is averaged. updates: how many the scores cover.
-        seconds: of an update, see above. cpu_seconds: of all threads, None where not measured.
-        timed: whether the seconds were measured in turns. stages: median seconds by stage.
-        gaussians: in the scene. scores: by name of ``SCORES``, None where the capture has no truth for them.
-        psnr_by_frame: dB, frame 0 first; empty for a mean.
+        variant: the setting.
+        capture: name of the capture, or a list of the averaged captures.
+        updates: number of updates that the scores cover.
+        seconds: seconds per update, see the module docstring.
+        cpu_seconds: CPU seconds per update over all threads; None if not measured.
+        timed: whether the seconds were measured in alternation.
+        stages: median seconds of each stage.
+        gaussians: number of Gaussians in the scene.
+        scores: value of each of ``SCORES``; None if the capture has no ground truth for it.
+        psnr_by_frame: PSNR of each frame in dB, starting at frame 0; empty for a mean.
     """
 
     variant: Variant
@@ -60,14 +65,14 @@ class Point:
 
     @property
     def psnr(self) -> float:
-        """PSNR in dB, the mean over updates and test cameras."""
+        """Mean PSNR over updates and test cameras, in dB."""
         value = self.scores["psnr"]
         assert value is not None  # every row has it
         return value
 
 
 def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]:
-    """Returns every setting that was measured on these captures, in the order of the axes."""
+    """Returns all settings that were measured on these captures, in the order of the axes."""
     rows = list(Store(out).rows())
     points = []
     for capture in captures:
@@ -83,7 +88,7 @@ def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]
 
 
 def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]:
-    """Returns the means over captures of settings that were measured on all of them, with equal numbers of updates."""
+    """Returns the means over captures of the settings that were measured on all of these captures."""
     by_variant: dict[Variant, dict[str, Point]] = {}
     for point in points:
         by_variant.setdefault(point.variant, {})[point.capture] = point
@@ -95,18 +100,18 @@ def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]
 
 
 def of_axis(points: Iterable[Point], axis: str, capture: str | None = None) -> list[Point]:
-    """Returns the points of an axis, on one capture or on all."""
+    """Returns the points of an axis, on one capture or on all captures."""
     return [p for p in points if p.variant in AXES[axis] and capture in (None, p.capture)]
 
 
 def curve(points: Iterable[Point], method: str, capture: str | None = None) -> list[Point]:
-    """Returns the points of a method by ascending number of iterations."""
+    """Returns the points of a method, in ascending order of iterations."""
     points_of_method = [p for p in of_axis(points, "iterations", capture) if p.variant.preset == method]
     return sorted(points_of_method, key=lambda point: point.variant.iterations)
 
 
 def undominated(points: Sequence[Point]) -> list[Point]:
-    """Returns the non-dominated points (no other has more PSNR in the same time), by ascending seconds."""
+    """Returns the points for which no other is as fast and more accurate, in ascending order of seconds."""
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, -point.psnr)):
         if not best or point.psnr > best[-1].psnr:
@@ -115,10 +120,10 @@ def undominated(points: Sequence[Point]) -> list[Point]:
 
 
 def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
-    """Interpolates the PSNR (dB) of a curve at a time, linearly in log time; None outside the curve.
+    """Interpolates the PSNR of a curve in dB at a given time, linearly in log time; None outside the curve.
 
-    A setting that takes longer than a better one is no part of it: with very few iterations, updates end so far off
-    that the search for what was lost takes longer than the iterations that would have found it.
+    Settings that take longer than a better one are excluded. With very few iterations, updates end so far off that the
+    search for lost objects takes longer than the iterations that would have found them.
     """
     ordered = undominated(points)
     if not ordered or not ordered[0].seconds <= seconds <= max(point.seconds for point in points):
@@ -131,8 +136,11 @@ class EqualSeconds:
     """Both methods at the time that the baseline takes for a number of iterations.
 
     Attributes:
-        psnr: dB of ``scas4d``, interpolated; None where its curve does not reach there.
-        baseline_psnr: dB, measured: the best within these seconds.
+        capture: name of the capture.
+        iterations: number of baseline iterations.
+        seconds: seconds per update at which the methods are compared.
+        psnr: interpolated PSNR of ``scas4d`` in dB; None if its curve does not cover this time.
+        baseline_psnr: best measured PSNR of the baseline within this time, in dB.
     """
 
     capture: str
@@ -143,12 +151,12 @@ class EqualSeconds:
 
     @property
     def lead(self) -> float | None:
-        """The lead of ``scas4d`` in dB."""
+        """Lead of ``scas4d`` in dB."""
         return None if self.psnr is None else self.psnr - self.baseline_psnr
 
 
 def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[EqualSeconds]:
-    """Compares the methods at equal time, for every measured budget of ``BUDGETS``."""
+    """Compares the methods at equal time, for every measured entry of ``BUDGETS``."""
     own, other = METHODS
     pairs = []
     for capture in captures:

@@ -1,4 +1,4 @@
-"""Data model of hard cases, and the checks that all of them share."""
+"""Data model of hard cases, and checks that all of them share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Values = dict[str, NDArray[Any]]
 
 REFERENCE = "float64"
-"""The backend that the others are held against: the torch twins in float64."""
+"""Backend against which the others are compared: the torch reference in float64."""
 CPU, TORCH = "cpu", "torch float32"
 
 
@@ -21,8 +21,9 @@ class BackendResult:
     """Result of one backend for a case.
 
     Attributes:
-        values, gradients: arrays by name.
-        guards: how often each acted.
+        values: output arrays, keyed by name.
+        gradients: gradient arrays, keyed by name.
+        guards: how often each guard acted.
     """
 
     values: Values
@@ -49,13 +50,13 @@ class HardCase:
     """One entry of the catalogue.
 
     Attributes:
-        name: of the case.
-        what: is hard about it, and what must hold beside the laws that every case has.
-        source: where it comes from: the literature, users' reports (repository#thread), or the equations.
-        sizes: in which it is tried; what a size is, ``what`` says.
-        make: the problem in a size.
-        holds: violations of what must hold beside the problem's own laws.
-        slow: left out where only the fast ones are run.
+        name: name of the case.
+        what: what makes it hard, what its size means, and what must hold besides the shared checks.
+        source: its origin: the literature, users' reports (repository#thread), or the equations.
+        sizes: sizes at which it is run.
+        make: creates the problem at a given size.
+        holds: returns violations of the requirements specific to this case.
+        slow: whether to skip it when only fast cases are run.
     """
 
     name: str
@@ -71,7 +72,7 @@ def not_finite(outcome: BackendResult, backend: str) -> list[str]:
     """Returns a line for each array that contains NaN or infinity."""
     arrays = [*outcome.values.items(), *((f"gradient of {name}", a) for name, a in outcome.gradients.items())]
     return [
-        f"{backend}: {name} holds {np.count_nonzero(~np.isfinite(array))} numbers that are not finite"
+        f"{backend}: {name} contains {np.count_nonzero(~np.isfinite(array))} values that are not finite"
         for name, array in arrays
         if not np.isfinite(array).all()
     ]
@@ -95,9 +96,9 @@ def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> flo
 def unexpected_counts(
     outcome: BackendResult, expected: Mapping[str, int] | None, silent: Sequence[str] = ()
 ) -> list[str]:
-    """Returns a line if the CPU's guards were triggered differently than expected; None accepts everything."""
+    """Returns a line if the CPU guards acted differently than expected; None accepts any counts."""
     if expected is None:
         return []
     counts = {name: count for name, count in outcome.guards.items() if count and name not in silent}
     wanted = {name: count for name, count in expected.items() if count}
-    return [] if counts == wanted else [f"guards acted {counts}, expected {wanted}"]
+    return [] if counts == wanted else [f"guards acted: {counts}, expected: {wanted}"]

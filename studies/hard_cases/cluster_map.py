@@ -1,4 +1,4 @@
-"""Hard cases of deformations: saturated factors, folds, half turns, clusters with one Gaussian or none."""
+"""Hard cases of deformations: saturated factors, folds, half turns, and clusters with one Gaussian or none."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: 
     means = rng.uniform(-0.5, 0.5, (count, 3))
     fine = np.arange(count) * sizes[-1] // count if sizes else np.zeros(count)
     labels = [(fine * size // sizes[-1]).astype(np.int32) for size in sizes]
-    # The clusters lie side by side along x: they are compact, as K-means makes them.
+    # The clusters lie side by side along x, so that they are compact like K-means clusters.
     means[:, 0] = np.sort(means[:, 0])
     return Deforming(
         means.astype(np.float32),
@@ -44,7 +44,7 @@ R, T, C, S = slice(0, 3), slice(3, 6), slice(6, 9), 9
 
 
 def members(made: Deforming) -> int:
-    """Returns the Gaussians of the first cluster of the finest layer."""
+    """Returns the number of Gaussians in the first cluster of the finest layer."""
     return int(np.count_nonzero(made.labels[-1] == 0))
 
 
@@ -55,7 +55,7 @@ def _saturated(exponent: float) -> Deforming:
 
 
 def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that factor and gradient are not 0 before the clamp, so that a shrunk cluster can grow again."""
+    """Checks that factors and gradients are nonzero before the clamp, so that a shrunk cluster can grow again."""
     exponent = float(problem.clusters[-1][0, S])
     rows = problem.labels[-1] == 0
     faults = []
@@ -68,17 +68,17 @@ def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[st
 
 
 def _fold(strength: float) -> Deforming:
-    """Creates one cluster about its pivot with c·y from −strength to strength; above 1 the map folds."""
+    """Creates one cluster around its pivot with c·y from −strength to strength; above 1 the map folds."""
     rng = np.random.default_rng(8)
     made = ordinary(64, (1,), 0.0)
     means = rng.uniform(-1, 1, (64, 3)).astype(np.float32)
-    # 1 / (1 + x) has its pole where the determinant changes sign: turns are steep about it.
+    # 1 / (1 + x) has its pole where the determinant changes sign, so rotations are steep around it.
     made.clusters[0][0] = (0.1, -0.2, 0.05, 0, 0, 0, strength, 0.1 * strength, 0, 0)
     return replace(made, means=means, guards=None, turn=5e-2, gradient=5e-2, bound=1e7)
 
 
 def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Counts the Gaussians with negative determinant in float64."""
+    """Compares the number of counted folds with the number of negative determinants in float64."""
     before, after = problem.factors.astype(np.float64), outcomes[REFERENCE].values["factors"]
     folded = int(np.count_nonzero(np.linalg.det(before) * np.linalg.det(after) < 0))
     counted = outcomes[CPU].guards["folded"]
@@ -86,11 +86,11 @@ def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]
 
 
 def _straight_back(steepness: float) -> Deforming:
-    """Creates a map that folds along c: a half turn without a plane, or (steepness 2) without a cosine either."""
+    """Creates a map that folds along c: a half turn without a plane; at steepness 2 its cosine vanishes as well."""
     made = ordinary(2, (1,), 0.0)
     means = np.array([[-1, 0, 0], [1, 0, 0]], np.float32)
     made.clusters[0][0, C] = (steepness, 0, 0)
-    # f = 2σ(2z) depends on c·y too; s brings z of the folded one to 0, where f = 1 and the cosine is 2 − steepness.
+    # f = 2σ(2z) also depends on c·y; s sets z of the folded Gaussian to 0, where f = 1 and the cosine is 2 − steepness.
     made.clusters[0][0, S] = steepness
     return replace(
         made, means=means, deltas=np.zeros_like(made.deltas), turn=None, gradient=None, guards=None, bound=1e13
@@ -99,7 +99,7 @@ def _straight_back(steepness: float) -> Deforming:
 
 def _half_turn_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     acted = outcomes[CPU].guards["half_turn"]
-    return [] if acted == 1 else [f"the half turn was counted {acted} times, once is right"]
+    return [] if acted == 1 else [f"the half turn was counted {acted} times instead of once"]
 
 
 def _turned(r: float) -> Deforming:
@@ -133,7 +133,7 @@ def _stretch(exponent: float) -> Deforming:
 
 def _identity(count: int) -> Deforming:
     made = ordinary(count, (min(count, 3),), 0.0)
-    # The neighbour terms have their kink here: their gradients are whatever rounding makes of 0, but small.
+    # The neighbour terms have their kink here, so their gradients are rounding noise, but small.
     return replace(made, deltas=np.zeros_like(made.deltas), gradient=None, bound=1e3)
 
 
@@ -160,7 +160,7 @@ def _unbalanced(count: int) -> Deforming:
 def _place(metres: float) -> Deforming:
     """Moves the cloud far from the origin of the internal world, where float32 has a resolution of metres · 6e-8."""
     made = ordinary()
-    # Pivots and offsets are differences of large numbers; all agree to the spacing there, times the layers.
+    # Pivots and offsets are differences of large numbers, so results agree to the local spacing times the layers.
     spacing = max(1e-5, 1e-6 * metres)
     return replace(
         made, means=(made.means + np.float32(metres)).astype(np.float32), value=spacing, turn=max(1e-4, spacing),
@@ -169,7 +169,7 @@ def _place(metres: float) -> Deforming:
 
 
 def _size(metres: float) -> Deforming:
-    """Scales the cloud, its Gaussians and displacements by a length; c is per metre."""
+    """Scales the cloud, its Gaussians and displacements by a length; c is inversely proportional to length."""
     made = ordinary()
     for clusters in made.clusters:
         clusters[:, T] *= metres
@@ -203,7 +203,7 @@ def _not_finite(value: float, what: str = "means", count: int = 3) -> Deforming:
 
 
 def _apart(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that the other Gaussians move as in float64 without the invalid rows, which get no gradient."""
+    """Checks that rows held back get no gradient of their own."""
     own = outcomes[CPU].gradients["own"][problem.bad]
     return [] if np.all(own == 0) else ["cpu: a row that is held back has a gradient of its own"]
 
@@ -243,13 +243,13 @@ def _published(s: float) -> Deforming:
 
 def _still(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     worst = max(float(np.abs(o.values["terms"]).max()) for o in outcomes.values())
-    return [] if worst < 1e-6 else [f"where nothing moves a neighbour term is {worst:.2g}"]
+    return [] if worst < 1e-6 else [f"where nothing moves, a neighbour term is {worst:.2g}"]
 
 
 CASES = (
     HardCase(
         "identity",
-        "every parameter 0, so many Gaussians: no bit changes, no turn, no term between neighbours",
+        "all parameters 0, for this many Gaussians: no bit changes, no rotation, neighbour terms 0",
         "equation (6)",
         (1, 16, 17, 200),
         _identity,
@@ -257,7 +257,7 @@ CASES = (
     ),
     HardCase(
         "factor near 0",
-        "s of a cluster: tanh(s) + 1 is 0 in float32 from −9, ours is not; clamped from −43.5",
+        "s of a cluster: tanh(s) + 1 is 0 in float32 from −9 on, ours is not; clamped from −43.5",
         "equation (6) in float32",
         (-5.0, -9.0, -20.0, -40.0, -44.0, -1e4),
         _saturated,
@@ -266,7 +266,7 @@ CASES = (
     HardCase("factor near 2", "s of a cluster", "equation (6) in float32", (5.0, 9.0, 20.0, 44.0, 1e4), _saturated),
     HardCase(
         "fold",
-        "c·y up to this within a cluster; from 1 on det J changes sign: finite, and counted",
+        "c·y up to this value within a cluster; from 1 on, det J changes sign: finite, and counted",
         "det J = f³ (1 + (2 − f) cᵀ(x − p))",
         (0.5, 0.99, 1.5, 3.0, 10.0),
         _fold,
@@ -274,7 +274,7 @@ CASES = (
     ),
     HardCase(
         "straight back",
-        "c·y = −this exactly along c: a half turn in no plane; at 2 the cosine is 0 too",
+        "c·y is minus this value along c: a half turn in no plane; at 2 the cosine is also 0",
         "polar rotation of a fold",
         (2.0, 3.0, 30.0),
         _straight_back,
@@ -282,7 +282,7 @@ CASES = (
     ),
     HardCase(
         "large c",
-        "per metre",
+        "c per metre",
         "equation (6)",
         (10.0, 100.0, 1000.0),
         lambda c: first_cluster(C, (c, -c, c), guards=None, turn=None, gradient=None, bound=1e8),
@@ -290,64 +290,64 @@ CASES = (
     HardCase(
         "rotation by 180°", "r = tan of half the angle", "rotation parameter (1, r)", (1e2, 1e4, 1e8, 1e15), _turned
     ),
-    HardCase("own rotation by 180°", "Δr likewise", "rotation parameter (1, r)", (1e2, 1e4, 1e8, 1e15), _own_turn),
+    HardCase("own rotation by 180°", "as for r", "rotation parameter (1, r)", (1e2, 1e4, 1e8, 1e15), _own_turn),
     HardCase(
         "beyond a half turn",
-        "two layers of 100°, to either side: q and −q",
+        "two layers of 100° each, in either direction: q and −q",
         "quaternion sign",
         (1.0, -1.0),
         _through_a_half_turn,
     ),
     HardCase(
         "stretch",
-        "Δs of a tenth: clamped beyond 87, left to the commit's bounds before",
+        "Δs of a tenth of the Gaussians: clamped beyond 87, limited only by the commit below",
         "gsplat#613",
         (-100.0, -60.0, 20.0, 60.0, 100.0),
         _stretch,
     ),
     HardCase(
         "cluster of one",
-        "clusters per layer, one Gaussian in each of the finest",
+        "clusters per layer, with one Gaussian in each cluster of the finest",
         "small clusters",
         ((5,), (2, 40)),
         _of_one,
     ),
     HardCase(
         "unbalanced clusters",
-        "so many Gaussians, nearly all in one cluster, ten alone",
+        "this many Gaussians, nearly all in one cluster and ten alone",
         "K-means on real scenes",
         (100, 5000),
         _unbalanced,
     ),
-    HardCase("empty cluster", "so many clusters whose Gaussians are all NaN", "after losses", (1, 4), _empty, _apart),
-    HardCase("every Gaussian NaN", "so many", "gsplat#248", (4, 40), _all_bad),
+    HardCase("empty cluster", "clusters with only NaN Gaussians", "after losses", (1, 4), _empty, _apart),
+    HardCase("every Gaussian NaN", "number of Gaussians", "gsplat#248", (4, 40), _all_bad),
     HardCase(
         "NaN in a cluster",
-        "so many means",
+        "number of NaN means",
         "gsplat#248, vye16/shape-of-motion#43",
         (1, 3, 30),
         lambda n: _not_finite(np.nan, count=n),
         _apart,
     ),
-    HardCase("infinity in a cluster", "means of this", "gsplat#248", (np.inf, -np.inf), _not_finite, _apart),
+    HardCase("infinity in a cluster", "means with this value", "gsplat#248", (np.inf, -np.inf), _not_finite, _apart),
     HardCase(
         "NaN factor in a cluster",
-        "factors of this",
+        "factors with this value",
         "graphdeco-inria/gaussian-splatting#781",
         (np.nan, np.inf),
         lambda v: _not_finite(v, "factors"),
         _apart,
     ),
-    HardCase("all in one place", "so many Gaussians", "coincident points", (2, 40), _coincident),
-    HardCase("all on one line", "so many Gaussians", "collinear points", (8, 100), _collinear),
+    HardCase("all in one place", "number of Gaussians", "coincident points", (2, 40), _coincident),
+    HardCase("all on one line", "number of Gaussians", "collinear points", (8, 100), _collinear),
     HardCase(
         "far from the origin",
-        "metres: agreement to the spacing of float32 there",
+        "metres from the origin: agreement to the float32 spacing there",
         "users' coordinates",
         (10.0, 1e3, 1e4),
         _place,
     ),
-    HardCase("cloud of another size", "all lengths times this", "users' units", (1e-6, 1e-3, 1e3), _size),
+    HardCase("cloud of another size", "scale of all lengths", "users' units", (1e-6, 1e-3, 1e3), _size),
     HardCase(
         "cluster thrown far",
         "t in metres",
@@ -355,8 +355,8 @@ CASES = (
         (10.0, 1e4),
         lambda t: first_cluster(T, t, value=1e-6 * max(t, 10), gradient=1e-2),
     ),
-    HardCase("mirrored factors", "det F < 0 of so many", "reflections", (1, 60), _mirrored),
-    HardCase("flat Gaussians", "the third axis times this", "2D Gaussian Splatting", (1e-3, 1e-12, 0.0), _flat),
+    HardCase("mirrored factors", "Gaussians with det F < 0", "reflections", (1, 60), _mirrored),
+    HardCase("flat Gaussians", "scale of the third axis", "2D Gaussian Splatting", (1e-3, 1e-12, 0.0), _flat),
     HardCase(
         "published map",
         "s of a cluster, scaling about the world's origin",

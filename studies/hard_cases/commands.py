@@ -13,29 +13,27 @@ from studies.options import QUALITY, Again, Captures, Changes, write_part
 
 def stability(
     cases: Annotated[
-        list[str] | None, typer.Option(help="Only cases whose name holds this. May be repeated.", show_default=False)
+        list[str] | None, typer.Option(help="Only cases whose name contains this. May be repeated.", show_default=False)
     ] = None,
-    fast: Annotated[bool, typer.Option("--fast", help="Leave out what takes long, as a million to cluster.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Skip slow cases, such as a million points to cluster.")] = False,
     mutate: Annotated[
-        bool, typer.Option("--mutate", help="Take away each guard in turn; goes on where it was interrupted.")
+        bool, typer.Option("--mutate", help="Remove each guard in turn; continues an interrupted run.")
     ] = False,
-    store: Annotated[Path, typer.Option(help="Folder of the mutations' results.")] = Path("out/stability"),
-    out: Annotated[Path | None, typer.Option(help="Write the tables here, between their marks.")] = None,
+    store: Annotated[Path, typer.Option(help="Folder for the results of the mutations.")] = Path("out/stability"),
+    out: Annotated[Path | None, typer.Option(help="Page whose tables to replace, between their markers.")] = None,
     frames: Annotated[
         bool,
-        typer.Option("--frames", help="The frame cases instead, and what the checks cost; synthetic, or --captures."),
+        typer.Option("--frames", help="Run the frame cases instead, and measure the cost of the checks."),
     ] = False,
     captures: Annotated[
-        list[Path] | None, typer.Option(help="Frame cases on this capture with test cameras. May be repeated.")
+        list[Path] | None, typer.Option(help="Run the frame cases on this capture. May be repeated.")
     ] = None,
-    service: Annotated[
-        bool, typer.Option("--service", help="The frame cases through a running service instead.")
-    ] = False,
+    service: Annotated[bool, typer.Option("--service", help="Run the frame cases through a service instead.")] = False,
     soak: Annotated[
-        int | None, typer.Option(min=1, help="So many frames of a small scene instead; goes on where it was.")
+        int | None, typer.Option(min=1, help="Process this many frames of a small scene instead; continues a run.")
     ] = None,
 ) -> None:
-    """Runs the catalogue of hard cases on every backend that is here, and counts what the guards did.
+    """Runs the catalogue of hard cases on every available backend and counts how often the guards acted.
 
     Examples: scripts/bench stability --cases NaN --cases fold; scripts/bench stability --captures captures/robot;
     scripts/bench stability --service; scripts/bench stability --soak 10000
@@ -50,7 +48,7 @@ def stability(
     failing = mutations.study(store, typer.echo) if mutate else mutations.known(store)
     if out is not None:
         if cases or fast:
-            raise typer.BadParameter("a page has all cases; leave out --cases and --fast, or --out")
+            raise typer.BadParameter("a page contains all cases; leave out --cases and --fast, or --out")
         write_part(out, run.page(lines, failing, *run.here()))
     if any(line.violations for line in lines) or (mutate and not all((failing or {}).values())):
         raise typer.Exit(1)
@@ -58,15 +56,15 @@ def stability(
 
 def timing(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study of quality: rows, frames 0.")] = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Of each capture, which is played there and back.")] = 24,
+    out: Annotated[Path, typer.Option(help="Folder of the quality study: rows and frames 0.")] = QUALITY,
+    updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 24,
     masks: Annotated[bool, typer.Option(help="Use the masks of the captures.")] = True,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Gives two cameras of a capture pictures from between the frames, and reports what is found of it.
+    """Gives two cameras of a capture images from between the frames, and reports which time offsets are found.
 
-    Leaves timing.md in the study's folder; a run that was measured is not measured again.
+    Writes timing.md to the study's folder. Runs that were already measured are not repeated.
     """
     from studies.hard_frames.out_of_step import run
 
@@ -76,10 +74,14 @@ def timing(
 def _frame_studies(
     captures: Sequence[Path], store: Path, cases: Sequence[str], *, service: bool, soak: int | None
 ) -> None:
-    """The soak, or the frame cases on the synthetic footage or on captures; ends with 1 where something does not hold.
+    """Runs the soak test, or the frame cases on synthetic footage or captures; exits with 1 if a check fails.
 
     Args:
-        store: folder; the soak goes on in it, the rest begins anew.
+        captures: folders of captures for the frame cases; synthetic footage if empty.
+        store: folder of the results. The soak test continues in it; everything else starts from scratch.
+        cases: parts of the names of the cases to run; all if empty.
+        service: whether to run the frame cases through a service.
+        soak: number of frames of the soak test, or None.
     """
     if soak is not None:
         from studies.hard_frames.soak import Soak, table, violations

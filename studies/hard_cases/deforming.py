@@ -27,24 +27,30 @@ from studies.hard_cases.case import (
 Array = NDArray[np.float32]
 
 STRENGTHS = (4.0, 2.0, 4.0)
-"""Of rigidity, isometry and rotation."""
+"""Weights of the rigidity, isometry and rotation terms."""
 
 
 @dataclass(frozen=True, eq=False)
 class Deforming:
-    """Gaussians under layers of clusters.
+    """Gaussians that are deformed by layers of clusters.
 
-    The loss is a sum of the moved means and factors, each number with a random weight, and the neighbour terms, which
-    read the turns.
+    The loss is a randomly weighted sum of the moved means and factors, plus the neighbour terms, which depend on the
+    rotations.
 
     Attributes:
-        means [M, 3], factors [M, 3, 3]: of frame t−1.
-        labels: per layer, coarse to fine, [M] ascending; nested.
-        clusters: per layer [K, 10]. deltas: [M, 9].
-        bad: [M] rows that are not finite: they stay as they are, the others as if they were not there.
-        near: [M] rows whose agreement is asked for; all where left out.
-        value: metres (of means), and per unit of the factors' norm. turn, gradient: as shares. None: no agreement.
-        bound: no gradient is larger.
+        means: [M, 3] means in frame t−1.
+        factors: [M, 3, 3] covariance factors in frame t−1.
+        labels: [M] ascending cluster labels per layer, coarse to fine and nested.
+        clusters: [K, 10] cluster parameters per layer.
+        deltas: [M, 9] parameters of each Gaussian.
+        bad: [M] rows that are not finite. They stay unchanged, and the others behave as if these were absent.
+        guards: expected counts of the guards; None accepts any counts.
+        value: tolerance of the means in metres; 100 times this value is the relative tolerance of the factors.
+            No check if None.
+        turn: tolerance of the rotations in radians. No check if None.
+        gradient: relative tolerance of the gradients. No check if None.
+        bound: largest allowed gradient.
+        kind: which cluster map is used.
     """
 
     means: Array
@@ -61,7 +67,7 @@ class Deforming:
     kind: Literal["centred", "published"] = "centred"
 
     def weights(self) -> tuple[Array, Array]:
-        """Returns the extent of means [M, 3] and factors [M, 3, 3]."""
+        """Returns the random loss weights of the means [M, 3] and factors [M, 3, 3]; 0 for invalid rows."""
         rng = np.random.default_rng(7)
         pulls = rng.normal(size=(len(self.means), 3)), rng.normal(size=(len(self.means), 3, 3))
         by_mean, by_factor = (pull.astype(np.float32) for pull in pulls)
@@ -70,7 +76,7 @@ class Deforming:
         return by_mean, by_factor
 
     def neighbours(self) -> Neighbours | None:
-        """Returns the size of the cloud of valid Gaussians in metres, or None for a single one."""
+        """Returns the neighbour graph of the valid Gaussians, or None if there are fewer than two."""
         sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
         if sound.sum() < 2:
             return None
@@ -79,7 +85,7 @@ class Deforming:
         return build_neighbours(where, 4, 1 / max(spread, 1e-30))
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``Problem``."""
+        """See ``SizedCase``."""
         if backend == CPU:
             return self._cpu()
         return self._torch(backend)
@@ -140,7 +146,7 @@ class Deforming:
                     losses.rotation_loss(moved.turns, index, weights),
                 ]
             )
-            terms = terms * (len(sound) / len(self.means))  # means over all pairs, those held back included
+            terms = terms * (len(sound) / len(self.means))  # averaged over all pairs, including rows held back
             loss = loss + (terms * tensor(np.array(STRENGTHS))).sum()
         gradient_list = torch.autograd.grad(loss, [*leaves, own], allow_unused=True)
         gradients = {f"layer {k}": g for k, g in enumerate(gradient_list[:-1])}
@@ -153,7 +159,7 @@ class Deforming:
         return BackendResult(values, {name: np.zeros(1) if g is None else g.numpy() for name, g in gradients.items()})
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``: checks finite and bounded values, unit rotations, isolated invalid rows, and agreement."""
+        """See ``SizedCase``: checks finite values, bounds, unit rotations, unchanged invalid rows, and agreement."""
         faults = []
         for backend, outcome in outcomes.items():
             sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
@@ -165,7 +171,7 @@ class Deforming:
             if self.bad.any():
                 held = all(np.array_equal(outcome.values[n][self.bad], getattr(self, n)[self.bad], equal_nan=True)
                            for n in ("means", "factors"))  # fmt: skip
-                faults += [] if held else [f"{backend}: a row that is not finite was not left as it is"]
+                faults += [] if held else [f"{backend}: a row that is not finite was changed"]
         if CPU in outcomes:
             faults += unexpected_counts(outcomes[CPU], self.guards)
         for backend in set(outcomes) - {REFERENCE}:
@@ -182,7 +188,7 @@ class Deforming:
             distance = apart(outcome.values["factors"][sound], truth.values["factors"][sound])
             faults += [] if distance <= 100 * self.value else [f"{backend}: factors are {distance:.2g} off"]
         if self.turn is not None and sound.any():
-            # q and −q are one rotation.
+            # q and −q are the same rotation.
             dots = (outcome.values["turns"] * truth.values["turns"]).sum(axis=1)[sound]
             angle = 2 * np.arccos(np.clip(np.abs(dots.astype(np.float64)), 0, 1)).max()
             faults += [] if angle <= max(self.turn, 2e-3) else [f"{backend}: a turn is {angle:.2g} rad off"]
@@ -194,7 +200,7 @@ class Deforming:
 
 
 def no_turn(count: int) -> Array:
-    """Returns [count, 4] identity quaternions."""
+    """Returns identity quaternions, [count, 4]."""
     return np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
 
 

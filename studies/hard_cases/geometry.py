@@ -18,7 +18,7 @@ from studies.hard_cases.rendering import Rendering
 
 WIDTH, HEIGHT = 48, 40
 COUNT = 40
-"""Ordinary Gaussians that every hard one stands among."""
+"""Number of ordinary Gaussians among which the hard ones are placed."""
 
 
 def camera(
@@ -30,7 +30,7 @@ def camera(
 
 
 def ordinary(count: int = COUNT, seed: int = 0, scale: float = 1.0, before: Camera | None = None) -> Rendering:
-    """Creates Gaussians of 1 to 6 pixels, 2 to 3 m in front of the camera; all lengths times ``scale``."""
+    """Creates Gaussians of 1 to 6 pixels, 2 to 3 m in front of the camera; ``scale`` multiplies all lengths."""
     rng = np.random.default_rng(seed)
     seen = before or camera()
     pixels = rng.uniform(0, (seen.width, seen.height), (count, 2))
@@ -52,7 +52,7 @@ def among(
     hard: int, means: Any = None, factors: Any = None, opacities: Any = None, features: Any = None, bad: bool = False,
     count: int = COUNT, before: Camera | None = None, **changes: Any,
 ) -> Rendering:  # fmt: skip
-    """Creates ordinary Gaussians and replaces some by hard ones; arrays are broadcast over those."""
+    """Creates ordinary Gaussians and replaces some with hard ones; arrays are broadcast over the hard ones."""
     base = ordinary(count + hard, before=before)
     rows = np.random.default_rng(1).permutation(count + hard)[:hard]
     arrays: dict[str, Any] = {}
@@ -119,12 +119,12 @@ def _at_one_pixel(count: int) -> Rendering:
     rng = np.random.default_rng(3)
     depths = rng.uniform(1, 4, count)
     means = np.stack([0.02 * depths, 0.01 * depths, depths], -1)
-    # Thousands of factors 1 − alpha in a row: float32 adds up.
+    # Thousands of factors 1 − alpha are multiplied, so errors of float32 accumulate.
     return among(count, means=means, factors=0.01 * np.eye(3), opacities=0.02, value=2e-3, gradient=2e-2, bound=1e8)
 
 
 def _opaque(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Hides Gaussians behind the centre of an opaque one: with the alpha cap, they are still rendered."""
+    """Checks that alpha is large at the centre of every opaque Gaussian, despite the alpha cap."""
     rows = np.flatnonzero(problem.opacities >= 0.98)
     places, _ = problem.camera.project(problem.means[rows])
     columns, lines = np.floor(places).astype(int).T
@@ -138,7 +138,7 @@ def _opaque(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[s
 
 
 def _on_a_pixel(seed: int) -> Culled:
-    """Creates supports that end, up to rounding, at the only pixel that they cover in a block."""
+    """Creates Gaussians whose support ends, up to rounding, at the only pixel that it covers in a block."""
     rng = np.random.default_rng(seed)
     count, depth, focal, low_pass = 2000, 2.0, 64.0, float(np.float32(Rendering.limits.low_pass))
     reach = rng.integers(2, 20, count)
@@ -161,11 +161,11 @@ def _on_a_pixel(seed: int) -> Culled:
 
 ARRAYS = ("means", "factors", "opacities", "features")
 TOGETHER = 100
-"""Gaussians of which each is seen: more would end pixels before."""
+"""Gaussians rendered together. With more, pixels would saturate before all Gaussians contribute."""
 
 
 def _culling_is_exact(problem: Rendering) -> list[str]:
-    """Checks for the same bits as with tile lists that contain every Gaussian in every block."""
+    """Checks that the bits equal those of tile lists that contain every Gaussian in every block."""
     changed = 0
     for first in range(0, len(problem.means), TOGETHER):
         rows = slice(first, first + TOGETHER)
@@ -187,14 +187,14 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
 
 
 class Culled(Rendering):
-    """A case in which only culling is checked, on the CPU."""
+    """A case that only checks culling, on the CPU."""
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``Problem``."""
+        """See ``SizedCase``."""
         return self._cpu() if backend == CPU else None
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``."""
+        """See ``SizedCase``."""
         return _culling_is_exact(self)
 
 
@@ -205,7 +205,7 @@ def _equal_depths(count: int) -> Rendering:
 
 
 def _by_row(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that ties follow the row order: swapping tied rows changes the picture, and repetition does not."""
+    """Checks that ties follow the row order: swapping tied rows changes the image, and repetition does not."""
     again = problem.run(CPU)
     assert again is not None
     same = np.array_equal(again.values["features"], outcomes[CPU].values["features"])
@@ -216,7 +216,7 @@ def _by_row(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[s
     swapped = turned.run(CPU)
     assert swapped is not None
     differs = not np.array_equal(swapped.values["features"], outcomes[CPU].values["features"])
-    return ([] if same else ["twice the same gave other bits"]) + ([] if differs else ["ties do not go by row"])
+    return ([] if same else ["identical renders differ"]) + ([] if differs else ["ties do not follow the row order"])
 
 
 def _mirrored(count: int) -> Rendering:
@@ -259,15 +259,15 @@ def _few(count: int) -> Rendering:
 def _steep(weight: float) -> Rendering:
     """Uses pixel weights that are so large that gradients overflow in float32, and only there."""
     return replace(
-        ordinary(), weight=weight, bound=1e38, value=2e-4, gradient=None, guards=None, why="float32 ends before it"
+        ordinary(), weight=weight, bound=1e38, value=2e-4, gradient=None, guards=None, why="beyond the range of float32"
     )
 
 
 def _counted_steep(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
     acted = outcomes[CPU].guards["gradient_not_finite"]
     if problem.weight >= 1e35 and acted == 0:
-        return ["no gradient was given up, though weights are at float32's end"]
-    return [] if problem.weight >= 1e20 or acted == 0 else [f"{acted} gradients given up that fit"]
+        return ["no gradient was dropped, although the weights are at the limit of float32"]
+    return [] if problem.weight >= 1e20 or acted == 0 else [f"{acted} gradients in range were dropped"]
 
 
 def _small_picture(size: tuple[int, int]) -> Rendering:
@@ -276,7 +276,7 @@ def _small_picture(size: tuple[int, int]) -> Rendering:
 
 
 def _principal_point(offset: float) -> Rendering:
-    """Places the principal point outside the picture, by a number of picture widths."""
+    """Places the principal point outside the image, by a number of image widths."""
     before = camera(centre=(offset * WIDTH, 0.5 * HEIGHT))
     return replace(ordinary(before=before), value=1e-3, gradient=1e-2, bound=1e8)
 
@@ -302,14 +302,14 @@ def _as_unscaled(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> l
 CASES = (
     HardCase(
         "camera centre",
-        "Gaussians at the camera's centre (how many): not drawn",
+        "number of Gaussians at the camera centre: not drawn",
         "graphdeco-inria/gaussian-splatting#41",
         (1, 16, 200),
         _culled_as_behind,
     ),
     HardCase(
         "near plane",
-        "one before it, one on it, one behind; near in metres",
+        "one in front of it, one on it, one behind it; near in metres",
         "JonathonLuiten/Dynamic3DGaussians#3, playcanvas/engine#7186",
         (0.01, 0.3, 2.0),
         _near_plane,
@@ -323,7 +323,7 @@ CASES = (
     ),
     HardCase(
         "off the axis",
-        "eight of 0.3 m at 2 m, at this angle from the axis",
+        "eight Gaussians of 0.3 m at 2 m, at this angle from the axis",
         "gsplat#977, aras-p/UnityGaussianSplatting#196",
         (60.0, 80.0, 89.0, 89.9),
         _off_axis,
@@ -331,14 +331,14 @@ CASES = (
     HardCase("needle", "1:1000, of this length in metres", "gsplat#613", (0.01, 0.1, 1.0), _needle),
     HardCase(
         "needle along the ray",
-        "1 mm thick, of this length in metres; the longest reach behind the camera",
+        "1 mm thick, of this length in metres; the longest extend behind the camera",
         "JonathonLuiten/Dynamic3DGaussians#3",
         (0.1, 3.0, 100.0),
         _along_the_ray,
     ),
     HardCase(
         "pancake",
-        "1:1000, tilted by degrees from face to edge",
+        "1:1000, tilted by this many degrees from face-on to edge-on",
         "2D Gaussian Splatting",
         (0.0, 45.0, 89.0, 90.0),
         _pancake,
@@ -359,13 +359,13 @@ CASES = (
     ),
     HardCase(
         "equal depth",
-        "so many at exactly one depth: in row order, the same bits twice",
+        "this many at exactly one depth: in row order, with the same bits twice",
         "gsplat#99, NVlabs/nvdiffrast#168",
         (2, 17, 300),
         _equal_depths,
         _by_row,
     ),
-    HardCase("stacked on a pixel", "so many over one pixel", "r4dl/StopThePop#5", (100, 1000, 5000), _at_one_pixel),
+    HardCase("stacked on a pixel", "Gaussians over one pixel", "r4dl/StopThePop#5", (100, 1000, 5000), _at_one_pixel),
     HardCase(
         "fainter than the floor",
         "opacity in units of 1/255: not drawn, no logarithm below 0",
@@ -375,7 +375,7 @@ CASES = (
     ),
     HardCase(
         "opacity at the floor",
-        "exactly 1/255 times this",
+        "exactly 1/255 times this value",
         "fastgs/FastGS#58",
         (1.0, 1.001),
         lambda o: among(9, opacities=np.float32(1 / 255) * np.float32(o)),
@@ -389,7 +389,7 @@ CASES = (
     ),
     HardCase(
         "opacity at one",
-        "capped, no gradient through the cap; two capped ones leave exactly the stop's light, and either is right then",
+        "capped, no gradient through the cap; after two capped ones exactly the stop is reached; either is right",
         "gsplat, alpha cap",
         (0.98, 0.99, 1.0, 2.0),
         lambda o: among(9, opacities=o, value=1.1e-2),
@@ -397,28 +397,28 @@ CASES = (
     ),
     HardCase(
         "axes of length 0",
-        "so many with a factor of zeros: a dot of one pixel",
+        "this many with a zero factor: a dot of one pixel",
         "gsplat 3DGUT, zero scales",
         (1, 17),
         lambda n: among(n, factors=0),
     ),
     HardCase(
         "axes of 1e-12",
-        "in metres, times this",
+        "in metres, times this value",
         "edge of float32",
         (1.0, 1e-20),
         lambda s: among(9, factors=1e-12 * s * np.eye(3)),
     ),
     HardCase(
         "axes of 1 km",
-        "in metres, times this: a wash over the picture",
+        "in metres, times this value: a haze over the picture",
         "gsplat#613, inuex35/360-gaussian-splatting#18",
         (1.0, 10.0),
         lambda s: among(4, factors=1e3 * s * np.eye(3), value=5e-3, gradient=2e-2),
     ),
     HardCase(
         "footprint beyond float32",
-        "axes in metres: left out, counted",
+        "axes in metres: left out and counted",
         "graphdeco-inria/gaussian-splatting#781",
         (1e8, 1e12, 1e14),
         lambda s: left_out(
@@ -427,62 +427,60 @@ CASES = (
     ),
     HardCase(
         "infinite axes",
-        "so many: left out, counted",
+        "this many: left out and counted",
         "graphdeco-inria/gaussian-splatting#781",
         (1, 16),
         lambda n: left_out(n, factors=np.inf),
     ),
     HardCase(
         "NaN axes",
-        "one entry of the factor",
+        "index of the NaN entry of the factor",
         "inuex35/360-gaussian-splatting#18",
         (0, 4, 8),
         lambda k: left_out(3, factors=np.where(np.arange(9).reshape(3, 3) == k, np.nan, BALL)),
     ),
     HardCase(
         "NaN mean",
-        "one coordinate",
+        "index of the NaN coordinate",
         "gsplat#248, vye16/shape-of-motion#43",
         (0, 1, 2),
         lambda k: left_out(3, means=np.where(np.arange(3) == k, np.nan, [0, 0, 2.0])),
     ),
     HardCase(
         "infinite mean",
-        "one coordinate",
+        "index of the infinite coordinate",
         "gsplat#248",
         (0, 1, 2),
         lambda k: left_out(3, means=np.where(np.arange(3) == k, -np.inf, [0, 0, 2.0])),
     ),
-    HardCase("NaN opacity", "so many", "openvdb/fvdb-core#410", (1, 17), lambda n: left_out(n, opacities=np.nan)),
+    HardCase("NaN opacity", "their number", "openvdb/fvdb-core#410", (1, 17), lambda n: left_out(n, opacities=np.nan)),
     HardCase(
         "NaN colour",
-        "one channel: would spoil all pixels it reaches",
+        "one channel, which would spoil all pixels that it reaches",
         "openvdb/fvdb-core#410",
         (0, 1, 3),
         lambda k: left_out(3, features=np.where(np.arange(4) == k, np.nan, 0.5)),
     ),
     HardCase(
         "infinite colour",
-        "a colour of this",
+        "a colour of this value",
         "the fourth powers in SSIM",
         (1e10, 1e38, np.inf),
         lambda v: left_out(3, features=v),
     ),
     HardCase(
         "nothing but NaN",
-        "so many, all not finite: the background",
+        "this many Gaussians, none of them finite: only the background",
         "gsplat#248",
         (1, 40),
         lambda n: left_out(n, count=0, means=np.nan),
         _nothing_seen,
     ),
     HardCase("none at all", "no Gaussian", "edge of the arrays", (0,), lambda n: ordinary(n), _nothing_seen),
-    HardCase(
-        "last group not full", "so many Gaussians, the last one NaN", "sixteen at a time", (1, 2, 15, 16, 17, 33), _few
-    ),
+    HardCase("last group not full", "Gaussians, the last one NaN", "sixteen at a time", (1, 2, 15, 16, 17, 33), _few),
     HardCase(
         "mirrored factor",
-        "det F < 0, so many: Σ and the picture are the same",
+        "this many with det F < 0: Σ and the picture are unchanged",
         "reflections",
         (1, 9),
         _mirrored,
@@ -490,14 +488,14 @@ CASES = (
     ),
     HardCase(
         "far and near at once",
-        "four at this depth in metres, four at 3 cm: order kept",
+        "four at this depth in metres, four at 3 cm: the order is kept",
         "playcanvas/supersplat#396",
         (1e3, 1e6, 1e9),
         _far_and_near,
     ),
     HardCase(
         "gradients beyond float32",
-        "pixels' weights of this size: given up by Gaussian, counted",
+        "pixel weights of this size: gradients dropped per Gaussian and counted",
         "gsplat#248",
         (1e15, 1e28, 1e36),
         _steep,
@@ -508,7 +506,7 @@ CASES = (
     ),
     HardCase(
         "principal point outside",
-        "in picture widths from the left edge",
+        "position in picture widths from the left edge",
         "cropped rigs",
         (-1.0, 2.0, 10.0),
         _principal_point,
@@ -522,7 +520,7 @@ CASES = (
     ),
     HardCase(
         "scene and near plane scaled",
-        "times this: the same picture",
+        "scaled by this value: the same picture",
         "users' units",
         (1e-3, 1e-2, 1e2, 1e3),
         _scaled,

@@ -1,8 +1,8 @@
-"""Mutation test of guards: disables each one in a copy of the sources, and records which cases fail.
+"""Mutation test of guards: disables each guard in a copy of the sources and records which cases fail.
 
-The value in the copy's ``guards.py`` is replaced by the row's ``without``; where a comparison does the work and no
-value, the line in ``PATCHES`` is. Compiled kernels of the copies are not kept. Results are, by the digest of the
-sources: the study goes on where it was interrupted.
+The value in the copy's ``guards.py`` is replaced with the guard's ``without``. If the guard is a comparison
+without a value, the line in ``PATCHES`` is replaced. Compiled kernels of the copies are discarded. Results are stored
+per digest of the sources, so that an interrupted study can be continued.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from scas4d_core.guards import CONVENTIONS, GUARDS, Guard
 
 CORE = Path(scas4d_core.__file__).parent
 SECONDS = 900
-"""A process that takes longer counts as failing."""
+"""Time limit of a run; a run that takes longer counts as failing."""
 CONTROL = "nothing"
-"""The copy from which nothing was taken: all must hold there."""
+"""Name of the copy without changes, on which all cases must pass."""
 
 PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "not_finite": (
@@ -55,14 +55,14 @@ PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("structure/hierarchy.py", "finite = np.isfinite(means).all(axis=1)", "finite = np.ones(len(means), bool)"),
     ),
 }
-"""File, text that stands there once, and what takes its place."""
+"""Edits per guard: file, text that occurs once in it, and replacement."""
 
 SECTIONS = (
     (("projection", "tiles", "limits", "twin"), "geometry"),
     (("cascade", "deformation", "neighbour_terms", "lanes"), "cluster_map"),
     (("adam", "activation", "image_loss", "hierarchy", "losses", "jit"), "steps"),
 )
-"""Which cases look at a guard, by the files that it is in."""
+"""Modules whose cases exercise a guard, by names of the files that contain the guard."""
 
 PROGRAM = """
 import json, sys
@@ -84,7 +84,7 @@ class MutationError(RuntimeError):
 
 
 def mutants() -> Iterator[Guard]:
-    """Returns every guard and convention."""
+    """Yields every guard and convention."""
     yield from GUARDS.values()
     yield from CONVENTIONS.values()
 
@@ -93,7 +93,7 @@ def take_away(guard: Guard, core: Path) -> None:
     """Edits a copy of ``scas4d_core`` to disable a guard.
 
     Raises:
-        MutationError: the place to edit is not there once.
+        MutationError: the text to replace does not occur exactly once.
     """
     if math.isnan(guard.without):
         edits = PATCHES[guard.name]
@@ -102,20 +102,20 @@ def take_away(guard: Guard, core: Path) -> None:
         values = re.findall(rf'^    "{guard.name}", [^,]+, ([^,]+),$', text, re.MULTILINE)
         old = re.findall(rf'^    "{guard.name}", [^,]+, [^,]+,$', text, re.MULTILINE)
         if len(old) != 1:
-            raise MutationError(f"guard {guard.name!r} has {len(old)} rows in guards.py; one is needed")
+            raise MutationError(f"guard {guard.name!r} has {len(old)} rows in guards.py; exactly one is expected")
         edits = (("guards.py", old[0], f'    "{guard.name}", {values[0]}, {values[0]},'),)
     for name, old_text, new_text in edits:
         path = core / name
         text = path.read_text()
         if text.count(old_text) != 1:
             raise MutationError(
-                f"{name} holds {old_text!r} {text.count(old_text)} times; mend the patch of {guard.name}"
+                f"{name} contains {old_text!r} {text.count(old_text)} times; fix the patch of {guard.name}"
             )
         path.write_text(text.replace(old_text, new_text))
 
 
 def sections_of(guard: Guard) -> list[str]:
-    """Returns the modules of cases that exercise a guard."""
+    """Returns the modules whose cases exercise a guard."""
     return [section for names, section in SECTIONS if any(name in guard.where for name in names)]
 
 
@@ -135,10 +135,10 @@ def failing_without(guard: Guard | None, sections: list[str]) -> list[str]:
         try:
             done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS)
         except subprocess.TimeoutExpired:
-            return ["(the run does not end)"]
+            return ["(the run hangs)"]
         if done.returncode != 0:
             if done.returncode < 0 and guard is not None:
-                return ["(the run dies)"]
+                return ["(the run crashes)"]
             raise MutationError(f"the run without {guard.name if guard else CONTROL} failed: {done.stderr[-2000:]}")
         failing: list[str] = json.loads(done.stdout.strip().splitlines()[-1])
         return failing
@@ -152,7 +152,7 @@ LOOKED_AT = (
     "studies/hard_cases/ca*.py", "studies/hard_cases/*ing.py", "studies/hard_cases/geometry.py",
     "studies/hard_cases/cluster_map.py", "studies/hard_cases/steps.py",
 )  # fmt: skip
-"""The files that decide what the mutations find."""
+"""Files that determine the result of the mutations."""
 
 
 def sources() -> str:
@@ -164,7 +164,7 @@ def sources() -> str:
 
 
 def known(store: Path) -> dict[str, list[str]] | None:
-    """Returns the results of ``study`` for these sources, or None if it has not finished."""
+    """Returns the results of ``study`` for the current sources, or None if they are incomplete."""
     file = store / f"mutations-{sources()}.json"
     results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
     stored = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}
@@ -172,13 +172,14 @@ def known(store: Path) -> dict[str, list[str]] | None:
 
 
 def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[str]]:
-    """Disables each guard in turn; returns the failing cases by guard.
+    """Disables each guard in turn; returns the failing cases of each guard.
 
     Args:
-        store: folder of the results; those of the same sources are taken from there.
+        store: folder of the results; results for the same sources are reused.
+        echo: prints the progress.
 
     Raises:
-        MutationError: a case fails though nothing was taken away, or a mutation cannot be made.
+        MutationError: a case fails on the unchanged copy, or a mutation cannot be made.
     """
     store.mkdir(parents=True, exist_ok=True)
     digest = sources()
@@ -188,7 +189,7 @@ def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[st
         results[CONTROL] = failing_without(None, [section for _, section in SECTIONS])
         file.write_text(json.dumps(results, indent=1))
     if results[CONTROL]:
-        raise MutationError(f"cases fail with all guards in place: {', '.join(results[CONTROL])}; mend them first")
+        raise MutationError(f"cases fail with all guards in place: {', '.join(results[CONTROL])}; fix them first")
     for guard in mutants():
         if guard.name not in results:
             results[guard.name] = failing_without(guard, sections_of(guard))

@@ -17,26 +17,31 @@ from studies.hard_cases.case import CPU, REFERENCE, BackendResult, apart, beyond
 Array = NDArray[np.float32]
 
 LEAST_LIGHT = 9e-5
-"""What passes the densest pixel: transmittances stay far above denormal numbers."""
+"""Lower bound on the transmittance of the densest pixel, far above denormal numbers."""
 KINK_SHARE = 0.005
-"""Of the pixels: so many may lie on the other side of the alpha floor or of the stop in float32."""
+"""Largest share of the pixels that may fall on the other side of the alpha floor or of the stop in float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
     """Gaussians in front of a camera.
 
-    The loss is a sum of the picture's features and of the light that is left, each pixel with a random weight.
+    The loss is a sum of the picture's features and its alpha, each pixel with a random weight.
 
     Attributes:
-        means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4]: float32.
-        camera: of the inside world.
-        bad: [N] rows that must be left out: no gradient, and the others as if they were not there.
-        guards: how often they must act on the CPU; None: as often as they will.
-        value, gradient: how far float32 may be from float64: a pixel, in units of the features' range; the norm of each
-            gradient, as a share of its norm in float64. None: no agreement is asked for, and ``why`` says why.
-        bound: no gradient is larger, for weights of 1.
-        weight: standard deviation of the pixels' weights.
+        means: [N, 3] float32 means.
+        factors: [N, 3, 3] float32 covariance factors.
+        opacities: [N] float32 opacities.
+        features: [N, 4] float32 features.
+        camera: camera in internal world coordinates.
+        bad: [N] rows that must be left out: they get no gradient, and the others behave as if these were absent.
+        guards: expected counts of the CPU guards; None accepts any counts.
+        value: tolerance of a pixel against float64, relative to the range of the features. No check if None.
+        gradient: tolerance of each gradient against float64, relative to its norm. No check if None.
+        bound: largest allowed gradient, for weights of 1.
+        weight: standard deviation of the pixel weights.
+        limits: limits of the rasterizer.
+        why: reason if agreement is not checked.
     """
 
     means: Array
@@ -54,7 +59,7 @@ class Rendering:
     why: str = ""
 
     def weights(self) -> tuple[Array, Array]:
-        """Returns the features [4, H, W] and alpha [H, W]."""
+        """Returns the random loss weights of the features [4, H, W] and of alpha [H, W]."""
         rng = np.random.default_rng(5)
         shape = (4, self.camera.height, self.camera.width)
         return (
@@ -63,7 +68,7 @@ class Rendering:
         )
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``Problem``."""
+        """See ``SizedCase``."""
         if backend == CPU:
             return self._cpu()
         if backend == REFERENCE:
@@ -109,7 +114,7 @@ class Rendering:
         )
 
     def without(self, rows: NDArray[np.bool_]) -> Rendering:
-        """Returns the problem without some Gaussians."""
+        """Returns the problem without the given Gaussians."""
         kept = ~rows
         return replace(
             self, means=self.means[kept], factors=self.factors[kept], opacities=self.opacities[kept],
@@ -117,7 +122,7 @@ class Rendering:
         )  # fmt: skip
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``: checks finite, bounded values, colours in their hull, isolated invalid rows, agreement."""
+        """See ``SizedCase``: checks finite and bounded values, colour range, isolated invalid rows, and agreement."""
         faults = []
         for backend, outcome in outcomes.items():
             faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound * self.weight)
@@ -149,7 +154,7 @@ class Rendering:
         if alpha.min() < -1e-5 or alpha.max() > 1 + 1e-5:
             faults.append(f"{backend}: alpha in {alpha.min():.4g}…{alpha.max():.4g}")
         if alpha.size and 1 - alpha.max() < LEAST_LIGHT:
-            faults.append(f"{backend}: {1 - alpha.max():.2g} of the light is left, less than {LEAST_LIGHT:g}")
+            faults.append(f"{backend}: the transmittance falls to {1 - alpha.max():.2g}, less than {LEAST_LIGHT:g}")
         return faults
 
     def _touched(self, outcome: BackendResult, backend: str) -> list[str]:
@@ -166,7 +171,7 @@ class Rendering:
         same = all(np.array_equal(outcome.values[name], alone.values[name]) for name in alone.values) and all(
             np.array_equal(outcome.gradients[name][~self.bad], alone.gradients[name]) for name in alone.gradients
         )
-        return [] if same else ["cpu: the others' picture or gradients are not what they are without the bad rows"]
+        return [] if same else ["cpu: the picture or the gradients of the other rows depend on the bad rows"]
 
     def _disagreement(self, outcome: BackendResult, truth: BackendResult, backend: str) -> list[str]:
         faults = []

@@ -1,4 +1,4 @@
-"""Runs the catalogue on every available backend, and formats its table."""
+"""Runs the catalogue on every available backend and formats its table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BEGIN, END = "<!-- scripts/bench stability: begin -->", "<!-- scripts/bench stab
 
 @dataclass
 class CaseResult:
-    """Result of a case in one size: tested backends, guards triggered on the CPU, violated checks."""
+    """Result of a case at one size: tested backends, guards triggered on the CPU, and violated checks."""
 
     case: str
     size: str
@@ -42,26 +42,26 @@ class CaseResult:
 
 
 def backends() -> list[str]:
-    """Returns the available backends, the float64 references in PyTorch first."""
+    """Returns the available backends, the float64 reference in PyTorch first."""
     return [CPU] if find_spec("torch") is None else [REFERENCE, CPU, TORCH]
 
 
 def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
-    """Returns cases whose name contains one of ``names``, or all; slow ones only if requested or named.
+    """Returns the cases whose name contains one of ``names``, or all; slow ones only if requested or named.
 
     Raises:
-        ValueError: no case has such a name.
+        ValueError: no case name contains one of the names.
     """
     for name in names or ():
         if not any(name in case.name for case in CASES):
-            raise ValueError(f"no case is named {name!r}; known are: {', '.join(case.name for case in CASES)}")
+            raise ValueError(f"no case is named {name!r}; known cases: {', '.join(case.name for case in CASES)}")
     if names:
         return [case for case in CASES if any(name in case.name for name in names)]
     return [case for case in CASES if slow or not case.slow]
 
 
 def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
-    """Runs one case in one size; an exception counts as a violation."""
+    """Runs one case at one size; an exception counts as a violation."""
     line = CaseResult(case.name, str(size))
     started = time.perf_counter()
     try:
@@ -90,17 +90,17 @@ def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = p
             for violation in line.violations:
                 echo(f"       {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    echo(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} do not hold")
+    echo(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} fail")
     return lines
 
 
 def in_words(guards: dict[str, int]) -> str:
-    """Formats the counts of guards, largest first."""
+    """Formats the counts of the guards, largest first."""
     return ", ".join(f"{name} {count:,}" for name, count in sorted(guards.items(), key=lambda item: -item[1]))
 
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
-    """Returns one row per section: its number of cases, with and without sizes, and the failing ones."""
+    """Returns a table with one row per section: number of cases, without and with sizes, and the failing ones."""
     text = ["| section | cases | with sizes | do not hold |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
         names = {case.name for case in cases}
@@ -111,7 +111,7 @@ def catalogue_table(lines: Sequence[CaseResult]) -> str:
 
 
 def guards_table(guards: Iterable[Guard]) -> str:
-    """Returns one row per guard: its value, and the first clause of its reason."""
+    """Returns a table with one row per guard: its value, the first clause of its reason, and what it counts."""
     lines = ["| guard | value | acts on | counts |", "|" + "---|" * 4]
     for guard in guards:
         clause = guard.reason.split(":")[0].split(". ")[0].rstrip(".")
@@ -149,5 +149,5 @@ Conventions act all the time and are not counted: {conventions}.
 
 
 def here() -> tuple[str, str]:
-    """Describes the machine and the date."""
+    """Returns a description of the machine, and today's date."""
     return in_words_of(machine()), datetime.now(UTC).date().isoformat()

@@ -17,7 +17,7 @@ from studies.hard_cases.case import CPU, BackendResult, HardCase
 from studies.synthetic.ball import ball_on_a_floor, moved, photograph, rig
 
 SIZE, BALL = 32, 400
-"""Pixels across a picture; Gaussians of the ball."""
+"""Width and height of the images in pixels, and number of Gaussians in the ball."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,10 +25,10 @@ class HardScene:
     """A ball that moves over a floor, for two updates that start from the true frame 0.
 
     Attributes:
-        rig: of the world in which the ball is 0.25 m; pictures are taken with it.
-        user: that world as the user's calibration has it.
-        metres_per_unit: as the user says.
-        least: dB that the last update's own views must reach, about what the same scene reaches in metres.
+        rig: rig that takes the images, in the world in which the ball has a radius of 0.25 m.
+        user: conversion between that world and the user's coordinates.
+        metres_per_unit: the value that the user specifies.
+        least: PSNR in dB that the last update must reach on its own views, about that of the same scene in metres.
     """
 
     rig: Rig
@@ -37,7 +37,7 @@ class HardScene:
     least: float = 0.0
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``Problem``; runs on the CPU."""
+        """See ``SizedCase``; runs only on the CPU."""
         if backend != CPU:
             return None
         from scas4d_core.first_frame.static_result import StaticResult
@@ -51,7 +51,7 @@ class HardScene:
         world = cameras.world_frame(self.metres_per_unit)
         settings = Settings.model_validate(
             {
-                "scene": {"metres_per_unit": self.metres_per_unit, "background": (0, 0, 0)},  # as in the photographs
+                "scene": {"metres_per_unit": self.metres_per_unit, "background": (0, 0, 0)},  # as in the images
                 "update": {"iterations": 60, "clusters": [4, 16]},
             }
         )
@@ -71,12 +71,12 @@ class HardScene:
         return BackendResult(values)
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``: checks finite values, unit rotations, unchanged static Gaussians, fit to the pictures."""
+        """See ``SizedCase``: checks finite values, unit rotations, unchanged static Gaussians, and image fit."""
         values = outcomes[CPU].values
         faults = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
         lengths = np.linalg.norm(values["rotations"], axis=1)
         faults += [] if np.abs(lengths - 1).max() < 1e-4 else [f"a rotation has length {lengths.max():.4g}"]
-        faults += [] if values["standing"].max() == 0 else ["what stands has moved"]
+        faults += [] if values["standing"].max() == 0 else ["a static Gaussian has moved"]
         far = float(values["error"].max())
         faults += [] if far < 1 else [f"a Gaussian is {far:.2g} extents off"]
         psnr = float(values["psnr"][0])
@@ -103,7 +103,7 @@ def _six() -> Rig:
 
 
 def _with(changes: Mapping[int, Any]) -> Rig:
-    """Returns the six cameras, some of them with other intrinsics."""
+    """Returns the rig of six cameras, some of them with different intrinsics."""
     cameras = list(_six().cameras)
     for k, intrinsics in changes.items():
         cameras[k] = replace(cameras[k], intrinsics=np.array(intrinsics))
@@ -115,12 +115,12 @@ def _lens(focal: float, cx: float = SIZE / 2, cy: float = SIZE / 2) -> list[list
 
 
 def _scaled(scale: float) -> HardScene:
-    """Uses a user unit of 1/scale metres, with metres_per_unit "auto"."""
+    """Creates a scene whose unit is 1/scale metres, with metres_per_unit "auto"."""
     return HardScene(_six(), WorldFrame(np.zeros(3), 1 / scale), "auto", least=37.5)
 
 
 def _unsaid(scale: float) -> HardScene:
-    """Uses a user unit of 1/scale metres without declaring it, so that rates and bounds in metres differ."""
+    """Creates a scene whose unit is 1/scale metres but is not declared, so that rates and bounds in metres differ."""
     return HardScene(_six(), WorldFrame(np.zeros(3), 1 / scale), 1.0)
 
 
@@ -129,24 +129,24 @@ def _shifted(metres: float) -> HardScene:
 
 
 def _cameras(names: tuple[int, ...]) -> HardScene:
-    least = 30 if len(names) > 1 else 26  # one camera does not determine how far away moving Gaussians are
+    least = 30 if len(names) > 1 else 26  # one camera does not determine the depth of moving Gaussians
     return HardScene(Rig(tuple(_six().cameras[k] for k in names)), least=least)
 
 
 CASES = (
     HardCase(
         "six cameras",
-        "of the same ball over a floor as the cases below",
-        "what the others are held against",
+        "the same ball over a floor as in the cases below",
+        "reference for the other cases",
         ("metres",),
         lambda s: HardScene(_six(), least=39.5),
     ),
     HardCase(
-        "other units, said", "lengths times this, metres_per_unit auto", "users' units", (1e-3, 1e-2, 1e2, 1e3), _scaled
+        "other units, said", "scale of lengths, metres_per_unit auto", "users' units", (1e-3, 1e-2, 1e2, 1e3), _scaled
     ),
     HardCase(
         "other units, not said",
-        "lengths times this, metres_per_unit 1: finite and bounded",
+        "scale of lengths, metres_per_unit 1: finite and bounded",
         "users' units",
         (1e-3, 1e-1, 10.0, 1e3),
         _unsaid,
@@ -160,21 +160,21 @@ CASES = (
     ),
     HardCase(
         "few cameras",
-        "those of the six that are there: one, two that face each other",
+        "cameras of the six that are used: one, two that face each other, three",
         "rigs of one or two",
         ((0,), (0, 3), (0, 2, 4)),
         _cameras,
     ),
     HardCase(
         "mixed focal lengths",
-        "two of the six have half and this many times the focal length",
+        "two of the six cameras have half and this many times the focal length",
         "rigs of mixed lenses",
         (2.0, 8.0),
         lambda k: HardScene(_with({1: _lens(20.0), 2: _lens(40.0 * k)}), least=39.5),
     ),
     HardCase(
         "principal points outside",
-        "of two of the six, in pictures beside the middle",
+        "of two of the six cameras, in picture sizes from the centre",
         "cropped rigs",
         (0.6, 2.0),
         lambda k: HardScene(

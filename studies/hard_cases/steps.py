@@ -36,10 +36,11 @@ class HardStep:
     """A function of arrays, on the CPU and, if available, in float64.
 
     Attributes:
-        compute: by backend.
-        agreement: of each array with that of float64, as a share of its norm; None asks for none.
-        bound: no gradient is larger. guards: as expected; None: as they will.
-        more: violations of what else must hold.
+        compute: functions that compute the result, keyed by backend.
+        agreement: tolerance of each array against float64, relative to its norm. No check if None.
+        bound: largest allowed gradient.
+        guards: expected counts of the guards; None accepts any counts.
+        more: returns violations of further requirements.
     """
 
     compute: Mapping[str, Callable[[], BackendResult]]
@@ -49,11 +50,11 @@ class HardStep:
     more: Callable[[Mapping[str, BackendResult]], list[str]] = lambda outcomes: []
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``Problem``."""
+        """See ``SizedCase``."""
         return self.compute[backend]() if backend in self.compute else None
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``."""
+        """See ``SizedCase``."""
         faults = []
         for backend, outcome in outcomes.items():
             faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound)
@@ -69,11 +70,11 @@ class HardStep:
 
 STEPS = 20
 LARGEST = EXPONENT * np.log(2.0)
-"""Of an exponential's argument."""
+"""Largest argument of an exponential."""
 
 
 def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, **changes: Any) -> HardStep:
-    """Runs twenty steps on a table in which ``gradient(step, table)`` replaces some values."""
+    """Runs twenty steps of Adam on a table in which ``gradient(step, table)`` replaces some gradients."""
 
     def start() -> tuple[Array, list[Array]]:
         rng = np.random.default_rng(11)
@@ -102,7 +103,7 @@ def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, 
         optimizer = torch.optim.Adam([leaf], lr=0.01, betas=(0.9, 0.999), eps=1e-15)
         for table in gradients:
             wide = torch.tensor(table, dtype=torch.float64)
-            # A gradient that is none is 0, one too large as large as is taken.
+            # A NaN gradient counts as 0, and one that is too large as the largest accepted value.
             leaf.grad = torch.nan_to_num(wide, nan=0.0, posinf=1e18, neginf=-1e18).clamp(-1e18, 1e18)
             optimizer.step()
         return BackendResult({"parameters": leaf.detach().numpy()})
@@ -121,7 +122,7 @@ def _spoil(value: float, once: bool) -> Callable[[int, Array], None]:
 
 
 def _tiny(value: float) -> Callable[[int, Array], None]:
-    """Uses a whole table of tiny gradients, for which no value and no moment may be denormal."""
+    """Fills the whole table with tiny gradients, for which no value or moment may be denormal."""
 
     def spoil(step: int, table: Array) -> None:
         table[:] = value
@@ -147,7 +148,7 @@ def _decaying(outcomes: Mapping[str, BackendResult]) -> list[str]:
 def _activation(
     columns: slice, value: Any, guards: dict[str, int], agreement: float | None = 1e-4, pull: float = 1.0
 ) -> HardStep:
-    """Replaces some columns in a tenth of 300 rows of the parameters of frame 0."""
+    """Replaces some columns of the parameters of frame 0, in a tenth of 300 rows."""
     rng = np.random.default_rng(12)
     table = rng.normal(size=(300, activation.COLUMNS)).astype(np.float32)
     table[::10, columns] = value
@@ -213,7 +214,7 @@ def _opposite(scale: float) -> HardStep:
 
 
 def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agreement: float | None = 2e-3) -> HardStep:
-    """Evaluates the image loss of two pictures (arrays or constants) and bounds the gradient of each pixel."""
+    """Evaluates the image loss of two images (arrays or constants) and bounds the gradient of each pixel."""
     height, width = size
     shape = (3, height, width)
     image = np.broadcast_to(np.asarray(rendered, np.float32), shape).copy()
@@ -273,23 +274,23 @@ def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: t
         return BackendResult({"laws": laws}, {}, {"left_out_of_hierarchy": hierarchy.left_out})
 
     def lawful(outcomes: Mapping[str, BackendResult]) -> list[str]:
-        names = ("every finite row once", "the same twice", "nested", "none empty", "no more than wished", "counted")
+        names = ("every finite row once", "reproducible", "nested", "no empty one", "as few as requested", "counted")
         laws = outcomes[CPU].values["laws"]
-        return [f"clustering: not {name}" for name, law in zip(names, laws, strict=True) if not law]
+        return [f"clustering violates: {name}" for name, law in zip(names, laws, strict=True) if not law]
 
     return HardStep({CPU: on_cpu}, guards=None, more=lawful)
 
 
 MILLION_MB = 600
-"""Most that clustering a million Gaussians may take beside what the process has before."""
+"""Largest additional memory that clustering a million Gaussians may take."""
 
 
 def _megabytes_of_clustering(count: int) -> float:
-    """Returns the peak memory of ``build_hierarchy`` on a surface of a number of points, above the initial memory."""
+    """Returns the peak memory of ``build_hierarchy`` for points on a surface, above the initial memory, in MB."""
     rng = np.random.default_rng(16)
     means = rng.normal(size=(count, 3)).astype(np.float32)
     means /= np.linalg.norm(means, axis=1, keepdims=True)
-    build_hierarchy(means[:2000], np.ones(2000, bool), (16, 64), 8)  # what the libraries hold
+    build_hierarchy(means[:2000], np.ones(2000, bool), (16, 64), 8)  # loads the libraries
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     hierarchy = build_hierarchy(means, np.ones(count, bool), (64, 320, 1280), 8)
     assert len(hierarchy.rows) == count
@@ -323,7 +324,7 @@ def _graph(points: NDArray[Any]) -> HardStep:
 
 
 def _split(lengths: tuple[float, float, float]) -> HardStep:
-    """Splits factors into rotation and lengths for export, and checks Σ, also for nearly equal lengths."""
+    """Splits factors into rotation and lengths, as for export, and checks Σ, even for nearly equal lengths."""
 
     def on_cpu() -> BackendResult:
         rng = np.random.default_rng(15)
@@ -339,7 +340,7 @@ def _split(lengths: tuple[float, float, float]) -> HardStep:
     def same(outcomes: Mapping[str, BackendResult]) -> list[str]:
         off, hands = float(outcomes[CPU].values["off"][0]), outcomes[CPU].values["hands"]
         return ([] if off < 1e-6 else [f"Σ is {off:.2g} off after the split"]) + (
-            [] if np.abs(hands - 1).max() < 1e-6 else ["a split's axes are no rotation"]
+            [] if np.abs(hands - 1).max() < 1e-6 else ["the axes of a split are not a rotation"]
         )
 
     return HardStep({CPU: on_cpu}, more=same)
@@ -350,21 +351,21 @@ QUATERNION, SCALE, OPACITY = slice(3, 7), slice(7, 10), slice(10, 11)
 CASES = (
     HardCase(
         "NaN gradient",
-        "of one number, once or in every step: it is 0 there, no other moves",
+        "of one number, once or in every step: it counts as 0 and affects no other",
         "gsplat#248",
         (True, False),
         lambda once: _adam(_spoil(np.nan, once), 1 if once else STEPS),
     ),
     HardCase(
         "huge gradient",
-        "of one number, once: the parameter goes on as after 1e18",
+        "of one number, once: the parameter continues as after 1e18",
         "gsplat#248",
         (1e20, 1e30, np.inf, -np.inf),
         lambda v: _adam(_spoil(v, True), 1),
     ),
     HardCase(
         "tiny gradients",
-        "of all: no denormal number among the moments",
+        "of all parameters: no denormal numbers in the moments",
         "denormals",
         (1e-18, 1e-25, 1e-40),
         lambda v: _adam(
@@ -373,7 +374,7 @@ CASES = (
     ),
     HardCase(
         "moments that fade",
-        "one gradient, then none: the first moment does not end as denormals",
+        "one gradient, then none: the first moment does not become denormal",
         "denormals",
         (1e-19, 1.5e-19),
         lambda v: _adam(
@@ -386,21 +387,21 @@ CASES = (
     ),
     HardCase(
         "no gradient",
-        "of anything in twenty steps: nothing moves, nothing is 0/0",
+        "of any parameter in twenty steps: nothing moves, no 0/0",
         "Adam's epsilon",
         (0.0,),
         lambda v: _adam(_tiny(v), 0),
     ),
     HardCase(
         "zero quaternion",
-        "of length 0 or this: no rotation, no gradient, counted",
+        "entries of this value: no rotation, no gradient, counted",
         "oppo-us-research/SpacetimeGaussians#96",
         (0.0, 1e-20, 1e-16),
         lambda v: _activation(QUATERNION, v, {"quaternion_floor": 30}),
     ),
     HardCase(
         "short and long quaternions",
-        "entries of this",
+        "entries of this value",
         "oppo-us-research/SpacetimeGaussians#96",
         (1e-14, 1e-6, 1e6, 1e15),
         lambda v: _activation(QUATERNION, v, {}, 1e-3),
@@ -421,7 +422,7 @@ CASES = (
     ),
     HardCase(
         "log scale beyond e^87",
-        "of one axis in ten Gaussians: clamped, finite",
+        "of one axis in every tenth Gaussian: clamped, finite",
         "gsplat#613",
         (88.0, 200.0),
         lambda v: _activation(slice(7, 8), v, {"exponent": 30}, 1e-3, 1e-3),
@@ -442,60 +443,58 @@ CASES = (
     ),
     HardCase(
         "flat pictures",
-        "a grey of this against the same",
+        "a grey of this value against itself",
         "SSIM without contrast",
         (1e-6, 0.5, 1.0),
         lambda v: _pictures(v, v, agreement=None),
     ),
-    HardCase(
-        "white on black", "a render of this on black", "lights off and on", (1.0, 100.0), lambda v: _pictures(v, 0)
-    ),
-    HardCase("black on white", "a render of 0 on this", "lights off and on", (1.0, 0.004), lambda v: _pictures(0, v)),
+    HardCase("white on black", "this render on black", "lights off and on", (1.0, 100.0), lambda v: _pictures(v, 0)),
+    HardCase("black on white", "black on this value", "lights off and on", (1.0, 0.004), lambda v: _pictures(0, v)),
     HardCase(
         "saturated noise",
-        "0 and 1 at random, another each",
+        "0 and 1 at random, different in both pictures",
         "sensor faults",
         (1, 2),
         lambda seed: _pictures(_noise(seed), _noise(seed + 100)),
     ),
     HardCase(
         "colours without bounds",
-        "a render of this against noise",
+        "a render with this factor against noise",
         "colours are not clamped",
         (1e3, 1e6, 1e9),
         lambda v: _pictures(v * _noise(3), _noise(4), agreement=2e-2),
     ),
     HardCase(
         "fewer Gaussians than clusters",
-        "so many, for layers of 64, 320 and 1280",
+        "this many, for layers of 64, 320 and 1280",
         "edge of K-means",
         (1, 2, 9, 63),
         lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)), (64, 320, 1280)),
     ),
     HardCase(
         "clustering coincident points",
-        "so many in one place",
+        "number of points in one place",
         "coincident points",
         (20, 2000),
         lambda n: _clustering(lambda rng: np.ones((n, 3)), (2, 16, 64)),
     ),
     HardCase(
         "clustering collinear points",
-        "so many on a line",
+        "number of points on a line",
         "collinear points",
         (100, 2000),
         lambda n: _clustering(lambda rng: rng.normal(size=(n, 1)) * np.array([1, 2, 3]), (2, 16, 64)),
     ),
     HardCase(
         "clustering two places",
-        "so many, half here, half 1 km away",
+        "this many points, half of them 1 km away",
         "outliers",
         (200,),
         lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)) + 1e3 * (np.arange(n) % 2)[:, None], (2, 8)),
     ),
     HardCase(
         "clustering NaN",
-        "so many of 300 not finite: they stand, counted",
+        "this many of 300 not finite: left in place and counted",
         "gsplat#248",
         (1, 299, 300),
         lambda n: _clustering(
@@ -504,7 +503,7 @@ CASES = (
     ),
     HardCase(
         "a million to cluster",
-        f"so many, layers of 64, 320 and 1280, within {MILLION_MB} MB",
+        f"this many, in layers of 64, 320 and 1280, within {MILLION_MB} MB",
         "uynitsuj/POGS#3",
         (1_000_000,),
         _million,
@@ -512,28 +511,28 @@ CASES = (
     ),
     HardCase(
         "neighbours in one place",
-        "so many Gaussians",
+        "number of Gaussians",
         "coincident points",
         (2, 19, 200),
         lambda n: _graph(np.ones((n, 3))),
     ),
     HardCase(
         "neighbours far apart",
-        "metres between them: weights that are 0",
+        "metres between them: weights become 0",
         "users' units",
         (1.0, 1e6, 1e18),
         lambda d: _graph(d * np.arange(60)[:, None] * np.ones(3)),
     ),
     HardCase(
         "one neighbour or none",
-        "so many Gaussians",
+        "number of Gaussians",
         "edge of the graph",
         (1, 2, 3),
         lambda n: _graph(np.random.default_rng(0).normal(size=(n, 3))),
     ),
     HardCase(
         "nearly equal axes",
-        "relative difference of the lengths: Σ again after the split, a proper rotation",
+        "relative difference of the lengths: the same Σ after the split, and a proper rotation",
         "re-splitting Σ",
         (0.0, 1e-7, 1e-4),
         lambda d: _split((1.0, 1.0 + d, 1.0 - d)),

@@ -1,1 +1,1 @@
-"""Studies of faulty pictures and cameras, and long runs."""
+"""Studies of faulty images and cameras, and of long runs."""

@@ -1,7 +1,7 @@
-"""Faults of a single camera: the frames that are sent, and checks that an alarm names the camera.
+"""Faults of a single camera: the faulty frames, and checks that an alarm names the camera.
 
-Lenses lose their focus and get dirty, gains and white balances jump, a grabber repeats its last picture. The update
-need not suffer much by it; a person must hear of it while the recording can still be saved.
+Lenses lose focus and get dirty, gain and white balance jump, and a frame grabber repeats its last image. The update may
+hardly suffer, but the operator must be alerted while the recording can still be saved.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from scas4d_core.captures.frame import Frame
 from studies.hard_frames.frames import Footage, FrameCase, FrameStep, Holds, Picture, Sent, near, replaced, two_cameras
 
 FRAMES = 3
-"""Faulty frames that are sent."""
+"""Number of faulty frames in a row."""
 SOON = 2
-"""Of them, by which the alarm must have come; a picture that stands is known by its third frame."""
+"""Number of them within which the alarm must be raised; a frozen image is recognized by its third frame."""
 SMEARED = 0.02
-"""Blur by dirt on a lens, of the picture's width."""
+"""Blur caused by dirt on a lens, as a fraction of the image width."""
 FIELD = "operators of rigs: lenses, gains and frame grabbers"
 
 Fault = Callable[[Picture, Any], Picture]
-"""The faulty picture, in a size."""
+"""Returns the faulty image for a size of the fault."""
 
 
 def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
-    """Returns the faults, all for the same camera of a footage."""
+    """Returns the fault cases, all for the same camera of a footage."""
     name = two_cameras(footage)[0]
 
     def case(title: str, what: str, sizes: tuple[Any, ...], fault: Fault) -> FrameCase:
@@ -42,16 +42,16 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
         )
 
     return (
-        case("a camera out of focus", "blurred by so many pixels", (1.5, 3.0), blurred),
-        case("a camera's gain jumps", "its pixels times the size", (0.7, 0.3), scaled),
+        case("a camera out of focus", "blurred by this many pixels", (1.5, 3.0), blurred),
+        case("a camera's gain jumps", "its pixels multiplied by the size", (0.7, 0.3), scaled),
         case(
-            "a camera's white balance jumps", "its red times the size", (1.1, 1.25),
+            "a camera's white balance jumps", "its red multiplied by the size", (1.1, 1.25),
             lambda picture, size: scaled(picture, (size, 1.0, 1.0)),
         ),
-        case("a camera is noisy", "noise of so many levels of 255", (10, 25), noisy),
-        case("a lens is dirty", "the middle ninth of its picture blurred, and so much white added", (0.2, 0.35), dirty),
+        case("a camera is noisy", "noise of this many levels of 255", (10, 25), noisy),
+        case("a lens is dirty", "middle ninth blurred, and this much white added", (0.2, 0.35), dirty),
         FrameCase(
-            "a camera's picture stands", "as it was before, while the others go on; size: frames", FIELD, (FRAMES,),
+            "a camera's picture freezes", "the previous one, while the others continue; size: frames", FIELD, (FRAMES,),
             lambda shown, at, size: _standing(shown, at, name, size), reports_alarm(name, FRAMES),
         ),
     )  # fmt: skip
@@ -61,11 +61,11 @@ def reports_alarm(name: str, soon: int) -> Holds:
     """Checks that only this camera raises an alarm, by frame ``soon`` of the fault, and that no damage is done."""
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
-        faults = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm of it within {soon} frames"]
+        faults = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm for it within {soon} frames"]
         for step in steps:
             others = {alarm.camera for alarm in step.report.alarms} - {name}
             faults += [
-                f"frame {step.report.index}: an alarm of {other or 'the frame'}" for other in sorted(others, key=str)
+                f"frame {step.report.index}: an alarm for {other or 'the frame'}" for other in sorted(others, key=str)
             ]
         return faults + near(steps, size)
 
@@ -77,25 +77,25 @@ def _names(step: FrameStep, name: str) -> bool:
 
 
 def blurred(picture: Picture, pixels: float) -> Picture:
-    """Blurs a picture, as if out of focus, by a standard deviation in pixels."""
+    """Blurs an image, as if out of focus, with a standard deviation in pixels."""
     picture_blurred: Picture = gaussian_filter(picture.astype(np.float32), (pixels, pixels, 0)).round().astype(np.uint8)
     return picture_blurred
 
 
 def scaled(picture: Picture, factor: Any) -> Picture:
-    """Multiplies a picture by one factor or a factor per colour, saturated at 255."""
+    """Multiplies an image by one factor, or by one per colour channel, saturating at 255."""
     picture_scaled: Picture = (picture * np.asarray(factor)).round().clip(0, 255).astype(np.uint8)
     return picture_scaled
 
 
 def noisy(picture: Picture, levels: float) -> Picture:
-    """Adds noise with a standard deviation in levels, different in each picture."""
+    """Adds noise with a standard deviation in levels of 255, different for each image."""
     rng = np.random.default_rng(int(picture.sum()))
     return (picture + rng.normal(0, levels, picture.shape)).round().clip(0, 255).astype(np.uint8)
 
 
 def dirty(picture: Picture, white: float) -> Picture:
-    """Simulates dirt on the lens over the middle ninth: blurred, and whitened by scattered light."""
+    """Simulates dirt on the lens over the middle ninth, which is blurred and brightened by scattered light."""
     height, width = picture.shape[:2]
     middle = slice(height // 3, 2 * height // 3), slice(width // 3, 2 * width // 3)
     smeared = gaussian_filter(picture[middle].astype(np.float32), (SMEARED * width, SMEARED * width, 0))

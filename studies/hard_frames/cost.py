@@ -12,17 +12,17 @@ from scas4d_core.frame_report import FrameReport
 from studies.hard_frames.footage import AnyFootage
 
 TARGET = 0.03
-"""Share of an update that the checks may cost."""
+"""Largest share of an update that the checks may cost."""
 
 Share = tuple[float, float, float]
 
 
 def shares(reports: Sequence[FrameReport]) -> Share:
-    """Medians over updates: seconds of an update, share of the checks, share of comparing its start and end.
+    """Returns medians over updates: seconds per update, share of the checks, and share of comparing start and end.
 
-    The checks are the stage ``judge``: the light of the pictures, the gate, plausibility, fits, and views of
-    cameras that are left out. Start and end are compared on the probe views, which are a part of the update: it may
-    end at any moment for them.
+    The checks are the stage ``judge``: exposure of the images, the gate, plausibility, fits, and views of cameras
+    that are left out. Start and end are compared on the probe views. This comparison is part of the update and
+    allows it to end at any moment.
     """
     totals = [sum(report.seconds.values()) for report in reports]
     checks = [report.seconds["judge"] / total for report, total in zip(reports, totals, strict=True)]
@@ -33,7 +33,7 @@ def shares(reports: Sequence[FrameReport]) -> Share:
 
 
 def cost(footage: AnyFootage, updates: int = 8) -> Share:
-    """Returns the cost over a number of updates of a footage, without the first one, which starts cold."""
+    """Returns the cost over a number of updates of a footage, excluding the first one, which is a cold start."""
     with TemporaryDirectory() as folder:
         scene = footage.start(Path(folder) / "states")
         reports = [scene.step(footage.frame(index)) for index in range(1, updates + 2)]

@@ -1,4 +1,4 @@
-"""Footage for the frame cases: a synthetic scene, which can show anything, and captures."""
+"""Footage for the frame cases: a synthetic scene, which can show any fault, and captures."""
 
 from __future__ import annotations
 
@@ -25,26 +25,29 @@ from studies.synthetic.ball import photograph, rig
 Pictures = Mapping[str, NDArray[np.uint8]]
 
 CAMERAS, SIZE = 10, 64
-"""Of the synthetic rig, and pixels of a picture's side."""
+"""Number of cameras in the synthetic rig, and width and height of its images in pixels."""
 ANGLE = 0.08
-"""Radians that the ball goes around in a frame: 11 mm and 5 degrees."""
+"""Angle by which the ball circles per frame, in radians: 11 mm and 5 degrees."""
 NOISE = 3.0
-"""Levels of 255, standard deviation, of the noise in the pictures that are learnt from."""
+"""Standard deviation of the noise in the training images, in levels of 255."""
 RATE = 30.0
-"""Frames a second."""
+"""Frames per second."""
 
 
 class SyntheticFootage:
     """A ball that circles over a floor next to a resting ball; frame 0 is known up to a few millimetres.
 
     Attributes:
-        name, rig, held_out, settings, count: of the footage.
+        name: name of the footage.
+        count: number of frames.
+        settings: settings of the reconstruction.
+        rig: training cameras.
     """
 
     name = "synthetic"
     count = 24
     constants = (("scas4d_core.preparation.NEIGHBOUR_FALLOFF", 200.0),)
-    """Of the method, with another value when a scene starts or is resumed: the Gaussians lie far apart."""
+    """Constants changed when a scene starts or resumes, because the Gaussians are far apart; name and value."""
 
     def __init__(self, settings: Settings | None = None) -> None:
         self.settings = settings or Settings(
@@ -60,7 +63,7 @@ class SyntheticFootage:
 
     @property
     def held_out(self) -> tuple[Camera, ...]:
-        """Returns cameras between those of the rig."""
+        """Cameras between those of the rig."""
         return self._others.cameras
 
     def frame(self, index: int) -> Frame:
@@ -77,7 +80,7 @@ class SyntheticFootage:
 
     @property
     def points(self) -> InitialPoints:
-        """Returns the frame for fitting frame 0."""
+        """Initial points for fitting frame 0."""
         true = self._true
         return InitialPoints(true.means.astype(np.float64), true.colours.copy(), true.foreground.copy())
 
@@ -108,10 +111,12 @@ class SyntheticFootage:
 
 
 class CapturedFootage:
-    """A capture with test cameras, whose frame 0 is fitted once and kept.
+    """A capture with test cameras, whose frame 0 is fitted once and stored.
 
     Args:
-        settings: of the scene. study: folder of a study, which keeps frame 0, as that of ``scripts/bench quality``.
+        capture: the capture.
+        settings: settings of the reconstruction.
+        study: folder of a study that stores frame 0, such as that of ``scripts/bench quality``.
     """
 
     constants = ()
@@ -138,7 +143,7 @@ class CapturedFootage:
         return self._capture.test_frame(index).images
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
-        """See ``frames.Footage``; None, since no such footage was recorded."""
+        """See ``frames.Footage``; returns None, because captures contain no such footage."""
         return None
 
     def start(self, folder: Path) -> Reconstruction:

@@ -1,8 +1,8 @@
 """Cases of faulty frames: the frames that each case sends, and the checks that its result must pass.
 
-A case takes a footage that goes as it should, and says what is sent in place of its frames from one on: first the
-faulty ones, then good ones. What must hold in every case: all is finite, what is not as it should be is explained in
-the report, and the third good frame is as good as if nothing had been.
+A case takes undisturbed footage and defines the frames that are sent instead from some frame on: first faulty ones,
+then good ones. In every case, all values must be finite, the report must explain what is wrong, and the third good
+frame must be as good as in the undisturbed run.
 """
 
 from __future__ import annotations
@@ -21,36 +21,37 @@ Picture = NDArray[np.uint8]
 Pictures = Mapping[str, Picture]
 
 AFTER = 3
-"""Good frames after the faulty ones; the last of them is held against the undisturbed run."""
+"""Number of good frames after the faulty ones; the last of them is compared with the undisturbed run."""
 WITHIN_DB = 0.5
-"""Of the undisturbed run, the last good frame."""
+"""Largest PSNR loss of the last good frame against the undisturbed run."""
 NEAR_DB = 1.0
-"""Of the undisturbed run, a faulty frame that can be followed all the same."""
+"""Largest PSNR loss, against the undisturbed run, of a faulty frame that can still be tracked."""
 JUMPED_DB = 3.0
-"""Of the undisturbed run, an object that jumped, three frames later: it is seen from other sides, with turned light."""
+"""Largest PSNR loss three frames after an object jumped: it is seen from other sides, and its shading turned too."""
 
 
 class Footage(Protocol):
     """An undisturbed sequence with held-out cameras."""
 
     def frame(self, index: int) -> Frame:
-        """Returns the training pictures."""
+        """Returns a frame with the training images."""
 
     def truth(self, index: int) -> Pictures:
-        """Returns the true pictures of the held-out cameras."""
+        """Returns the true images of the held-out cameras."""
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
-        """Returns the pictures with the object moved by a multiple of its size, or None if unavailable."""
+        """Returns the images with the object moved by a multiple of its size, or None if unavailable."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sent:
-    """A frame as it is sent.
+    """A frame that a case sends.
 
     Attributes:
-        frame: its index and time are set when it is sent. like: frame of the footage that it should look like, which
-            the undisturbed run is asked for. truth: what held-out cameras see at that moment.
-        good: whether it is as it should be.
+        frame: the frame; its index and time are set when it is sent.
+        like: frame of the footage that it should resemble, which is looked up in the undisturbed run.
+        truth: images of the held-out cameras at that moment.
+        good: whether the frame is undisturbed.
     """
 
     frame: Frame
@@ -64,9 +65,12 @@ class FrameStep:
     """Outcome of one frame.
 
     Attributes:
-        sent: what was sent. report: of the frame. kept: whether the state is that before, bit by bit. sound: whether
-            it is finite and its rotations have unit norm. psnr, usual: dB of the held-out cameras, here and in the
-            undisturbed run.
+        sent: the frame that was sent.
+        report: report of the frame.
+        kept: whether the state has the same bits as before the frame.
+        sound: whether the state is finite and its rotations have unit norm.
+        psnr: PSNR of the held-out cameras in dB.
+        usual: the same PSNR in the undisturbed run.
     """
 
     sent: Sent
@@ -86,10 +90,14 @@ class FrameCase:
     """One entry of the catalogue.
 
     Attributes:
-        name, what, source: of the case; where in the literature or in users' reports it comes from. sizes: in which it
-            is tried. make: what is sent from a frame on, in a size; None where the footage cannot show it. holds: what
-            must hold beside what always must, of the faulty frames. alarms: whether they must raise an alarm, in a
-            size: what looks like a world that stands or moves faster cannot.
+        name: name of the case.
+        what: description of the case.
+        source: its origin in the literature or in users' reports.
+        sizes: sizes at which it is run.
+        make: creates the frames to send, for a start frame and a size; None if the footage cannot show the case.
+        holds: returns violations by the faulty frames, besides those of the shared checks.
+        alarms: whether the faulty frames of a size must raise an alarm. Frames that resemble a resting or a faster
+            scene cannot raise one.
     """
 
     name: str
@@ -103,35 +111,37 @@ class FrameCase:
 
 def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Returns the violated checks, one sentence each."""
-    faults = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
+    faults = [f"frame {step.report.index}: not finite, or a rotation is not unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
     faults += case.holds(faulty, size)
     if case.alarms(size) and not any(step.report.alarms for step in faulty):
         faults.append("no alarm")
     last = steps[-1]
     if last.sent.good:
-        faults += [f"{AFTER} good frames later an alarm: {alarm.evidence}" for alarm in last.report.alarms]
+        faults += [f"an alarm {AFTER} good frames later: {alarm.evidence}" for alarm in last.report.alarms]
         if not last.psnr >= last.usual - WITHIN_DB:
-            faults.append(f"{AFTER} good frames later {last.psnr - last.usual:+.2f} dB against the undisturbed run")
+            faults.append(f"{last.psnr - last.usual:+.2f} dB against the undisturbed run, {AFTER} good frames later")
         if last.report.degraded is not None:
-            faults.append(f"{AFTER} good frames later it is still degraded: {last.report.degraded}")
+            faults.append(f"still degraded {AFTER} good frames later: {last.report.degraded}")
     return faults
 
 
-# What must hold of the faulty frames
+# Checks of the faulty frames
 
 
 def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Checks that the state is unchanged and the report explains why."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
-    return faults + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.rejected]
+    return faults + [f"frame {s.report.index}: not rejected" for s in steps if not s.report.outcome.rejected]
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:
-    """Checks that these cameras are excluded, no others except those that ``may`` be, and that no damage is done.
+    """Checks that these cameras are left out, no others except those that ``may`` be, and that no damage is done.
 
     Args:
-        first: number of the faulty frame from which on they have to be.
+        names: cameras that must be left out, for a size of the case.
+        first: number of the first faulty frame in which they must be left out.
+        may: cameras that may be left out as well.
     """
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
@@ -149,7 +159,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
 
 
 def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that the frames are tracked nearly as well as usual."""
+    """Checks that the frames are tracked almost as well as usual."""
     return [
         f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB against the undisturbed run"
         for step in steps
@@ -158,9 +168,9 @@ def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def unchanged(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that nothing moved and the report states this."""
+    """Checks that nothing moved and that the update ran no iterations."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
-    return faults + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
+    return faults + [f"frame {s.report.index}: the update ran iterations" for s in steps if s.report.iterations]
 
 
 def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
@@ -168,16 +178,16 @@ def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
     faults = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
     if not last.psnr >= last.usual - JUMPED_DB:
-        faults.append(f"not found again: {last.psnr - last.usual:+.2f} dB after {len(steps)} frames")
+        faults.append(f"not recovered: {last.psnr - last.usual:+.2f} dB after {len(steps)} frames")
     return faults
 
 
 def explained(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that each frame is degraded or excluded cameras, with an explanation."""
+    """Checks that each frame is degraded or leaves out cameras, with an explanation."""
     return [f"frame {s.report.index}: not explained" for s in steps if not (s.report.degraded or s.report.dropped)]
 
 
-# What is sent
+# Frames that are sent
 
 
 def good(footage: Footage, index: int) -> Sent:
@@ -186,7 +196,7 @@ def good(footage: Footage, index: int) -> Sent:
 
 
 def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame], Frame]) -> list[Sent]:
-    """Returns a number of changed frames from ``at``, during which the scene continues, then good frames."""
+    """Returns ``count`` changed frames from ``at`` on, during which the scene continues, followed by good frames."""
     faulty = [
         Sent(change(number, footage.frame(at + number)), at + number, footage.truth(at + number), False)
         for number in range(count)
@@ -195,13 +205,13 @@ def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame
 
 
 def each(frame: Frame, change: Callable[[str, Picture], Picture]) -> Frame:
-    """Replaces all pictures; the masks stay."""
+    """Replaces all images; the masks stay unchanged."""
     images = {name: change(name, np.asarray(frame.images[name])) for name in frame.images}
     return Frame(frame.index, frame.time, images, frame.masks)
 
 
 def filled(value: int) -> Make:
-    """Sends constant pictures, for as many frames as the size specifies."""
+    """Sends constant images, for as many frames as the size specifies."""
     return lambda footage, at, size: replaced(
         footage, at, size, lambda number, frame: each(frame, lambda name, picture: np.full_like(picture, value))
     )
@@ -218,7 +228,7 @@ def noise(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) -> Make:
-    """Multiplies pictures by a factor, saturated at 255."""
+    """Multiplies the images by a factor, saturating at 255."""
 
     def make(footage: Footage, at: int, size: Any) -> list[Sent]:
         def changed(number: int, frame: Frame) -> Frame:
@@ -231,7 +241,7 @@ def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) 
 
 
 def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Swaps the pictures of two cameras."""
+    """Swaps the images of two cameras."""
     one, two = two_cameras(footage)
 
     def change(number: int, frame: Frame) -> Frame:
@@ -245,7 +255,7 @@ def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Shifts one camera's pictures permanently by a number of pixels; four frames are sent."""
+    """Shifts the images of one camera permanently by a number of pixels; sends four frames."""
     name = two_cameras(footage)[0]
 
     def change(number: int, frame: Frame) -> Frame:
@@ -266,7 +276,7 @@ def capped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def capped_names(footage: Footage, size: int) -> list[str]:
-    """Returns the first camera of the rig."""
+    """Returns the names of the first ``size`` cameras of the rig."""
     return sorted(footage.frame(0).images)[:size]
 
 
@@ -276,13 +286,13 @@ def still(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def stuck(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the pictures of the previous frame a number of times while the scene continues."""
+    """Repeats the images of the previous frame a number of times while the scene continues."""
     before = footage.frame(at - 1)
     return replaced(footage, at, size, lambda number, frame: before)
 
 
 def still_noisy(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the previous frame twice, with noise of a standard deviation in levels."""
+    """Repeats the previous frame twice, with noise whose standard deviation is given in levels of 255."""
     rng = np.random.default_rng(0)
 
     def change(name: str, picture: Picture) -> Picture:
@@ -297,7 +307,7 @@ def _again(footage: Footage, at: int, count: int, change: Callable[[Frame], Fram
 
 
 def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Removes one more camera in each frame until a minimum number remains; then all return."""
+    """Removes one or more further cameras in each frame until a minimum number remains; then all return."""
     names = sorted(footage.frame(0).images)
     count = min(len(names) - size, 7)
     steps = np.linspace(1, len(names) - size, count).round().astype(int)
@@ -315,14 +325,14 @@ def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def elsewhen(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Inserts one frame that shows the scene a number of frames later."""
+    """Sends one frame that shows the scene a number of frames later."""
     wrong = footage.frame(at + size)
     faulty = Sent(Frame(at, 0.0, wrong.images, wrong.masks), at + size, footage.truth(at + size), False)
     return [faulty, *(good(footage, at + 1 + number) for number in range(AFTER))]
 
 
 def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
-    """Moves the object by a multiple of its size and continues from there; four frames are sent."""
+    """Moves the object by a multiple of its size and continues from there; sends four frames."""
     sent = []
     for number in range(4):
         jump = footage.jumped(at + number, size)
@@ -341,17 +351,17 @@ def two_cameras(footage: Footage) -> tuple[str, str]:
 FIELD = "users' reports of capture systems: caps, triggers, cables and light"
 CASES = (
     FrameCase(
-        "all black", "lens caps, or a lost trigger: finite, and learnt it would paint the scene black; size: frames",
+        "all black", "lens caps or a lost trigger; learning them would paint the scene black; size: frames",
         FIELD, (1, 3, 5), filled(0), held,
     ),
-    FrameCase("all white", "over-exposed; size: frames", FIELD, (1, 3), filled(255), held),
+    FrameCase("all white", "overexposed; size: frames", FIELD, (1, 3), filled(255), held),
     FrameCase("saturated noise", "pixels of 0 and 255 at random; size: frames", FIELD, (1, 3), noise, held),
     FrameCase(
-        "lights off and on", "2 % of the light for so many frames, then as before", FIELD, (1, 5),
+        "lights off and on", "2 % of the light for this many frames, then all of it", FIELD, (1, 5),
         brighter(lambda size, number: 0.02, lambda size: int(size)), held,
     ),
     FrameCase(
-        "exposure flickers", "all pictures times the size and its inverse by turns, four frames", FIELD,
+        "exposure flickers", "all images times the size and its inverse in alternation, four frames", FIELD,
         (1.1, 1.3, 1.6),
         brighter(lambda size, number: size if number % 2 == 0 else 1 / size, lambda size: 4), near,
     ),
@@ -364,34 +374,34 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
     return (
         *CASES,
         FrameCase(
-            "two cameras swapped", "cables changed over, for so many frames", FIELD, (1, 3), swapped,
+            "two cameras swapped", "cables swapped, for this many frames", FIELD, (1, 3), swapped,
             left_out(lambda size: (one, two)),
         ),
         FrameCase(
-            "a camera is bumped", "shifted by so many pixels for good; one may pass unseen", FIELD,
+            "a camera is bumped", "permanently shifted by this many pixels; a shift of one may go unnoticed", FIELD,
             (1, 2, 4, 8), bumped,
             left_out(lambda size: (one,) if size > 1 else (), first=1, may=(one,)), lambda size: bool(size > 1),
         ),
         FrameCase(
-            "cameras show nothing", "so many are black, two frames", FIELD, (1, 3), capped,
+            "cameras show nothing", "this many are black, for two frames", FIELD, (1, 3), capped,
             left_out(lambda size: capped_names(footage, size)),
         ),
-        FrameCase("everything stands", "the same pictures so many times, then on", FIELD, (1, 5), still, unchanged),
-        FrameCase("a frame again", "repeated pictures while the world goes on", FIELD, (1, 2), stuck, unchanged),
+        FrameCase("everything stands", "the same images this many times", FIELD, (1, 5), still, unchanged),
+        FrameCase("a frame again", "repeated images while the scene continues", FIELD, (1, 2), stuck, unchanged),
         FrameCase(
-            "a frame again, with noise", "the last pictures twice more, with noise of so many levels of 255", FIELD,
+            "a frame again, with noise", "the last images twice more, with noise of this many levels of 255", FIELD,
             (1, 3), still_noisy, near, lambda size: False,
         ),
         FrameCase(
-            "cameras drop out one by one", "until so many are left, then all are back", FIELD, (4, 2), dropping,
+            "cameras drop out one by one", "until this many are left, then all return", FIELD, (4, 2), dropping,
             lambda steps, size: [],
         ),
         FrameCase(
-            "a frame of another time", "one frame shows what is so many frames later", FIELD, (2, 4), elsewhen,
+            "a frame of another time", "one frame shows the scene this many frames later", FIELD, (2, 4), elsewhen,
             lambda steps, size: [], lambda size: False,
         ),
         FrameCase(
-            "the object jumps", "by so many times its own size, and goes on from there", FIELD, (1.0, 2.0), teleported,
+            "the object jumps", "by this multiple of its size, and continues from there", FIELD, (1.0, 2.0), teleported,
             jumped,
         ),
     )  # fmt: skip

@@ -1,8 +1,8 @@
 """``scripts/bench timing``: cameras that are not synchronized, and how well their time offsets are estimated.
 
-A capture is played there and back, as a stream of every second, third or fourth of its frames; two cameras get the
-pictures of the frames between, one after the others', one before them: their offsets are exact. The stream moves twice
-as fast as the capture, or faster. The synthetic footage is rendered at any moment, for as long as one likes.
+A capture is played back and forth, as a stream of every second, third or fourth of its frames. Two cameras get images
+from the frames in between, one later and one earlier than the others, so their offsets are exact. The stream moves at
+least twice as fast as the capture. The synthetic footage can be rendered at any moment and for any duration.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ COLUMNS = (
 
 
 _TRUE = first_state(resting_may_move=False)
-"""The synthetic footage's."""
+"""State of frame 0 of the synthetic footage."""
 
 
 class Case(NamedTuple):
-    """A case: the frame step through a capture, and the frame offsets of a late and an early camera; 0: none."""
+    """A case: the frame step through a capture, and the offset in frames of a late and an early camera, or 0."""
 
     step: int
     shift: int
@@ -74,11 +74,16 @@ def run(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Updates each capture in each case, prints the table and writes it to ``out/timing.md``.
+    """Runs every case on each capture, prints the table and writes it to ``out/timing.md``.
 
     Args:
-        captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
-        masks: whether they are used. changes: to the settings. again: measure anew. report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the study, which stores each finished run; a second call continues.
+        updates: updates per capture.
+        masks: whether the masks are used.
+        changes: changes to the settings.
+        again: whether to repeat finished runs.
+        report: prints the progress.
     """
     settings, rows = settings_of("scas4d", None, 0, changes), []
     for folder in captures:
@@ -114,7 +119,10 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
     """Returns frame ``index`` of a stream that plays a subsampled capture back and forth.
 
     Args:
-        shifts: by camera, frames of the capture after the others'.
+        capture: the capture.
+        index: index of the frame in the stream.
+        step: frames of the capture per frame of the stream.
+        shifts: delay of each camera against the others, in frames of the capture, keyed by camera name.
     """
     frame = capture.frame(ping_pong(abs(step * index), capture.frame_count))
     images, masks = dict(frame.images), dict(frame.masks)
@@ -128,7 +136,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
 
 @contextmanager
 def clocked() -> Iterator[list[float]]:
-    """Records the seconds that the timing checks of each frame take, inside the context."""
+    """Records the seconds that the timing checks of each frame take, within the context."""
     spent, looked = list[float](), timing.record_timing
 
     def record_timing(*given: Any) -> Any:
@@ -153,10 +161,11 @@ def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[st
 
 
 def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
-    """Returns the row of a run, from its reports.
+    """Returns the row of a run, computed from its reports.
 
     Args:
-        true: frames by which cameras are off; the others are in step.
+        reports: reports of all frames of the run.
+        true: true time offset of each camera in frames; cameras that are not listed are synchronized.
     """
     last = reports[-1].timing
     named = [{name for name, one in report.timing.items() if one["out_of_step"]} for report in reports]

@@ -1,4 +1,4 @@
-"""The small scene of the frame cases and the soak test: a ball circles over a floor, another one rests."""
+"""Small scene of the frame cases and the soak test: one ball circles over a floor, another one is at rest."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import Gaussians
 
 ORBIT = 0.14
-"""Metres, radius of the way of the ball that goes."""
+"""Radius of the moving ball's orbit, in metres."""
 BALL = 0.15
-"""Metres, its radius."""
+"""Radius of the moving ball, in metres."""
 GOES, RESTS, STANDS = 220, 160, 64
-"""Gaussians of the ball that goes, of the one that lies, and of the floor; in this order."""
+"""Number of Gaussians of the moving ball, of the resting ball and of the floor, in this order."""
 
 
 def first_state(*, resting_may_move: bool) -> Gaussians:
-    """Returns Θ_0, in metres of the internal world.
+    """Returns Θ_0, the state of frame 0, in metres of the internal world.
 
     Args:
-        resting_may_move: whether the ball that lies there is labelled as moving.
+        resting_may_move: whether the resting ball is labelled as moving.
     """
     rng = np.random.default_rng(0)
     positions, widths = [], []
@@ -50,7 +50,7 @@ def first_state(*, resting_may_move: bool) -> Gaussians:
 
 
 def gone(state: Gaussians, angle: float, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Gaussians:
-    """Returns the moving ball, rotated about the vertical axis by ``angle`` radians, then shifted."""
+    """Returns the state with the moving ball rotated by ``angle`` radians about the vertical axis, then shifted."""
     means, factors = state.means.copy(), state.factors.copy()
     turn = np.eye(3)
     if angle != 0:
@@ -62,6 +62,6 @@ def gone(state: Gaussians, angle: float, shift: tuple[float, float, float] = (0.
 
 
 def rows() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns masks [N] of the Gaussians of the moving and of the resting ball."""
+    """Returns masks [N] of the Gaussians of the moving ball and of the resting ball."""
     index = np.arange(GOES + RESTS + STANDS)
     return index < GOES, (index >= GOES) & (index < GOES + RESTS)

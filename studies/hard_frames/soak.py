@@ -1,8 +1,8 @@
 """Soak test with thousands of frames of a small scene: static Gaussians, rotations, sizes and memory must not drift.
 
-A ball goes six times around a vertical axis in 500 frames and turns about itself as often, then all the way back, and
-again. Beside it lies a ball that is labelled as moving and never moves, and a floor that stands. After each way there
-and back the truth is that of frame 0, bit by bit.
+A ball circles a vertical axis six times in 500 frames and spins as often about itself, then moves all the way back, and
+so on. Next to it are a resting ball that is labelled as moving, and a static floor. After each round trip the truth
+equals that of frame 0, bit for bit.
 """
 
 from __future__ import annotations
@@ -29,40 +29,40 @@ from studies.machine import resident_mb
 from studies.synthetic.ball import photograph, rig
 
 SIZE = 48
-"""Pixels, side of the six pictures."""
+"""Width and height of the six images in pixels."""
 OUT = 500
-"""Frames of the way there."""
+"""Number of frames on the outward trip."""
 ROUNDS = 6
-"""Turns around the axis on the way there."""
+"""Number of turns around the axis on the outward trip."""
 RATE = 30.0
-"""Frames a second."""
+"""Frames per second."""
 
 SETTINGS = Settings(
     scene=SceneSettings(metres_per_unit=1.0),
     static=StaticSettings(iterations=1),
     update=UpdateSettings(iterations=20, clusters=(2, 12, 48)),
 )
-"""Few iterations: what one of them leaves wrong has thousands of frames to add up."""
+"""Few iterations, so that the errors of each update can accumulate over thousands of frames."""
 
 PIXEL_M = 0.023
-"""Metres that a pixel sees at the middle of the scene: the resolution of the pictures."""
+"""Size of a pixel at the centre of the scene in metres, which is the resolution of the images."""
 RESTING_M = 4 * PIXEL_M
-"""Target: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an
-update finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""
+"""Target: largest RMS distance of the resting ball from its start, in any row. An update locates a ball of ten pixels
+with some error, and several errors in a row may have the same direction."""
 RESTING_MEAN_M = PIXEL_M
-"""Target: the mean of that over a run."""
+"""Target: mean of this distance over a run."""
 RETURN_M = PIXEL_M
-"""Target: the same of those that move, when they are back where they began."""
+"""Target: largest RMS distance of the moving ball from its start when it has returned there."""
 TREND = 1.5
-"""Target: times as far as in the first half that what rests may be from where it was in the second half, on average."""
+"""Target: largest ratio of the mean distance of the resting ball in the second half to that in the first half."""
 UNIT = 1e-5
-"""Target: how far from 1 the norm of a rotation may be."""
+"""Target: largest deviation of a rotation's norm from 1."""
 GROWTH = 10.5
-"""Target: times longer or shorter than in frame 0 that an axis may be: ``checks.SHRUNK``, less rounding."""
+"""Target: largest ratio between the lengths of an axis now and in frame 0: ``checks.SHRUNK``, plus rounding."""
 HALF = 10
-"""Rows that a half needs for that."""
+"""Number of rows in each half that this comparison needs."""
 MEMORY = 1.1
-"""Target: times the memory of the first tenth that the last tenth may take."""
+"""Target: largest ratio of the memory in the last tenth to that in the first tenth."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,18 @@ class Row:
     """The state of the scene after a frame.
 
     Attributes:
-        frame: index. seconds: of an update, mean since the row before. psnr: dB, training views of the update.
-        still: whether nothing of what stands has changed but its colours, bit by bit. finite: whether all is.
-        resting, moving: metres, root mean square distance from the truth, of what rests and of what moves.
-        unit: largest distance of a rotation's norm from 1. longest, shortest: times an axis is as long as in frame 0.
-        memory: MB resident. degraded: frames since the row before that were held or degraded.
+        frame: index of the frame.
+        seconds: mean seconds per update since the previous row.
+        psnr: PSNR of the training views of the update, in dB.
+        still: whether static Gaussians have the same bits as in frame 0, except for their colours.
+        finite: whether all values are finite.
+        resting: RMS distance of the resting ball from the truth, in metres.
+        moving: RMS distance of the moving ball from the truth, in metres.
+        unit: largest deviation of a rotation's norm from 1.
+        longest: largest ratio of an axis length to that in frame 0.
+        shortest: smallest ratio of an axis length to that in frame 0.
+        memory: resident memory in MB.
+        degraded: number of degraded frames since the previous row.
     """
 
     frame: int
@@ -92,14 +99,14 @@ class Row:
 
 
 def true_state(state: Gaussians, index: int) -> Gaussians:
-    """Returns the ground truth of frame ``index``; ``state`` is that of frame 0."""
+    """Returns the ground truth of frame ``index``; ``state`` is the ground truth of frame 0."""
     on = index % (2 * OUT)
     share = min(on, 2 * OUT - on) / OUT
     return gone(state, 2 * np.pi * ROUNDS * (1 - np.cos(np.pi * share)) / 2)
 
 
 class Soak:
-    """A run in a folder, which continues if it is created again for the same folder."""
+    """A run in a folder; creating it again for the same folder continues the run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -121,18 +128,18 @@ class Soak:
 
     @property
     def rows(self) -> list[Row]:
-        """Rows up to the current frame of the scene."""
+        """Rows up to the current frame."""
         file = self.folder / "rows.jsonl"
         rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
         return [Row(**row) for row in rows if row["frame"] <= self.done]
 
     def frame(self, index: int) -> Frame:
-        """Returns the pictures of all cameras."""
+        """Returns a frame with the images of all cameras."""
         shown = photograph(true_state(self.first, index), self._rig)
         return Frame(index, index / RATE, shown.images, shown.masks)
 
     def run(self, frames: int, every: int = 100, echo: Callable[[Row], None] = lambda row: None) -> list[Row]:
-        """Continues up to a number of frames after the first, with a row at regular intervals; returns all rows."""
+        """Continues to a number of frames after the first, adding rows at regular intervals; returns all rows."""
         rows, began, degraded, since = self.rows, 0.0, 0, 0
         while self.done < frames:
             frame, began = self.frame(self.done + 1), began - perf_counter()
@@ -180,29 +187,29 @@ def violations(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         at = f"frame {row.frame}: "
         if not row.finite:
-            faults.append(at + "something is not finite")
+            faults.append(at + "a value is not finite")
         if not row.still:
-            faults.append(at + "what stands has moved")
+            faults.append(at + "a static Gaussian has moved")
         if not row.resting <= RESTING_M:
             faults.append(
-                at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the target is {RESTING_M} m"
+                at + f"the resting ball is {1000 * row.resting:.1f} mm from its start, the target is {RESTING_M} m"
             )
         if row.frame % (2 * OUT) == 0 and not row.moving <= RETURN_M:
             faults.append(
-                at + f"it came back {1000 * row.moving:.1f} mm from where it began, the target is {RETURN_M} m"
+                at + f"the moving ball returned {1000 * row.moving:.1f} mm from its start, the target is {RETURN_M} m"
             )
         if not row.unit <= UNIT:
-            faults.append(at + f"a rotation's norm is {row.unit:.1e} from 1")
+            faults.append(at + f"the norm of a rotation deviates from 1 by {row.unit:.1e}")
         if not (row.longest <= GROWTH and row.shortest >= 1 / GROWTH):
             faults.append(at + f"axes are {row.shortest:.2f} to {row.longest:.2f} times as long as in frame 0")
     half = len(rows) // 2
     if half >= HALF:
         early, late = (float(np.mean([row.resting for row in part])) for part in (rows[:half], rows[half:]))
         if not early + late <= 2 * RESTING_MEAN_M:
-            faults.append(f"what rests is {500 * (early + late):.1f} mm from where it was on average")
+            faults.append(f"the resting ball is {500 * (early + late):.1f} mm from its start on average")
         if late > TREND * early:
             faults.append(
-                f"what rests wanders: {1000 * early:.1f} mm in the first half, {1000 * late:.1f} mm in the second"
+                f"the resting ball drifts: {1000 * early:.1f} mm in the first half, {1000 * late:.1f} mm in the second"
             )
     tenth = max(1, len(rows) // 10)
     began, ended = max(row.memory for row in rows[:tenth]), max(row.memory for row in rows[-tenth:])
@@ -216,9 +223,9 @@ def _rms(distances: NDArray[np.float64]) -> float:
 
 
 def table(rows: Sequence[Row], most: int = 10) -> str:
-    """Formats at most a number of evenly spread rows as Markdown."""
+    """Formats the rows as a Markdown table, combining consecutive rows into at most ``most`` lines."""
     lines = [
-        "| frame | ms | degraded | what rests, mm off | what moves, mm off | norm of rotations | axes | MB |",
+        "| frame | ms | degraded | resting ball, mm off | moving ball, mm off | norm of rotations | axes | MB |",
         "|" + "---|" * 8,
     ]
     for part in np.array_split(np.arange(len(rows)), min(most, len(rows))):

@@ -21,18 +21,21 @@ from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, named, violations
 
 AT = 5
-"""The frame at which each case begins: by then it is known what is usual."""
+"""Frame at which each case begins; by then the usual values are known."""
 UNIT = 1e-5
-"""How far from 1 the norm of a rotation may be."""
+"""Largest deviation of a rotation's norm from 1."""
 
 
 @dataclass
 class FrameCaseResult:
-    """Result of a case in one size.
+    """Result of a case at one size.
 
     Attributes:
-        said: what the reports say of the faulty frames. against: dB of each frame against the undisturbed run, the good
-            ones last. violations: what does not hold.
+        case: the case.
+        size: its size.
+        said: statements of the reports about the faulty frames.
+        against: PSNR of each frame minus that of the undisturbed run, in dB; the good frames come last.
+        violations: violated checks.
     """
 
     case: FrameCase
@@ -51,7 +54,8 @@ class FrameStudy:
     """Runs cases on a footage.
 
     Args:
-        folder: for committed states; what is there goes.
+        footage: the footage.
+        folder: folder for committed states; its contents are deleted.
     """
 
     def __init__(self, footage: AnyFootage, folder: Path) -> None:
@@ -73,7 +77,7 @@ class FrameStudy:
         return self.usual[index]
 
     def run(self, case: FrameCase, size: Any) -> FrameCaseResult | None:
-        """Returns the frames of a case, or None if the footage cannot show it or is too short."""
+        """Runs a case at one size; returns None if the footage cannot show it or is too short."""
         try:
             sent = case.make(self.footage, AT, size)
         except IndexError:
@@ -103,7 +107,7 @@ class FrameStudy:
         return steps
 
     def _branch(self, name: str) -> Reconstruction:
-        """Returns the scene in its state before the case; it continues with the same bits."""
+        """Returns a copy of the scene as it was before the case; it continues with the same bits."""
         folder = self.folder / name
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(self.folder / "before", folder)
@@ -122,7 +126,7 @@ def study(
     names: Sequence[str] = (),
     echo: Callable[[str], None] = print,
 ) -> list[FrameCaseResult]:
-    """Runs the cases whose name contains one of ``names``, or all, in all sizes; reports each immediately."""
+    """Runs the cases whose name contains one of ``names``, or all, at all sizes; reports each result immediately."""
     of, lines = FrameStudy(footage, folder), []
     echo(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
     for case in of.cases:
@@ -138,7 +142,7 @@ def study(
             for sentence in [*line.said, *(f"! {violation}" for violation in line.violations)]:
                 echo(f"       {sentence}")
     failed = sum(bool(line.violations) for line in lines)
-    echo(f"{len({line.case.name for line in lines})} frame cases, {len(lines)} with sizes, {failed} do not hold")
+    echo(f"{len({line.case.name for line in lines})} frame cases, {len(lines)} with sizes, {failed} fail")
     return lines
 
 

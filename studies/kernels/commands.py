@@ -11,17 +11,17 @@ from studies.options import QUALITY, Capture, Changes, Page, write_page, write_p
 
 
 def kernels(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; the targets are for robot.")],
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; targets are for robot.")],
     out: Page = None,
-    store: Annotated[Path, typer.Option(help="Folder of the study, for `scripts/bench table`.")] = QUALITY,
+    store: Annotated[Path, typer.Option(help="Folder of the study, read by `scripts/bench table`.")] = QUALITY,
     preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
-    frames: Annotated[int, typer.Option(min=3, help="Frames of the timed run; the first update does not count.")] = 8,
-    repeats: Annotated[int, typer.Option(min=1, help="Repeats of the rasterizer and of its arithmetic.")] = 9,
+    frames: Annotated[int, typer.Option(min=3, help="Frames of the timed run; the first update is not counted.")] = 8,
+    repeats: Annotated[int, typer.Option(min=1, help="Repetitions of the rasterizer and its arithmetic.")] = 9,
     changes: Changes = None,
 ) -> None:
-    """Measures the CPU kernels: rasterizer against its arithmetic, update against its passes, peak memory.
+    """Measures the CPU kernels: the rasterizer against its arithmetic, an update against its passes, and peak memory.
 
-    Leave the machine alone meanwhile; NUMBA_NUM_THREADS sets the threads. Frame 0 is fitted anew, for its memory.
+    Needs an idle machine. NUMBA_NUM_THREADS sets the number of threads. Frame 0 is fitted again to measure its memory.
     """
     from studies.kernels import kernels as study
     from studies.quality.settings import settings_of
@@ -34,12 +34,12 @@ def kernels(
 
 def moving(
     share: Annotated[
-        list[float] | None, typer.Option(min=0.01, max=1, help="Of the pixels; 0.05, 0.2 and 1 when left out.")
+        list[float] | None, typer.Option(min=0.01, max=1, help="Share of moving pixels; default 0.05, 0.2 and 1.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=2, help="Updates of each; the first one does not count.")] = 8,
+    frames: Annotated[int, typer.Option(min=2, help="Updates per share; the first one is not counted.")] = 8,
     out: Page = None,
 ) -> None:
-    """Measures the time of an update against the share of the pixels that move, on made-up footage, in turns."""
+    """Measures the time of an update against the share of moving pixels, on synthetic footage, in alternation."""
     from scas4d_core.warm_up import compile_in_processes
     from studies.kernels import moving as study
 
@@ -51,13 +51,11 @@ def moving(
 
 def startup(
     capture: Capture,
-    against: Annotated[
-        Path | None, typer.Option(help="Another checkout, measured in turns with this one; ratios are to it.")
-    ] = None,
+    against: Annotated[Path | None, typer.Option(help="Another checkout to compare with; runs alternate.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Starts of each checkout.")] = 3,
     out: Page = None,
 ) -> None:
-    """Measures a service from an empty cache of kernels to the first committed update, of one checkout or two."""
+    """Measures a service from an empty kernel cache to the first committed update, for one checkout or two."""
     from studies.kernels import startup as study
 
     checkouts = [study.ROOT] if against is None else [against.resolve(), study.ROOT]

@@ -1,11 +1,11 @@
 """``scripts/bench kernels``: cost of the kernels, compared with their arithmetic alone.
 
-1. The rasterizer, forward and backward, against a micro-kernel that does the arithmetic of as many blended pairs and
-   nothing else (``bench.pairs``); both in turn, in this process, on the same threads. On all views of frame 0, and on a
-   cloud of wider Gaussians, where the cost of a pair outweighs that of a Gaussian.
-2. Updates against their own rasterizer passes: seconds of ``Reconstruction.step``, pictures decoded and state
-   committed, over those of its stages "render" and "render backward".
-3. Peak memory of that run, frame 0 fitted in it, in a fresh process.
+1. The rasterizer, forward and backward, against a micro-kernel that does only the arithmetic of as many blended pairs
+   (``studies.kernels.pairs``). Both alternate in this process, on the same threads. They run on all views of frame 0,
+   and on a cloud of wider Gaussians, where the cost of the pairs outweighs that of the Gaussians.
+2. Updates against their own rasterizer passes: seconds of ``Reconstruction.step``, including decoding and committing,
+   divided by those of its stages "render" and "render backward".
+3. Peak memory of that run, including the fit of frame 0, in a fresh process.
 """
 
 from __future__ import annotations
@@ -40,41 +40,42 @@ from studies.quality.first_frame import first_frame_key, load_first_frame, save_
 from studies.quality.targets import KERNELS, TARGETS
 
 PASSES = ("render", "render backward")
-"""Stages of an update that are the rasterizer's."""
+"""Stages of an update that belong to the rasterizer."""
 CLOUD_GAUSSIANS, CLOUD_SIZE = 20_000, 256
-"""Of the cloud, and of its square picture in pixels."""
+"""Number of Gaussians in the cloud, and width and height of its image in pixels."""
 CLOUD_WIDTH = 2.1
-"""Pixels, standard deviation: about 145 pixels a Gaussian, 2.9 million pairs in a picture."""
+"""Standard deviation in pixels: about 145 pixels per Gaussian and 2.9 million pairs per image."""
 
 
 def study(
     folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
 ) -> Row:
-    """Measures all three on a capture, prints them, and writes them to ``store/kernels.json``.
+    """Takes all three measurements on a capture, prints them, and writes them to ``store/kernels.json``.
 
     Args:
-        folder: of the capture.
-        settings: of frame 0 and the updates.
+        folder: folder of the capture.
+        settings: settings of frame 0 and the updates.
         store: folder of the study.
-        frames: of the run; the first update compiles or loads kernels and is not counted, so at least 3.
-        repeats: of the rasterizer and the micro-kernel.
+        frames: number of frames, at least 3. The first update compiles or loads kernels and is not counted.
+        repeats: repetitions of the rasterizer and the micro-kernel.
+        report: prints the progress.
 
     Raises:
         ValueError: fewer than 3 frames.
-        BrokenProcessPool: the run's process ended before its time.
+        BrokenProcessPool: the process of the run ended early.
     """
     if frames < 3:
         raise ValueError(f"frames is {frames}; give at least 3: the first update is not counted")
     capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
-    report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")
+    report(f"running {min(frames, capture.frame_count)} frames, starting with frame 0, in a separate process")
     compile_in_processes()
     timed = in_a_process(run_and_time, folder, settings, frames, first_file)
     kept = load_first_frame(first_file)
-    assert kept is not None  # the run has left it there
+    assert kept is not None  # the run has stored it
     world = capture.rig.world_frame(settings.scene.metres_per_unit)
     rig = rig_inside(world, capture.rig.scaled(settings.scene.image_scale).cameras)
-    report(f"the rasterizer and the micro-kernel, {repeats} times in turn")
+    report(f"running the rasterizer and the micro-kernel {repeats} times, in alternation")
     limits = scene_limits(settings.scene.near, rig.radius)
     on_frame_0 = measure_rasterizer(kept[0].gaussians, rig.cameras, repeats, limits)
     cloud, camera = make_cloud()
@@ -101,11 +102,13 @@ def study(
 
 
 def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats: int, limits: Limits = DEFAULT) -> Row:
-    """Returns nanoseconds per pair for the rasterizer (four channels: colour and label) and the micro-kernel.
+    """Returns nanoseconds per pair of the rasterizer (four channels: colour and label) and of the micro-kernel.
 
     Args:
-        gaussians: what is rendered. cameras: of the inside world. repeats: each gives one figure.
-        limits: of the scene.
+        gaussians: Gaussians to render.
+        cameras: cameras in internal world coordinates.
+        repeats: number of measurements.
+        limits: limits of the rasterizer in the scene.
     """
     rasterizer = CpuRasterizer(limits)
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
@@ -121,7 +124,7 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
         blended = blended_pairs(rasterizer.splats, rasterizer.counts, view.width, view.height, limits)
         pairs, lanes = pairs + blended[0], lanes + blended[1]
     micro = MicroKernel(threads())
-    # One thread's own time is not disturbed by others who want its core; several threads also wait for each other.
+    # Other processes do not affect a single thread's CPU time, but several threads also wait for each other.
     clock = time.process_time if threads() == 1 else time.perf_counter
     rounds = max(1, round(pairs / micro.run(1)))
     seconds: dict[str, list[float]] = {"forward": [], "backward": [], "micro": []}
@@ -158,7 +161,7 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
 
 
 def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
-    """Creates a camera and round Gaussians spread evenly over its picture, at 3 to 5 m with opacities 0.1 to 0.9."""
+    """Creates a camera, and round Gaussians spread evenly over its image, at 3 to 5 m with opacities of 0.1 to 0.9."""
     rng = np.random.default_rng(seed)
     focal, middle = float(CLOUD_SIZE), CLOUD_SIZE / 2
     depth = rng.uniform(3, 5, CLOUD_GAUSSIANS)
@@ -177,10 +180,10 @@ def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
 
 
 def update_figures(updates: Sequence[Row]) -> Row:
-    """Returns the seconds of updates and of their rasterizer passes, and their ratio, without the first update.
+    """Returns the seconds of the updates and of their rasterizer passes, and their ratio, without the first update.
 
     Args:
-        updates: ``seconds`` of the whole step and ``stages`` by name, in order.
+        updates: updates in order, each with the ``seconds`` of the whole step and of its ``stages``.
     """
     counted = updates[1:]
     passes = np.array([sum(update["stages"][name] for name in PASSES) for update in counted])
@@ -197,7 +200,7 @@ def update_figures(updates: Sequence[Row]) -> Row:
 
 
 def spread(values: Any) -> dict[str, float]:
-    """Returns minimum and median."""
+    """Returns the minimum and the median."""
     return {"min": float(np.min(values)), "median": float(np.median(values))}
 
 
@@ -259,7 +262,7 @@ def page(row: Row) -> str:
 - The rasterizer covers projection, depth order, tile lists, blending, and their backward pass. "Arithmetic alone"
   is the exp and the multiply-adds of as many pairs, in cache, forward and backward with four channels.
 - "By place" compares with the arithmetic of all pixels of the 4×4 blocks that are visited.
-- Times are CPU times with one thread, and wall-clock times with more. Ratios are medians of runs in turns.
+- Times are CPU times with one thread, and wall-clock times with more. Ratios are medians of alternating runs.
 - An update is the whole `Reconstruction.step`, median of {row["updates"]}. Peak memory is that of a process that
   fits frame 0 and runs {row["frames"] - 1} updates.
 
@@ -281,7 +284,7 @@ def _scene_words(on: Row) -> str:
 
 
 def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
-    """Reconstructs a number of frames, keeps frame 0, and reports seconds per update and peak memory."""
+    """Reconstructs a number of frames and stores frame 0; returns the seconds per update and the peak memory."""
     capture = open_source(folder)
     count = min(frames, capture.frame_count)
     updates: list[Row] = []

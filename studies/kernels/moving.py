@@ -1,7 +1,7 @@
-"""Time of an update versus the share of moving pixels, on synthetic footage.
+"""Time of an update against the share of moving pixels, on synthetic footage.
 
-A textured wall is seen by a row of cameras; a square in its middle slides, as large as the share asks for.
-All variants have the same Gaussians, cameras and settings; they are updated in turns.
+Cameras in a row see a textured wall. A square in its middle slides; its size depends on the share. All variants have
+the same Gaussians, cameras and settings, and are updated in alternation.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ from scas4d_core.settings import Settings
 from studies.synthetic.wall import Size, known, rig, shown, wall
 
 SIZE = Size(gaussians=22_500)
-"""As many Gaussians as a captured object has, and as small pictures."""
+"""As many Gaussians as a captured object has, and images that are as small."""
 
 
 @dataclass(frozen=True)
 class MovingTime:
-    """Times of a variant.
+    """Measurements of one variant.
 
     Attributes:
-        share: of the pixels that show something that moves, asked for. moving: Gaussians that move. seconds: median of
-            an update. psnr: dB, mean over the cameras at the last update.
+        share: requested share of the pixels that show something moving.
+        moving: number of moving Gaussians.
+        seconds: median seconds per update.
+        psnr: PSNR of the last update, averaged over the cameras, in dB.
     """
 
     share: float
@@ -39,7 +41,9 @@ def measure(shares: Sequence[float], frames: int, settings: Settings | None = No
     """Updates all variants in alternation, frame by frame.
 
     Args:
-        shares: 0…1. frames: updates of each; the first one, which looks for the motion, does not count.
+        shares: shares of moving pixels, from 0 to 1.
+        frames: updates per share. The first one searches for the motion and is not counted.
+        settings: settings of the reconstruction; defaults in metres if None.
     """
     settings = settings or Settings.model_validate({"scene": {"metres_per_unit": 1.0}})
     cameras = rig(SIZE)
@@ -65,9 +69,9 @@ def measure(shares: Sequence[float], frames: int, settings: Settings | None = No
 
 
 def table(results: Sequence[MovingTime]) -> str:
-    """Formats the results as Markdown, with ratios to the last one."""
+    """Formats the results as Markdown, with times relative to the last one."""
     last = results[-1].seconds
-    lines = ["| pixels that move | Gaussians that move | s an update | of the last | PSNR |", "|---|---|---|---|---|"]
+    lines = ["| moving pixels | moving Gaussians | s per update | of the last | PSNR |", "|---|---|---|---|---|"]
     lines += [
         f"| {100 * one.share:.0f} % | {one.moving:,} | {one.seconds:.2f} | {one.seconds / last:.2f} | {one.psnr:.1f} |"
         for one in results

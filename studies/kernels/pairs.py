@@ -1,9 +1,9 @@
-"""Blended pixel–Gaussian pairs: their number in a picture, and the cost of their arithmetic alone.
+"""Blended pixel–Gaussian pairs: their number in an image, and the cost of their arithmetic alone.
 
-A pair is blended where the Gaussian's alpha is at least the floor and the pixel is not finished. The micro-kernel does
-for each pair what ``kernels.blend`` does forward and backward (exp, alpha, transmittance, four channels; the products
-and sums of the gradients), in the same blocks of 16 pixels, on Gaussians that cover a whole tile and stay in cache: no
-projection, no order, no lists, no blocks half outside, no reduction of the sums.
+A pair is blended if the Gaussian's alpha is at least the floor and the pixel is not finished. For each pair, the
+micro-kernel computes what ``kernels.blend`` does forward and backward (exp, alpha, transmittance, four channels; the
+products and sums of the gradients), in the same blocks of 16 pixels. Its Gaussians cover a whole tile and stay in
+cache. It needs no projection, sorting, lists, partly covered blocks or reduction of the sums.
 """
 
 from __future__ import annotations
@@ -35,26 +35,31 @@ from scas4d_core.kernels.projection import (
 Array = NDArray[np.float32]
 
 GAUSSIANS = 32
-"""Of the micro-kernel's tile: with their sums they fit into the first-level cache beside the tile."""
+"""Number of Gaussians in the micro-kernel's tile; with their sums, they fit into the L1 cache next to the tile."""
 CHANNELS = 4
 SIDE = 16
-"""Pixels along the side of the micro-kernel's tile."""
+"""Width and height of the micro-kernel's tile in pixels."""
 PAIRS = GAUSSIANS * SIDE * SIDE
-"""Pairs of one round of the micro-kernel's tile: every lane is one."""
+"""Pairs in one round of the micro-kernel's tile; every lane is a pair."""
 SUMS = 6 + CHANNELS
 
 
 def blended_pairs(
     splats: Array, counts: NDArray[np.int32], width: int, height: int, limits: Limits = DEFAULT
 ) -> tuple[int, int, Array]:
-    """Counts the pairs of a picture, Gaussian by Gaussian in depth order, without tiles.
+    """Counts the pairs of an image without tiles, one Gaussian after the other in depth order.
 
     Args:
-        splats: [N, 16], counts: [N] of ``CpuRasterizer`` after ``forward``. width, height: pixels.
+        splats: [N, 16] splats of ``CpuRasterizer`` after ``forward``.
+        counts: [N] counts of ``CpuRasterizer`` after ``forward``.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
+        limits: limits of the rasterizer.
 
     Returns:
-        Pairs; places in blocks of 4×4 pixels that some support meets (what a block-wise kernel computes at least); and
-        the light left [H, W], which is the rasterizer's ``transmittance`` if the count is right.
+        The number of pairs; the number of pixels in the 4×4 blocks that a support touches, which is the least that a
+        block-wise kernel computes; and the remaining light [H, W], which equals the rasterizer's ``transmittance`` if
+        the count is correct.
     """
     visible = np.flatnonzero(counts > 0)
     order = visible[np.argsort(splats[visible, DEPTH], kind="stable")]
@@ -74,7 +79,7 @@ def _count(splats: Any, order: Any, limits: Any, alive: Any, light: Any, last_me
         mx, my = splats[i, MEAN_X], splats[i, MEAN_Y]
         a, b, c, opacity = splats[i, CONIC_A], splats[i, CONIC_B], splats[i, CONIC_C], splats[i, OPACITY]
         determinant = max(a * c - b * b, np.float32(1e-30))
-        # A pixel wider than the support's box: what is outside fails the test of alpha.
+        # One pixel wider than the bounding box of the support: pixels outside fail the alpha test.
         half_x = np.sqrt(splats[i, REACH] * c / determinant) + ONE
         half_y = np.sqrt(splats[i, REACH] * a / determinant) + ONE
         for y in range(max(int(my - half_y), 0), min(int(my + half_y) + 1, height)):
@@ -105,7 +110,7 @@ class MicroKernel:
         self.tasks = tasks
         self.splats = np.zeros((GAUSSIANS, SPLAT_COLUMNS), np.float32)
         self.splats[:, [MEAN_X, MEAN_Y]] = rng.uniform(4, 12, (GAUSSIANS, 2))
-        # Wide and faint: alpha stays above the floor in the whole tile, and light is left behind the last.
+        # Wide and faint: alpha stays above the floor in the whole tile, and light remains behind the last Gaussian.
         self.splats[:, [CONIC_A, CONIC_C]] = rng.uniform(0.002, 0.004, (GAUSSIANS, 2))
         self.splats[:, CONIC_B] = rng.uniform(-0.001, 0.001, GAUSSIANS)
         self.splats[:, OPACITY] = rng.uniform(0.05, 0.15, GAUSSIANS)
@@ -116,7 +121,7 @@ class MicroKernel:
         self.sums = np.zeros((tasks, GAUSSIANS, SUMS, lanes.COUNT), np.float32)
 
     def run(self, rounds: int) -> int:
-        """Runs forward and backward pass; returns the number of pairs."""
+        """Runs the forward and the backward pass; returns the number of pairs."""
         _micro(self.splats, self.features, self.limits, rounds, self.image, self.sums)
         return rounds * self.tasks * PAIRS
 
@@ -126,7 +131,7 @@ def _micro_forward(splats: Any, features: Any, limits: Any, image: Any) -> None:
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     blocks, step = SIDE * SIDE // lanes.COUNT, lanes.COUNT * (1 + CHANNELS)
-    state = np.empty(blocks * step + lanes.COUNT, np.float32)  # per block: light left, colours
+    state = np.empty(blocks * step + lanes.COUNT, np.float32)  # per block: remaining light, colours
     base = lanes.aligned(state)
     state[:] = ZERO
     for block in range(blocks):
@@ -165,7 +170,7 @@ def _micro_backward(splats: Any, features: Any, limits: Any, image: Any, out: An
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     blocks, step = SIDE * SIDE // lanes.COUNT, lanes.COUNT * (2 + CHANNELS)
-    state = np.empty(blocks * step + lanes.COUNT, np.float32)  # per block: light left, what remains, gradients
+    state = np.empty(blocks * step + lanes.COUNT, np.float32)  # per block: remaining light, light behind, gradients
     base = lanes.aligned(state)
     for block in range(blocks):
         lanes.store(state, base + block * step, lanes.fill(ONE))

@@ -1,7 +1,7 @@
 """Startup of a service, from an empty kernel cache to the first committed update.
 
-A service starts with no compiled kernel. As soon as it is ready, as a rig would, the study sends it a capture's first
-two frames. Two checkouts are measured in turns, because the time of a shared machine drifts.
+A service starts without compiled kernels. As soon as it is ready, the study sends it the first two frames of a capture,
+as a rig would. Two checkouts are measured in alternation, because the speed of a shared machine drifts.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ EVERY_S = 0.1
 PATIENCE_S = 1800.0
 ENDING_S = 120.0
 ADOPT = 36
-"""PR_SET_CHILD_SUBREAPER: processes whose parent has ended become ours, so that their processor time counts."""
+"""PR_SET_CHILD_SUBREAPER: adopts processes whose parent has ended, so that their CPU time is counted."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,11 @@ class Start:
     """One start of a service.
 
     Attributes:
-        checkout: whose service. ready, first, update: seconds from the start of its process until it was ready, until
-            frame 0 was committed, and until the first update was. processor: seconds of all its processes.
+        checkout: checkout of the service.
+        ready: seconds from the start of the process until the service was ready.
+        first: seconds from the start of the process until frame 0 was committed.
+        update: seconds from the start of the process until the first update was committed.
+        processor: CPU seconds of all its processes.
     """
 
     checkout: Path
@@ -56,7 +59,7 @@ def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> l
     """Starts a service of each checkout several times, in alternation.
 
     Raises:
-        RuntimeError: a service or what it started did not end, or no update came.
+        RuntimeError: a service or one of its processes did not end, or no update was committed.
     """
     starts = []
     for turn in range(repeats):
@@ -69,14 +72,14 @@ def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> l
 def start(capture: Path, checkout: Path) -> Start:
     """Starts a service of a checkout with an empty cache, and sends it two frames.
 
-    It does so in a process of its own: that one waits for all its children, and counts their time alone.
+    It runs in a separate process, which waits for all its children and counts only their time.
     """
     begun: Start = in_a_process(_start, capture, checkout)
     return begun
 
 
 def _start(capture: Path, checkout: Path) -> Start:
-    with contextlib.suppress(OSError, AttributeError):  # elsewhere than on Linux, compilers' time is missing
+    with contextlib.suppress(OSError, AttributeError):  # only Linux can count the compilers' time
         ctypes.CDLL(None).prctl(ADOPT, 1, 0, 0, 0)
     source = open_source(capture)
     with tempfile.TemporaryDirectory() as folder, _service(checkout, Path(folder)) as (url, process):
@@ -100,10 +103,10 @@ def _start(capture: Path, checkout: Path) -> Start:
 
 
 def table(starts: list[Start]) -> str:
-    """Formats medians by checkout, and their ratios to the first one, as Markdown."""
+    """Formats the medians of each checkout, and their ratios to the first checkout, as Markdown."""
     lines = [
         f"{in_words(machine())}; medians of {sum(one.checkout == starts[0].checkout for one in starts)} starts each, "
-        "in turns.",
+        "in alternation.",
         "",
         "| checkout | ready | frame 0 | first update | processor | first update, ratio | processor, ratio |",
         "|---|---|---|---|---|---|---|",
@@ -169,11 +172,11 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.send_signal(signal.SIGTERM)
     process.wait()
     until = time.monotonic() + ENDING_S
-    with contextlib.suppress(ChildProcessError):  # there is none left
+    with contextlib.suppress(ChildProcessError):  # no child process is left
         while True:
             if os.waitpid(-1, os.WNOHANG) == (0, 0):
                 if time.monotonic() > until:
-                    raise RuntimeError(f"a process that the service started goes on {ENDING_S:.0f} s after its end")
+                    raise RuntimeError(f"a process of the service still runs {ENDING_S:.0f} s after its end")
                 time.sleep(EVERY_S)
 
 

@@ -13,18 +13,18 @@ from studies.options import FRONTIER, QUALITY, Captures
 def paper(
     captures: Captures,
     out: Annotated[
-        Path, typer.Option(help="Folder of the study, shared with frontier. Run again to continue.")
+        Path, typer.Option(help="Folder of the study, shared with frontier. A second run continues it.")
     ] = FRONTIER,
     quality: Annotated[
-        Path | None, typer.Option(help="Folder of the study of quality, for captures that have rows there alone.")
+        Path | None, typer.Option(help="Folder of the quality study, for captures with rows only there.")
     ] = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Updates of each row.")] = 5,
+    updates: Annotated[int, typer.Option(min=1, help="Updates per row.")] = 5,
     measure: Annotated[
-        bool, typer.Option("--measure/--no-measure", help="Measure rows that are missing; else leave them out.")
+        bool, typer.Option("--measure/--no-measure", help="Measure missing rows; otherwise leave them out.")
     ] = True,
-    page: Annotated[Path | None, typer.Option(help="The page, as Markdown. [OUT/paper.md]")] = None,
+    page: Annotated[Path | None, typer.Option(help="Markdown page to write. [OUT/paper.md]")] = None,
 ) -> None:
-    """Reproduces the paper's experiments on captures, beside the paper's figures, and says where they agree.
+    """Reproduces the paper's experiments on captures and reports where the results agree with the paper's figures.
 
     A capture without rows in either study is measured, its cheapest rows first.
 

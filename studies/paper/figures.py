@@ -1,7 +1,7 @@
-"""Figures of the paper (SCas4D, TMLR 06/2025) by scene, as printed in its tables.
+"""Figures of the paper (SCas4D, TMLR 06/2025) per scene, as printed in its tables.
 
-Only the scenes that have a counterpart among the captures: five of FastParticle, and Basketball of Panoptic. They are
-other pictures of other motions under the same names.
+Only scenes with a counterpart among the captures are included: five of FastParticle, and Basketball of Panoptic. The
+captures have the same names, but show other images of other motions.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 Figures = Mapping[str, float]
-"""By capture."""
+"""Figure of each capture."""
 
 SCENES = ("robot", "spring", "wheel", "pendulums", "cloth", "basketball")
 
 
 def _scenes(*values: float) -> Figures:
-    """Maps figures to scenes in the order of ``SCENES``; the last one is missing in tables of FastParticle only."""
+    """Maps the scenes, in the order of ``SCENES``, to figures; tables with only FastParticle lack the last scene."""
     return dict(zip(SCENES, values, strict=False))
 
 
@@ -25,11 +25,11 @@ PSNR_BASELINE_2000 = _scenes(30.23, 30.88, 28.59, 31.23, 32.91, 30.01)
 SSIM_100 = _scenes(0.96, 0.97, 0.94, 0.97, 0.97, 0.93)
 SSIM_BASELINE_100 = _scenes(0.90, 0.93, 0.89, 0.94, 0.92, 0.92)
 SSIM_BASELINE_2000 = _scenes(0.97, 0.97, 0.94, 0.97, 0.98, 0.92)
-"""dB and SSIM, table "Online methods rendering results"."""
+"""PSNR in dB and SSIM, from the table "Online methods rendering results"."""
 
 PSNR_BASELINE_300 = _scenes(27.66, 27.16, 26.67, 29.57, 30.41)
 SSIM_BASELINE_300 = _scenes(0.95, 0.95, 0.93, 0.96, 0.97)
-"""Table "our method trained with 100 iterations per time frame against Dynamic3DGS" (same wall clock)."""
+"""From the table "our method trained with 100 iterations per time frame against Dynamic3DGS" (same wall clock)."""
 
 PSNR_LAYERS: Mapping[int, Figures] = {
     1: _scenes(24.56, 26.16, 25.12, 25.94, 27.77),
@@ -38,7 +38,7 @@ PSNR_LAYERS: Mapping[int, Figures] = {
     4: _scenes(29.39, 30.09, 27.87, 30.38, 31.48),
     5: _scenes(29.17, 30.00, 27.79, 30.36, 31.43),
 }
-"""By K, the number of layers; tables "Ablation study for the number of cluster layers" and "More ablation study"."""
+"""By number of layers K, from "Ablation study for the number of cluster layers" and "More ablation study"."""
 
 PSNR_FIRST_LAYER: Mapping[int, Figures] = {
     16: _scenes(29.76, 30.43, 27.97, 30.84, 31.56),
@@ -46,11 +46,11 @@ PSNR_FIRST_LAYER: Mapping[int, Figures] = {
     48: _scenes(29.49, 30.36, 28.00, 30.70, 31.61),
     64: _scenes(29.46, 30.28, 27.95, 30.60, 31.68),
 }
-"""By N, the clusters of the first layer; table "varying the number of clusters in the first layer"."""
+"""By number of clusters N in the first layer, from "varying the number of clusters in the first layer"."""
 
 PSNR_MAX_SCALE_2 = _scenes(15.86, 19.86, 22.42, 18.86, 21.53)
-"""max_scale 2.0 instead of 0.02; table "different values of the max scale constraint"."""
+"""For max_scale 2.0 instead of 0.02, from the table "different values of the max scale constraint"."""
 
 MTE_100 = _scenes(0.80, 0.17, 14.88, 0.50, 0.24, 0.57)
 MTE_BASELINE_100 = _scenes(7.84, 2.26, 18.53, 3.51, 2.33, 15.85)
-"""% of the picture's diagonal, table "2D tracking results"; the best of the candidates within 10 pixels is taken."""
+"""In % of the image diagonal, from the table "2D tracking results", with the best candidate within 10 pixels."""

@@ -1,4 +1,4 @@
-"""The page of the paper's tables: each experiment next to the paper's figures, and whether they agree."""
+"""Page of the paper's tables: each experiment next to the paper's figures, and whether they agree."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from studies.paper.paper import (
 )
 
 DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ari": 3}
-"""By score."""
+"""Number of decimals of each score."""
 
 
 def write_paper_page(
@@ -32,8 +32,11 @@ def write_paper_page(
     """Writes the page from the rows of the study; returns the text.
 
     Args:
-        out: folder of the frontier. captures: names. page: Markdown file. updates: that the rows cover.
-        quality: folder of the study of quality, for captures that the frontier has no rows of.
+        out: folder of the frontier study.
+        captures: names of the captures.
+        page: Markdown file to write.
+        updates: number of updates that the rows cover.
+        quality: folder of the quality study, for captures without rows in the frontier study.
     """
     ours = measured(out, captures, updates, quality)
     points = read_points(out, captures, updates)
@@ -45,8 +48,8 @@ def write_paper_page(
     )
     text = f"""# The paper's tables
 
-The paper's experiments on our captures. A cell holds our figure and, in brackets, the paper's. The scenes share names
-and kinds of motion with the paper's, not pictures: only differences can be compared.
+The paper's experiments on our captures. A cell contains our figure and, in brackets, the paper's. The scenes share
+names and kinds of motion with the paper's, but not images, so only differences can be compared.
 
 ```
 {_commands(captures, there, page)}
@@ -84,7 +87,7 @@ def section(
     captures: Sequence[str],
     ratio: float | None,
 ) -> str:
-    """Formats an experiment as Markdown: table and note."""
+    """Formats an experiment as Markdown: its table and its note."""
     names = [name for name in SCENES if name in captures]
     digits = DIGITS[experiment.score]
     unit = f" {experiment.unit}" if experiment.unit else ""
@@ -107,7 +110,7 @@ def section(
 
 
 def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
-    """Returns counts and a table of all claims."""
+    """Returns the counts and the table of all claims."""
     known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
     counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [

@@ -1,8 +1,8 @@
 """``scripts/bench paper``: each experiment of the paper on the available captures, next to the paper's figures.
 
-Every experiment is a comparison: of a setting with another one, by one score. The outcome agrees in sign where the
-difference of the means points the same way as the paper's, and in size where it is also within a factor of two of it.
-Differences that are small on both sides agree as well. Where the paper shows a picture only, the sign is its claim.
+Every experiment compares one setting with another, by one score. The outcome agrees in sign if the difference of the
+means has the sign of the paper's, and in size if both are also within a factor of two. Differences that are small on
+both sides agree as well. If the paper shows only a picture, its claim is the sign.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from studies.paper.figures import Figures
 from studies.quality.runs import measured_runs
 
 FACTOR = 2.0
-"""Between two differences that agree in size."""
+"""Largest factor between two differences that agree in size."""
 SMALL: Mapping[str, float] = {
     "psnr": 0.3,
     "ssim": 0.005,
@@ -28,17 +28,17 @@ SMALL: Mapping[str, float] = {
     "mte_2d_oracle": 0.1,
     "parts_ari": 0.05,
 }
-"""Differences below this count as none."""
+"""Differences below these count as zero."""
 
 
 def variant(label: str) -> Variant:
-    """Returns the frontier setting with a label, except those for whole captures."""
+    """Returns the frontier setting with the given label, excluding settings that cover whole captures."""
     return next(v for axis in AXES.values() for v in axis if v.label == label and not v.whole)
 
 
 @dataclass(frozen=True)
 class ClaimSetting:
-    """One setting of an experiment: the paper's name, the frontier's setting, the paper's figures (empty: none)."""
+    """One setting of an experiment: its name in the paper, the frontier setting, and the paper's figures, if any."""
 
     name: str
     variant: Variant
@@ -47,10 +47,13 @@ class ClaimSetting:
 
 @dataclass(frozen=True)
 class Claim:
-    """A comparison made in the paper: the gain of ``first`` over ``second``, by their names.
+    """A comparison made in the paper: the gain of one setting over another.
 
     Attributes:
-        expected: of the gain, where the paper has no figures: its sign, or 0 for the same.
+        what: description of the claim.
+        first: name of the first setting.
+        second: name of the second setting.
+        expected: sign of the gain, or 0 for no difference, if the paper has no figures.
     """
 
     what: str
@@ -106,8 +109,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "Same wall clock, PSNR", "appendix", "psnr", "dB",
         (OURS, ClaimSetting("Dynamic3DGS, 300", BASE_300, figures.PSNR_BASELINE_300)),
         (Claim("ahead of three times the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
-        "The paper takes 300 iterations of the baseline for as long as 100 of its own. Here an iteration of the "
-        "baseline costs {ratio} of one of `scas4d`; at truly equal seconds: accuracy-and-time.md.",
+        "In the paper, 300 iterations of the baseline take as long as 100 of its own. Here an iteration of the "
+        "baseline costs {ratio} of one of `scas4d`; accuracy-and-time.md compares them at equal seconds.",
     ),
     Experiment(
         "Same wall clock, SSIM", "appendix", "ssim", "",
@@ -141,8 +144,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
             Claim("three over four", "K=3", "K=4"),
             Claim("three over five", "K=3", "K=5"),
         ),
-        "The paper does not say how many clusters its single layer has, nor those of K = 2, 4, 5: here 64 (of 320, of "
-        "1280) and 64 to 1280, evenly in the logarithm.",
+        "The paper does not state the number of clusters of its single layer, nor for K = 2, 4, 5. Here they are 64 "
+        "(or 320, or 1280), and 64 to 1280, evenly spaced in log scale.",
     ),
     Experiment(
         "Clusters of the first layer", "appendix", "psnr", "dB",
@@ -164,9 +167,9 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "Entangled against separate covariance", "a figure", "psnr", "dB",
         (ClaimSetting("Entangled", DEFAULT, {}), ClaimSetting("Separate", variant("separate covariance"), {})),
         (Claim("better pictures", "Entangled", "Separate", 1),),
-        "The paper shows a picture of its wheel. Separate (`update.covariance`): the cascade moves means alone, and a "
-        "Gaussian's own ΔR and Δs are all that changes its covariance; they begin at once (`update.deltas_start` 0), "
-        "not after 40 % of the iterations.",
+        "The paper shows a picture of its wheel. Separate (`update.covariance`): the cascade moves only the "
+        "means, and only a Gaussian's own ΔR and Δs change its covariance. They start immediately "
+        "(`update.deltas_start` 0), not after 40 % of the iterations.",
     ),
     Experiment(
         "Tracking: 2D MTE, the best candidate taken, as in the paper", "table 3", "mte_2d_oracle", "% of the diagonal",
@@ -181,13 +184,13 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "adjusted Rand index",
         (ClaimSetting("Ours, 100", DEFAULT, {}), ClaimSetting("Dynamic3DGS, 2000", BASE_2000, {})),
         (Claim("better parts", "Ours, 100", "Dynamic3DGS, 2000", 1),),
-        "The paper shows pictures; the index is against true labels, over the updates of the row.",
+        "The paper only shows pictures; the index compares with true labels, over the updates of the row.",
     ),
 )  # fmt: skip
-"""In the order of the page."""
+"""Experiments in the order of the page."""
 
 Measured = Mapping[tuple[Variant, str], Figures]
-"""Our figures by setting and score, then by capture."""
+"""Maps each setting and score to our figure of each capture."""
 
 AgreementWord = Literal["sign and size", "sign", "no", "not measured"]
 
@@ -197,10 +200,12 @@ class ClaimResult:
     """A claim of the paper next to our figures.
 
     Attributes:
-        paper: the paper's mean gain over the captures that both have; None where it prints none.
-        own: our mean gain over the same captures; None where not measured.
-        captures: over which. same_sign: on how many of them alone the gain points as in the paper.
-        agrees: in sign and size, in sign, or not.
+        claim: the claim.
+        paper: the paper's mean gain over the captures that both have; None if the paper prints no figures.
+        own: our mean gain over the same captures; None if not measured.
+        captures: captures over which the gains are averaged.
+        same_sign: number of these captures whose own gain agrees with the paper.
+        agrees: whether the mean gains agree in sign and size, only in sign, or not.
     """
 
     claim: Claim
@@ -212,7 +217,7 @@ class ClaimResult:
 
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
-    """Returns our figures from the frontier, or from the quality study over the shared updates."""
+    """Returns our figures from the frontier study, or from the quality study over the updates that both have."""
     by_variant: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:
@@ -262,7 +267,7 @@ def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> ClaimResul
 
 
 def _agrees(own: float, paper: float, small: float) -> AgreementWord:
-    """Returns whether two gains agree: both small, or both of the same sign."""
+    """Returns whether two gains agree in sign and size, only in sign, or not; two small gains agree."""
     if abs(own) < small and abs(paper) < small:
         return "sign and size"
     if own * paper <= 0:
@@ -277,7 +282,7 @@ def _sign(value: float, small: float) -> int:
 
 
 def iteration_ratio(points: Sequence[Point]) -> float | None:
-    """Returns the time ratio of the baseline's 100 iterations to ``scas4d``, averaged over captures that have both."""
+    """Returns the time of 100 baseline iterations relative to ``scas4d``, averaged over captures that have both."""
     own = {p.capture: p.seconds for p in points if p.variant == DEFAULT}
     base = {p.capture: p.seconds for p in points if p.variant == BASE_100}
     ratios = [base[name] / own[name] for name in own if name in base]

@@ -11,7 +11,7 @@ from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes, write_page
 
-Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to continue.")]
+Study = Annotated[Path, typer.Option(help="Folder of the study: rows, images, frames 0. A second run continues it.")]
 
 
 @with_capture_options
@@ -24,23 +24,23 @@ def quality(
     ] = None,
     iterations: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Iterations of an update; the preset's when left out. May be repeated."),
+        typer.Option(min=1, help="Iterations per update; default: the preset's. May be repeated."),
     ] = None,
     seed: Annotated[
         list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates, default 0. May be repeated.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; 1 measures frame 0 alone.")] = None,
-    masks: Annotated[bool, typer.Option(help="Give the method the masks; they measure in any case.")] = True,
-    points: Annotated[bool, typer.Option(help="Give the method the initial cloud.")] = True,
-    lpips: Annotated[bool, typer.Option("--lpips", help="Also LPIPS, where its weights are installed.")] = False,
+    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames; 1 measures only frame 0.")] = None,
+    masks: Annotated[bool, typer.Option(help="Give the method the masks; the scores always use them.")] = True,
+    points: Annotated[bool, typer.Option(help="Give the method the initial point cloud.")] = True,
+    lpips: Annotated[bool, typer.Option("--lpips", help="Also measure LPIPS, if its weights are installed.")] = False,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Measures pictures, tracks, parts and seconds of captures; prints a table.
+    """Measures images, tracks, parts and times of captures, and prints a table.
 
-    Reconstructs every capture with every preset, number of iterations and seed, each row in a process of its own, and
-    measures it on the capture's test cameras and ground truth. Rows on disk are not measured again. Leaves table.md,
-    a JSON file a row, a line a frame, and pictures (truth | render | difference) in the study's folder.
+    Reconstructs every capture with every preset, number of iterations and seed, each row in a separate process, and
+    measures it on the capture's test cameras and ground truth. Rows on disk are not measured again. Writes table.md, a
+    JSON file per row, a line per frame, and images (truth | render | difference) to the study's folder.
 
     Example: scripts/bench quality captures/robot --preset scas4d --preset dynamic3dgs --iterations 100
     """
@@ -69,17 +69,17 @@ def refit(
     captures: Captures,
     options: CaptureOptions,
     out: Study = QUALITY,
-    frame: Annotated[int, typer.Option(help="Frame that is fitted; negative ones count from the end.")] = -1,
-    preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
+    frame: Annotated[int, typer.Option(help="Frame to fit; negative numbers count from the end.")] = -1,
+    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
     seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
-    points: Annotated[bool, typer.Option(help="Start from the capture's cloud, that of its first frame.")] = False,
+    points: Annotated[bool, typer.Option(help="Start from the point cloud of the capture's first frame.")] = False,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Fits a later frame from scratch: the ceiling of the updates, with how far they are below it.
+    """Fits a later frame from scratch, as an upper bound for the updates, and reports how far they fall short of it.
 
-    The updates' figures are those of `scripts/bench quality` in the same folder, with the same settings. Leaves
-    refit.md and a JSON file a row in the study's folder.
+    The figures of the updates come from `scripts/bench quality` in the same folder, with the same settings. Writes
+    refit.md and a JSON file per row to the study's folder.
 
     Example: scripts/bench refit captures/visit --frame -1
     """
@@ -102,24 +102,23 @@ def refit(
 def effects(
     captures: Captures,
     options: CaptureOptions,
-    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to continue.")] = Path("out/effects"),
-    name: Annotated[
-        list[str] | None, typer.Option(help="Only this effect, by name; all when left out. May be repeated.")
-    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the study. A second run continues it.")] = Path("out/effects"),
+    name: Annotated[list[str] | None, typer.Option(help="Only this effect; all by default. May be repeated.")] = None,
     pin: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=MODE,NAME=MODE", help="Effects pinned together. May be repeated."),
+        typer.Option(metavar="NAME=MODE,NAME=MODE", help="Effects to pin together. May be repeated."),
     ] = None,
-    preset: Annotated[str, typer.Option(help="Named settings.")] = "scas4d",
+    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
     seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
-    frames: Annotated[int | None, typer.Option(min=2, help="Only so many frames; all when left out.")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="Number of frames; all by default.")] = None,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Compares each effect pinned off, pinned on or removed from the registry with auto: dB, time and bits.
+    """Compares auto with each effect pinned off, pinned on or removed from the registry: dB, time and bits.
 
-    Both are updated in turns from the same frame 0, a file a finished run. Effects that are on in every scene are
-    tried off alone; "removed" shows what one costs that is off. Leaves effects.md in the study's folder.
+    Both are updated in alternation from the same frame 0, and each finished run is stored in a file. Effects that are
+    on in every scene are only tested off. "removed" shows what an effect costs while it is off. Writes effects.md to
+    the study's folder.
 
     Example: scripts/bench effects captures/robot --name entering --name leaving --frames 8
     """
@@ -143,14 +142,14 @@ def effects(
 def switches(
     captures: Captures,
     out: Study = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Of each capture, played forwards and backwards.")] = 50,
+    updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 50,
     seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Updates captures for a while, and says which effects are switched on and off, and when.
+    """Updates captures for a while and reports which effects are switched on and off, and when.
 
-    Leaves switches.md in the study's folder; a capture that was played is not played again.
+    Writes switches.md to the study's folder. Captures that were already played are not played again.
     """
     from studies.quality.switches import run
 
@@ -158,19 +157,19 @@ def switches(
 
 
 def targets(
-    captures: Annotated[Path, typer.Argument(metavar="CAPTURES", help="Folder that holds the captures' folders.")],
+    captures: Annotated[Path, typer.Argument(metavar="CAPTURES", help="Folder that contains the captures.")],
     out: Study = QUALITY,
     run: Annotated[
         list[str] | None,
-        typer.Option(help="Only this run, as scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
+        typer.Option(help="Only this run: scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
     ] = None,
     only: Annotated[list[str] | None, typer.Option(help="Only this capture, by name. May be repeated.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; the table says how many.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, shown in the table.")] = None,
     again: Again = False,
 ) -> None:
-    """Measures every row that the targets need, or some of them; `scripts/bench table` compares them.
+    """Measures every row that the targets need, or some of them; `scripts/bench table` compares them with the targets.
 
-    The costliest runs come last; dynamic3dgs-2000 takes 20 times as long as the others: --frames shortens it.
+    The most expensive runs come last. dynamic3dgs-2000 takes 20 times as long as the others; --frames shortens it.
     """
     from studies.quality.runs import measure_runs
 
@@ -182,38 +181,40 @@ def targets(
 def table(
     study: Annotated[Path, typer.Argument(help="Folder of the study.")] = QUALITY,
     out: Annotated[
-        Path | None, typer.Option(help="Write the whole page here (commands, machine, targets, rows) as Markdown.")
+        Path | None, typer.Option(help="Markdown page to write: commands, machine, targets and rows.")
     ] = None,
 ) -> None:
-    """Prints which targets the measured rows reach, as one Markdown table.
+    """Prints which targets the measured rows reach, as a Markdown table.
 
-    A row counts where its settings are exactly those of today's presets; of several, the one with most frames.
+    A row counts only if its settings equal those of the current presets; of several, the one with the most frames.
     """
     from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
 
     if not study.is_dir():
-        raise typer.BadParameter(f"{study} is no folder; measure first: scripts/bench targets CAPTURES --out {study}")
+        raise typer.BadParameter(
+            f"{study} is not a folder; measure first: scripts/bench targets CAPTURES --out {study}"
+        )
     rows = read_study(study)
     outcomes = compare(rows)
     print(target_table(outcomes))
     print(f"\n{count_words(outcomes)}.")
     if others := left_out(study, rows):
-        print(f"{others} rows of the study are not used: other settings than today's presets, or fewer frames.")
+        print(f"{others} rows of the study are not used: their settings differ, or they have fewer frames.")
     if out is not None:
         write_page(out, page(rows))
 
 
 def processors(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to continue.")] = Path("out/processors"),
-    frames: Annotated[int, typer.Option(min=1, help="Updates of each run.")] = 5,
+    out: Annotated[Path, typer.Option(help="Folder of the study. A second run continues it.")] = Path("out/processors"),
+    frames: Annotated[int, typer.Option(min=1, help="Updates per run.")] = 5,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of the updates, on this processor.")] = 4,
     changes: Changes = None,
 ) -> None:
-    """Compares a capture's result on this processor with that on lesser ones, beside the spread over seeds.
+    """Compares a capture's result on this processor with that on less capable ones, and with the spread over seeds.
 
-    Kernels, numpy and BLAS compute as on a processor with AVX2 alone, and as on one of 2008 (x86-64). Ends with 1
-    where a state has other bits.
+    Kernels, numpy and BLAS compute as on a processor with only AVX2, and as on one of 2008 (x86-64). Exits with 1 if
+    the bits of a state differ.
     """
     from studies.quality import processors as study
 

@@ -1,8 +1,8 @@
 """``scripts/bench effects``: benefit and cost of each effect compared with `auto`, measured in alternation.
 
-Two reconstructions start from the same frame 0 and are updated in turns, frame by frame, in one process: one as
-`auto` decides, one with effects pinned. An effect that waits for evidence is tried "on", "off" and "removed": without
-its line in the registry, which shows what it costs while it is off.
+Two reconstructions start from the same frame 0 and are updated in alternation, frame by frame, in one process. One
+follows `auto`; in the other, effects are pinned. An effect that waits for evidence is tested "on", "off" and "removed",
+that is, without its line in the registry, which shows what it costs while it is off.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from studies.quality.first_frame import first_of
 from studies.quality.settings import settings_of
 
 Pins = Mapping[str, str]
-"""Modes by effect: "on", "off", or "removed"."""
+"""Maps each effect to its mode: "on", "off", or "removed"."""
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -67,14 +67,20 @@ def run(
     """Measures every variant of each capture; prints the table and writes it to ``out/effects.md``.
 
     Args:
-        captures: folders. out: a file a finished run goes here; run again to go on.
-        names: of the effects; none: all, unless there are ``pins``. pins: further variants, effects pinned together.
-        preset, changes: the settings that both share. seeds: of frame 0 and the updates, each tried.
-        frames: only so many; None: all. again: measure anew what ``out`` holds.
-        options: how the captures are read. report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the study, which stores each finished run; a second call continues.
+        names: names of the effects; all if empty, unless there are ``pins``.
+        pins: further variants, each with effects that are pinned together.
+        preset: preset that both reconstructions share.
+        seeds: seeds of frame 0 and the updates, each of which is measured.
+        frames: number of frames; all if None.
+        changes: changes to the settings that both reconstructions share.
+        again: whether to repeat the runs that ``out`` already contains.
+        options: how the captures are read.
+        report: prints the progress.
 
     Raises:
-        ValueError: an unknown effect or setting, a pin that the settings contradict, or fewer than two frames.
+        ValueError: an effect or setting is unknown, the settings contradict a pin, or there are fewer than two frames.
     """
     if frames is not None and frames < 2:
         raise ValueError("effects are compared in updates: give two frames or more")
@@ -118,7 +124,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
 
 
 def pinned(settings: Settings, pins: Pins) -> Settings:
-    """Returns the settings with effects pinned; removed effects are not included.
+    """Returns the settings with effects pinned; removed effects are left out.
 
     Raises:
         ValueError: an effect or a mode is unknown.
@@ -156,7 +162,7 @@ def _row(
     again: bool,
     options: CaptureOptions,
 ) -> Row:
-    """Returns the row of a variant, and measures it if it is missing."""
+    """Returns the row of a variant, measuring it if it is missing."""
     capture = open_measured(folder, options)
     count = min(frames or capture.frame_count, capture.frame_count)
     if count < 2:
@@ -185,7 +191,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
     assert rig is not None
     for index in range(1, count):
         shown = truth.test_frame(index).images
-        for which in (0, 1) if index % 2 else (1, 0):  # the one that comes second finds pictures in the system's cache
+        for which in (0, 1) if index % 2 else (1, 0):  # the second one finds the images in the cache
             frame = capture.frame(index)
             with without(taken[which]):
                 began, spent = perf_counter(), process_time()
@@ -195,7 +201,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
             psnr[which, index - 1] = np.mean(drawn)
         auto, other = (scene.history.newest.arrays() for scene in scenes)
         same &= auto.keys() == other.keys() and all(np.array_equal(auto[key], other[key]) for key in auto)
-    timed = slice(1 if count > 2 else 0, None)  # the first update loads kernels, and looks for the motion
+    timed = slice(1 if count > 2 else 0, None)  # the first update loads kernels and searches for the motion
     report = scenes[0].report
     return {
         "updates": count - 1,
@@ -213,7 +219,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
 
 
 def _words(scene: Reconstruction, pins: Pins) -> str:
-    """Returns the final switches of these effects in auto, and since when they are on."""
+    """Returns the final switches of these effects in auto, and since when they have been on."""
     record: Any = scene.history.report(scene.history.indices[-1]).get("effects", {})
     switches = {name: record[name] for name in pins if name in record}
     return ", ".join(f"on since {one['since']}" if one["on"] else "off" for one in switches.values())

@@ -1,6 +1,6 @@
 """Frame 0, fitted once and shared by all rows of a capture with the same inputs.
 
-What is compared then differs in its updates alone, and only the first row pays for frame 0.
+Rows then differ only in their updates, and only the first row pays for frame 0.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 VERSION = 5
-"""Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
+"""Increase this if frame 0 changes for the same images and settings, so that stored results are fitted again."""
 
 CLOUD_VERSION = 4
-"""The same, where the first cloud is made from the pictures."""
+"""The same, for first clouds that are made from the images."""
 
 ARRAYS = tuple(field.name for field in fields(Gaussians))
 
 
 def first_frame_key(capture: Capture, settings: Settings) -> str:
-    """Names the frame 0 of a capture; the name depends on cameras, pictures, masks, points and settings.
+    """Returns a name for a capture's frame 0, which depends on cameras, images, masks, points and settings.
 
     Args:
-        capture: as the method gets it: without what is withheld.
-        settings: those of the scene and of frame 0 count.
+        capture: capture as the method gets it, without withheld inputs.
+        settings: settings; only those of the scene and of frame 0 matter.
     """
     hasher = hashlib.sha256()
     described = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
@@ -62,7 +62,7 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in ARRAYS if name in file}  # those that are None are not kept
+        arrays = {name: file[name] for name in ARRAYS if name in file}  # arrays that are None are not stored
         names, exposures = file["exposure_names"].tolist(), file["exposures"]
         rows = zip(*(file[f"evidence_{name}"].tolist() for name in ("names", "shares", "texts")), strict=True)
         evidence = {name: Evidence(share, text) for name, share, text in rows}
@@ -92,7 +92,7 @@ def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
 
 
 def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
-    """Returns frame 0 from the folder of a study, fitted once; its settings include the pin of gloss."""
+    """Returns frame 0 from the folder of a study, fitting it on first use; each pin of gloss has its own."""
     key = first_frame_key(capture, settings)
     gloss = settings.effects.get("direction", "auto")
     path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"
@@ -111,7 +111,10 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
     """Returns a reconstruction after frame 0, which is read from the study or fitted and stored on first use.
 
     Args:
-        states: empty folder to commit to; None: in memory.
+        capture: the capture.
+        settings: settings of the reconstruction.
+        out: folder of the study.
+        states: empty folder to commit to; in memory if None.
     """
     static = first_of(capture, out, settings)
     history = History() if states is None else History.open(states)

@@ -1,8 +1,9 @@
-"""``scripts/bench processors``: variation of a capture's result over processors and seeds.
+"""``scripts/bench processors``: variation of a capture's result between processors and seeds.
 
-The first frames of a capture on this processor, on it as one with AVX2 alone, and as one of 2008, where kernels
-(``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``) are concerned; beside them
-other seeds of the updates. Each row runs in a process of its own, frame 0 included; rows on disk are not run again.
+The first frames of a capture run on this processor, as on one with only AVX2, and as on one of 2008. This applies to
+kernels (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``). For comparison,
+other seeds of the updates run as well. Each row runs in a separate process, including frame 0; rows on disk are not
+run again.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ PROCESSORS: Mapping[str, Mapping[str, str]] = {
         "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
     },
 }
-"""What makes this processor compute as a lesser one; an x86-64."""
+"""Environment variables that make this processor, an x86-64, compute like a less capable one."""
 
 
 def run(
@@ -51,15 +52,18 @@ def run(
     """Measures each capture on each target with seed 0, and on this processor with the other seeds.
 
     Args:
-        captures: folders with test cameras. out: folder of the study; run again with the same one to go on.
-        frames: updates of each run. seeds: of the updates, 0 among them. changes: settings, as
-            ``update.iterations=20``.
+        captures: folders of captures with test cameras.
+        out: folder of the study; a second call with the same folder continues.
+        frames: updates per run.
+        seeds: number of seeds of the updates, starting at 0.
+        changes: changes to the settings, such as ``update.iterations=20``.
+        report: prints the progress.
 
     Returns:
         Whether every capture has the same bits on all targets.
 
     Raises:
-        RuntimeError: a run failed; its last words are in the message.
+        RuntimeError: a run failed; the message contains its last line of output.
     """
     store, rows = Store(out), []
     for capture in captures:
@@ -85,7 +89,7 @@ def same_bits(rows: Sequence[Row], capture: str) -> bool:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Returns a line per capture: PSNR in dB by target, whether the bits agree, and the spread over seeds."""
+    """Returns a table with a row per capture: PSNR in dB by target, whether bits agree, and the spread over seeds."""
     lines = [
         f"| capture | {' | '.join(PROCESSORS)} | states | seeds: spread (standard deviation) |",
         "|---" * (len(PROCESSORS) + 3) + "|",
@@ -132,7 +136,7 @@ def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Ro
 
 def _apart(capture: Path, target: Mapping[str, str], frames: int, seed: int, changes: Sequence[str]) -> dict[str, Any]:
     present = os.environ | dict(target)
-    if "NPY_DISABLE_CPU_FEATURES" in target:  # numpy warns of those that are not there
+    if "NPY_DISABLE_CPU_FEATURES" in target:  # numpy warns about missing features
         numpy_core: Any = importlib.import_module("numpy._core._multiarray_umath")
         features: Mapping[str, bool] = numpy_core.__cpu_features__
         wanted = target["NPY_DISABLE_CPU_FEATURES"].split()

@@ -1,9 +1,9 @@
-"""``scripts/bench quality``: scores of pictures, tracks and parts of captures, and seconds per update.
+"""``scripts/bench quality``: scores of images, tracks and parts of captures, and seconds per update.
 
-One row for every capture, preset, number of iterations and seed. Each row runs in a process of its own, so that peak
-memory is that row's; rows that are on disk already are not run again. Rows of a capture with the same settings of
-scene and frame 0 share one frame 0 (``first/`` in the folder of the study); only the first of them fits it. A row that
-was cut off begins again at its frame 0.
+There is one row for every capture, preset, number of iterations and seed. Each row runs in a separate process, so that
+it has its own peak memory; rows on disk are not run again. Rows of a capture with the same settings of scene and frame
+0 share one frame 0 (``first/`` in the folder of the study), which only the first of them fits. An interrupted row
+starts again at frame 0.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
 
 OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
-"""The captures whose mean is reported beside them."""
+"""Captures whose mean is reported as well."""
 LATER = ("scas4d_core.update.", "scas4d_core.robust.", "scas4d_core.structure.")
-"""What the names of constants begin with that frame 0 does not depend on: rows with others share no frame 0."""
+"""Prefixes of constants that do not affect frame 0. Rows with other changed constants share no frame 0."""
 
 
 def run(
@@ -49,26 +49,26 @@ def run(
     """Measures every capture with every preset; prints the table and writes it to ``out/table.md``.
 
     Args:
-        captures: folders; those without test cameras are measured on their training cameras, and the rows say so.
-        out: rows, per-frame lines and pictures go here; run again with the same folder to go on.
-        presets: names.
-        iterations: of an update, each tried; none: the preset's own.
-        seeds: of frame 0 and of the updates, each tried.
-        changes: further settings as ``"update.clusters=[64]"``, JSON behind the sign.
-        frames: only so many frames of each capture; None: all.
+        captures: folders. Captures without test cameras are measured on their training cameras, and their rows say so.
+        out: folder for rows, per-frame lines and images; a second call with the same folder continues.
+        presets: names of the presets.
+        iterations: numbers of iterations per update, each of which is measured; the preset's own if empty.
+        seeds: seeds of frame 0 and of the updates, each of which is measured.
+        changes: further settings, such as ``"update.clusters=[64]"``, with JSON after the sign.
+        frames: number of frames per capture; all if None.
         masks: False withholds the masks from the method.
-        points: False withholds the initial cloud.
-        pictures: frames to save as truth | render | difference; negative ones count from the end.
-        lpips: also LPIPS where its weights are installed.
-        again: measure rows anew that are on disk already.
+        points: False withholds the initial point cloud.
+        pictures: frames to save as truth | render | difference; negative numbers count from the end.
+        lpips: whether to measure LPIPS, if its weights are installed.
+        again: whether to measure rows again that are already on disk.
         options: how the captures are read.
-        report: takes the lines that are printed.
+        report: prints the progress.
 
     Returns:
-        The rows asked for, in order; a failed one has ``error`` and is tried again next time.
+        The requested rows, in order; a failed row has an ``error`` and is retried next time.
 
     Raises:
-        ValueError: an unknown preset or setting, or a value out of range.
+        ValueError: a preset or setting is unknown, or a value is out of range.
     """
     jobs = [
         Job(
@@ -105,7 +105,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
             if "error" in row:
                 report(f"    failed: {row['error']}")
         else:
-            other = "" if row.get("core") == core_version() else ", with other sources of the core"
+            other = "" if row.get("core") == core_version() else ", with another version of the core"
             report(f"[{number}/{len(jobs)}] {job.key}: measured already{other}")
         rows.append(row)
     table = score_tables(with_means(rows), rows)
@@ -115,13 +115,13 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
 
 
 def measure(job: Job, folder: Path, report: Report = print) -> Row:
-    """Measures one capture, from a frame 0 that other rows of the study may have fitted already.
+    """Measures one capture, from a frame 0 that other rows of the study may already have fitted.
 
     Raises:
-        CaptureError: it cannot be read.
+        CaptureError: the capture cannot be read.
     """
     given = job.open_given()
-    # These bring the kernels; the table and the command do not.
+    # These imports load the kernels, which the table and the command do not need.
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 
@@ -141,7 +141,7 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
 def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label: str = "mean of objects") -> list[Row]:
     """Returns the rows, followed by the means of each variant that has all captures in ``over``.
 
-    A variant is what has the same ``variant`` value; only numbers that every row of it has are averaged.
+    Rows with the same ``variant`` value form a variant; only numbers that all of its rows have are averaged.
     """
     result = list(rows)
     for variant in dict.fromkeys(row["variant"] for row in rows if "error" not in row):
@@ -173,7 +173,7 @@ def _apart(job: Job, folder: Path) -> Row:
     try:
         answer: Row = in_a_process(_measured_or_failed, job, folder)
     except BrokenProcessPool:
-        answer = {"error": "its process ended before its time (out of memory, or killed)"}
+        answer = {"error": "its process ended early (out of memory, or killed)"}
     return failed | answer
 
 

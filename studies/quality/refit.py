@@ -1,8 +1,8 @@
-"""``scripts/bench refit``: upper bound for updates, from fitting a later frame alone with the method of frame 0.
+"""``scripts/bench refit``: upper bound for the updates, from fitting a later frame alone with the method of frame 0.
 
-A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. How
-far the updates are below it at that frame says how much is still missing: what no effect explains, what was lost on the
-way. The updates' figures are read from the rows of ``scripts/bench quality`` in the same folder.
+A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. The
+gap to the updates at that frame shows what they still miss: what no effect explains, and what was lost on the way. The
+figures of the updates are read from the rows of ``scripts/bench quality`` in the same folder.
 """
 
 from __future__ import annotations
@@ -51,15 +51,19 @@ def run(
     """Fits a frame of each capture from scratch; prints the table and writes it to ``out/refit.md``.
 
     Args:
-        captures: folders. out: folder of the study of quality. Run again to continue.
-        frame: that is fitted; negative ones count from the end.
-        preset, changes: the settings; ``changes`` as ``"effects.direction=off"``.
-        seeds: of frame 0, each tried.
-        points: start from the capture's cloud, which is that of its first frame; else from the pictures alone.
-        again: fit anew what ``out`` holds. options: how the captures are read. report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the quality study; a second call continues.
+        frame: frame to fit; negative numbers count from the end.
+        preset: preset of settings.
+        seeds: seeds of frame 0, each of which is fitted.
+        points: whether to start from the point cloud of the capture's first frame, instead of the images alone.
+        changes: changes to the settings, such as ``"effects.direction=off"``.
+        again: whether to repeat fits that ``out`` already contains.
+        options: how the captures are read.
+        report: prints the progress.
 
     Raises:
-        ValueError: a frame that a capture does not have, or an unknown setting.
+        ValueError: a capture does not have the frame, or a setting is unknown.
     """
     store, rows = Store(out), list[Row]()
     compile_in_processes()
@@ -85,7 +89,7 @@ def _refitted(
     again: bool,
     options: CaptureOptions,
 ) -> Row:
-    """Returns the row of one frame, and fits it if it is missing."""
+    """Returns the row of one frame, fitting it if it is missing."""
     capture = open_measured(folder, options, use_points=points)
     index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
     if index is None:
@@ -97,7 +101,7 @@ def _refitted(
 
 
 def _measured(capture: Capture, index: int, settings: Settings) -> Row:
-    """Returns the row of a frame that is fitted alone."""
+    """Returns the row of a frame that is fitted on its own."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
     scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
@@ -117,7 +121,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
 
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
-    """Returns the updates' figure for the same frame and its deficit, or nothing if it was not measured."""
+    """Returns the PSNR of the updates at the same frame and its deficit, or nothing if it was not measured."""
     wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])

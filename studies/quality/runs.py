@@ -1,4 +1,4 @@
-"""Runs that the targets need: captures, preset and changes of each. ``scripts/bench targets`` measures them."""
+"""Runs that the targets need, with the captures, preset and changes of each; see ``scripts/bench targets``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from studies.quality.quality import OBJECT_CAPTURES, run_jobs
 from studies.quality.settings import settings_of
 
 CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
-"""Every capture of the targets, by the name of its folder."""
+"""Captures of the targets, by the names of their folders."""
 
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
-"""What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
+"""Settings that a scene itself needs in every run (its Gaussian budget, its floor), never ones that tune a method."""
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
 """The cluster map that is not the default."""
@@ -28,10 +28,13 @@ class Run:
     """One way to reconstruct some captures.
 
     Attributes:
-        captures: names of folders. preset: name. iterations: of an update.
-        changes: further settings, as ``"update.clusters=[64]"``.
-        masks, points: whether the method gets them.
-        frames: only so many frames; None: all.
+        captures: names of the folders.
+        preset: name of the preset.
+        iterations: iterations per update.
+        changes: further settings, such as ``"update.clusters=[64]"``.
+        masks: whether the method gets the masks.
+        points: whether the method gets the initial points.
+        frames: number of frames; all if None.
     """
 
     captures: tuple[str, ...]
@@ -47,7 +50,7 @@ class Run:
         return settings_of(self.preset, self.iterations, changes=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
 
     def job(self, folder: Path, frames: int | None = None) -> Job:
-        """Returns the row of one capture, with at most a number of frames."""
+        """Returns the job that measures one capture, with at most a number of frames."""
         limits = [limit for limit in (frames, self.frames) if limit is not None]
         return Job(
             capture=folder,
@@ -70,7 +73,7 @@ RUNS: Mapping[str, Run] = {
     "other-map": Run(CAPTURES, changes=(f"update.cluster_map={OTHER_MAP}",)),
     "dynamic3dgs-2000": Run(OBJECT_CAPTURES, "dynamic3dgs", 2000),
 }
-"""By name, in the order in which they are measured: the costliest last."""
+"""Runs by name, in the order in which they are measured: the most expensive last."""
 
 
 def measure_runs(
@@ -86,23 +89,23 @@ def measure_runs(
     """Measures runs on the available captures; existing rows are not measured again.
 
     Args:
-        captures: folder of the captures' folders.
+        captures: folder that contains the captures.
         out: folder of the study.
-        names: of ``RUNS``; none: all.
-        only: captures by name; none: all of each run.
-        frames: only so many frames of each; None: all.
-        again: measure rows anew that are on disk.
-        report: takes the lines that are printed.
+        names: names from ``RUNS``; all runs if empty.
+        only: names of captures; all captures of each run if empty.
+        frames: number of frames per capture; all if None.
+        again: whether to measure rows again that are already on disk.
+        report: prints the progress.
 
     Raises:
-        ValueError: an unknown run or capture, or no capture of any run in the folder.
+        ValueError: a run or capture is unknown, or the folder contains no capture of any run.
     """
     for name in names:
         if name not in RUNS:
-            raise ValueError(f"run {name!r} is unknown; choose of {', '.join(RUNS)}")
+            raise ValueError(f"run {name!r} is unknown; choose from {', '.join(RUNS)}")
     for name in only:
         if name not in CAPTURES:
-            raise ValueError(f"capture {name!r} has no targets; choose of {', '.join(CAPTURES)}")
+            raise ValueError(f"capture {name!r} has no targets; choose from {', '.join(CAPTURES)}")
     jobs: list[Job] = []
     missing: dict[str, None] = {}
     for name in names or RUNS:
@@ -114,21 +117,21 @@ def measure_runs(
             else:
                 missing[capture] = None
     for capture in missing:
-        report(f"{captures / capture}: no such folder; left out")
+        report(f"{captures / capture}: no such folder; skipped")
     if not jobs:
-        raise ValueError(f"{captures} holds none of the captures asked for; give the folder that holds their folders")
+        raise ValueError(f"{captures} contains none of the requested captures; give their parent folder")
     return run_jobs(jobs, out, again=again, report=report)
 
 
 FIRST_FRAME = "scas4d_core.first_frame."
-"""The room of the constants that frame 0 depends on."""
+"""Prefix of the constants on which frame 0 depends."""
 
 
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
-    """Returns the stored rows with these settings by run and capture; if there are several, the longest.
+    """Returns the stored row of each run and capture that has the run's settings; of several rows, the longest.
 
-    A row belongs to a run where its settings are, to the last number, those the run has today; where only frame 0 is
-    asked for, those of updates do not count.
+    A row belongs to a run if its settings equal the run's current settings exactly. If only frame 0 is needed, the
+    settings of updates do not matter.
     """
     rows = [row for row in store.rows() if "error" not in row]
     by_run: dict[tuple[str, str], Row] = {}

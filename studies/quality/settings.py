@@ -1,4 +1,4 @@
-"""Settings of a study's row: a preset, its iterations and seed, and changes as text."""
+"""Settings of a study's row: a preset, its iterations and seed, and changes given as text."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def settings_of(
     """Returns a preset with changes, without a time limit for frame 0, so that results do not depend on machine load.
 
     Args:
-        name: of the preset.
-        iterations: of an update; the preset's where None.
-        seed: of frame 0 and of the updates.
-        changes: as ``"update.clusters=[64]"``; they go over all else.
+        name: name of the preset.
+        iterations: iterations per update; the preset's if None.
+        seed: seed of frame 0 and of the updates.
+        changes: changes such as ``"update.clusters=[64]"``, which override everything else.
 
     Raises:
-        ValueError: an unknown preset or setting, or a value out of range.
+        ValueError: the preset or a setting is unknown, or a value is out of range.
     """
     own: dict[str, Any] = {"static": {"seed": seed, "seconds": None}, "update": {"seed": seed}}
     if iterations is not None:

@@ -1,6 +1,6 @@
 """``scripts/bench switches``: the effects that a stream activates, and how often each is switched.
 
-A capture is played forwards and backwards, so that a stream may be longer than the capture.
+A capture is played back and forth, so that a stream may be longer than the capture.
 """
 
 from __future__ import annotations
@@ -46,9 +46,14 @@ def run(
     """Updates each capture for a number of frames, prints the table and writes it to ``out/switches.md``.
 
     Args:
-        captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
-        preset, changes: the settings. seeds: of frame 0 and the updates, each tried. again: measure anew.
-        report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the study, which stores each finished run; a second call continues.
+        updates: updates per capture.
+        preset: preset of settings.
+        seeds: seeds of frame 0 and the updates, each of which is measured.
+        changes: changes to the settings.
+        again: whether to repeat finished runs.
+        report: prints the progress.
     """
     rows = []
     for folder in captures:
@@ -80,7 +85,7 @@ def _row(folder: Path, out: Path, key: str, settings: Settings, seed: int, updat
 
 
 def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Row:
-    """Returns the switches of the effects that need evidence."""
+    """Plays a capture and returns the switches of the effects that need evidence."""
     scene = started(capture, settings, out)
     auto = [name for name in EFFECTS if effect(name).auto]
     on = [{name: bool(scene.history.report(0)["effects"].get(name, {}).get("on")) for name in auto}]

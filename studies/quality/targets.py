@@ -1,4 +1,4 @@
-"""The targets of the method, as data, compared with measured rows."""
+"""Targets of the method, as data, and their comparison with measured rows."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ from studies.quality.quality import OBJECT_CAPTURES
 from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
 
 KERNELS = "kernels"
-"""Stands for the study of ``studies.kernels`` where a target names a run."""
+"""Name that a target uses in place of a run for the study of ``studies.kernels``."""
 MAPS = f"the {preset('scas4d').update.cluster_map} cluster map over the {OTHER_MAP} one"
 K1 = ("clusters-64", "clusters-320", "clusters-1280")
 
 Rows = Mapping[tuple[str, str], Row]
-"""By run and capture."""
+"""Rows by run and capture."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """One figure to be reached.
+    """A figure to reach.
 
     Attributes:
-        what: in words.
-        run: of ``RUNS``, or ``KERNELS``.
-        metric: name of a value in the row; "psnr" is taken over the updates that all compared rows have, "loss" and
-            "loss_worst" are what the updates lose against frame 0, their mean and their worst.
-        captures: each of them has to reach it, or their mean.
-        sense: how the figure has to lie to the threshold.
-        threshold: in ``unit``; None: the figure is only reported.
-        over: the figure is the difference to the best of these runs (higher is better).
-        mean: of the captures.
+        what: description of the figure.
+        run: name from ``RUNS``, or ``KERNELS``.
+        metric: name of a value in the row. "psnr" is averaged over the updates that all compared rows have. "loss" and
+            "loss_worst" are the mean and the worst loss of the updates against frame 0.
+        captures: captures that must each reach the target, or whose mean must reach it.
+        sense: how the figure must compare with the threshold.
+        threshold: threshold in ``unit``; if None, the figure is only reported.
+        unit: unit of the figure.
+        over: if given, the figure is the difference to the best of these runs (higher is better).
+        mean: whether the mean over the captures is compared.
     """
 
     what: str
@@ -114,7 +115,7 @@ TARGETS: tuple[Target, ...] = (
     Target("update over its rasterizer passes", KERNELS, "ratio_update", ("robot",), "≤", 3.0, "×"),
     Target("peak memory of a run, frame 0 included", KERNELS, "peak_mb", ("robot",), "<", 1500.0, "MB"),
 )  # fmt: skip
-"""In the order of the table."""
+"""Targets in the order of the table."""
 
 
 @dataclass(frozen=True)
@@ -122,10 +123,12 @@ class Verdict:
     """One line of the table.
 
     Attributes:
-        capture: name, or "mean of …". value: the figure, None where not all of it is measured.
-        parts: the figures of the run and of what it is compared with, where the target is a difference.
-        updates: how many updates the figure covers, in words; "frame 0" where none.
-        reached: None where there is no figure or no threshold.
+        target: the target.
+        capture: name of the capture, or "mean of …".
+        value: the figure; None if a part of it is not measured.
+        parts: figures of the run and of the run it is compared with, if the target is a difference.
+        updates: number of updates that the figure covers, as text; "frame 0" if there are none.
+        reached: whether the target is reached; None without a figure or threshold.
     """
 
     target: Target
@@ -137,7 +140,7 @@ class Verdict:
 
     @property
     def word(self) -> str:
-        """Returns the text of the verdict."""
+        """Text of the verdict."""
         if self.value is None:
             return "not measured"
         return "" if self.reached is None else "reached" if self.reached else "**missed**"
@@ -153,7 +156,7 @@ class Figure:
 
 
 def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
-    """Evaluates every target, with one verdict per capture, or one for a mean."""
+    """Evaluates every target, with one verdict per capture, or one verdict for a mean."""
     verdicts = []
     for target in targets:
         figures = {capture: figure_of(target, capture, rows) for capture in target.captures}
@@ -183,7 +186,7 @@ def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
 
 
 def target_table(verdicts: Sequence[Verdict]) -> str:
-    """Formats the measured verdicts as a Markdown table, and lists the others in a sentence."""
+    """Formats the measured verdicts as a Markdown table and lists the others in a sentence."""
     lines = ["| figure | capture | target | measured | | updates |", "|---|---|---|---|---|---|"]
     for verdict in verdicts:
         if verdict.value is None:
@@ -215,7 +218,7 @@ def count_words(verdicts: Sequence[Verdict]) -> str:
 
 
 def read_study(folder: Path) -> dict[tuple[str, str], Row]:
-    """Reads the rows of the runs in a study's folder and, if available, those of the kernel study."""
+    """Returns the rows of the runs in a study's folder and, if available, those of the kernel study."""
     rows = measured_runs(Store(folder))
     file = folder / f"{KERNELS}.json"
     if file.exists():
@@ -231,7 +234,7 @@ def left_out(folder: Path, rows: Rows) -> int:
 
 
 def page(rows: Rows) -> str:
-    """Returns the documentation page: commands, machine, date, the table of the targets, and the underlying rows."""
+    """Returns the page with commands, machine, date, the table of the targets, and the underlying rows."""
     verdicts = compare(rows)
     known = list(rows.values())
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
@@ -242,7 +245,7 @@ def page(rows: Rows) -> str:
     return f"""# Quality
 
 Pictures, tracks and parts on the test cameras and ground truth of the captures, against targets. These commands measure
-the rows and write the page; rows that are measured already are kept (`CAPTURES` holds the captures' folders):
+the rows and write the page; rows that are already measured are kept (`CAPTURES` is the folder of the captures):
 
 ```
 scripts/bench targets CAPTURES
@@ -266,7 +269,7 @@ of the metrics: `scas4d_core/metrics/`.
 
 ## Rows
 
-Runs of the default preset. The store has those of the baseline and of changed settings, and seconds by stage.
+Runs of the default preset. The store also has those of the baseline and of changed settings, and seconds per stage.
 
 {markdown(behind) if behind else "None yet."}
 """
@@ -286,7 +289,7 @@ def _value(row: Row, metric: str, updates: int) -> float | None:
 
 
 def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
-    """Returns the updates that a figure covers; those of each row if values do not use the shared ones."""
+    """Returns the updates that a figure covers, as text; those of each row if values do not use the shared ones."""
     if metric == "psnr_first":
         return "frame 0"
     if "capture_frames" not in rows[0]:
@@ -313,7 +316,7 @@ def _verdict(target: Target, capture: str, figure: Figure | None) -> Verdict:
 
 
 def _reached(target: Target, value: float) -> bool | None:
-    """Compares figures as measured, without the rounding of the table."""
+    """Compares the figure as measured, without the rounding of the table."""
     if target.threshold is None:
         return None
     return {

@@ -1,6 +1,6 @@
 """``scripts/bench calibration``: what frame 0 reports about faulty rigs, and the benefit of refining them.
 
-Faults are put into the calibration; the pictures stay. Test cameras keep theirs.
+Faults are added to the calibration; the images do not change. Test cameras keep their calibration.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FAULTS = (
     ("across", 1.0), ("down", 1.0), ("across", 2.0), ("down", 2.0), ("across", 4.0), ("down", 4.0), ("centre", 2.0),
     ("focal", 0.01),
 )  # fmt: skip
-"""Of one camera after the other: turns by pixels across and down, the principal point, the focal length."""
+"""Faults of one camera at a time: rotations by pixels across and down, the principal point, the focal length."""
 MEASURED = (
     Column("capture", "capture"),
     Column("fault", "fault"),
@@ -40,7 +40,7 @@ MEASURED = (
     Column("others named", "others", "d"),
 )
 RIGS = (("right", 0.0), ("one", 2.0), ("one", 4.0), ("all", 1.0), ("all", 2.0), ("all", 4.0))
-"""Frame 0 is fitted to: one camera turned across by so many pixels; all turned at random, by about so many."""
+"""Rigs to which frame 0 is fitted: one camera rotated across by these pixels, or all at random by about as many."""
 FITTED = (
     Column("capture", "capture"),
     Column("rig", "rig"),
@@ -55,8 +55,10 @@ def faulty(camera: Camera, kind: str, size: float) -> Camera:
     """Returns a camera with a fault in its calibration.
 
     Args:
-        kind: "across" and "down": turned by ``size`` pixels; "centre": its principal point is off by so many; "focal":
-            its focal length by this share.
+        camera: the camera.
+        kind: "across" and "down" rotate the camera by ``size`` pixels; "centre" shifts its principal point by ``size``
+            pixels; "focal" increases its focal length by the fraction ``size``.
+        size: size of the fault.
     """
     lens, pose = camera.intrinsics.copy(), camera.world_to_camera.copy()
     if kind in ("across", "down"):
@@ -92,8 +94,12 @@ def run(
     """Measures each capture, prints two tables and writes them to ``out/calibration.md``.
 
     Args:
-        captures: folders. out: a file a finished run goes here; run again to go on. fit: also frame 0 of faulty rigs.
-        changes: to the settings. again: measure anew. report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the study, which stores each finished run; a second call continues.
+        fit: whether to also fit frame 0 to faulty rigs.
+        changes: changes to the settings.
+        again: whether to repeat finished runs.
+        report: prints the progress.
     """
     measured_rows, fitted = [], []
     for folder in captures:
@@ -125,7 +131,7 @@ def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
 
 
 def _measured(name: str, matches: Matches) -> list[Row]:
-    """Returns the residuals of the given rig, and of each camera in turn with each fault."""
+    """Returns the residuals of the given rig, and of each camera in turn with each of the faults."""
     given, off = measure_residuals(matches)
     known = np.array([fit.pixels for fit in given.values()])
     rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]

@@ -11,7 +11,7 @@ from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes
 
-Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to continue.")]
+Study = Annotated[Path, typer.Option(help="Folder of the study: rows, images, frames 0. A second run continues it.")]
 
 
 @with_capture_options
@@ -19,14 +19,14 @@ def rigs(
     captures: Captures,
     options: CaptureOptions,
     out: Study = QUALITY,
-    frames: Annotated[int, typer.Option(min=1, help="At most so many.")] = 20,
-    longer: Annotated[int, typer.Option(min=64, help="Pixels along the longer side of the largest picture.")] = 480,
+    frames: Annotated[int, typer.Option(min=1, help="Maximum number of frames.")] = 20,
+    longer: Annotated[int, typer.Option(min=64, help="Longer side of the largest image in pixels.")] = 480,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Reconstructs captures of other rigs with default settings: seconds of frame 0, and a camera held out.
+    """Reconstructs captures of other rigs with default settings: seconds of frame 0, and scores of a held-out camera.
 
-    Leaves rigs.md and a JSON file a row in the study's folder.
+    Writes rigs.md and a JSON file per row to the study's folder.
 
     Example: scripts/bench rigs captures/fly --frames 15
     """
@@ -38,15 +38,15 @@ def rigs(
 def drift(
     captures: Captures,
     out: Study = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Of each capture.")] = 14,
-    pixels: Annotated[float, typer.Option(min=0, help="Of the files, that a camera drifts by in a frame.")] = 0.3,
-    most: Annotated[float, typer.Option(min=0, help="Of the files, that it drifts by in all.")] = 4.0,
+    updates: Annotated[int, typer.Option(min=1, help="Updates per capture.")] = 14,
+    pixels: Annotated[float, typer.Option(min=0, help="Drift of a camera per frame, in pixels of the files.")] = 0.3,
+    most: Annotated[float, typer.Option(min=0, help="Largest drift of a camera, in pixels of the files.")] = 4.0,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Updates captures of which two cameras drift, or none, with the effect pose_drift and without.
+    """Updates captures in which two cameras drift, or none, with and without the effect pose_drift.
 
-    Leaves drift.md in the study's folder; a run that was measured is not measured again.
+    Writes drift.md to the study's folder. Runs that were already measured are not repeated.
     """
     from studies.rigs.pose_drift import run
 
@@ -56,13 +56,13 @@ def drift(
 def calibration(
     captures: Captures,
     out: Study = QUALITY,
-    fit: Annotated[bool, typer.Option(help="Fit frame 0 to rigs with faults, as given and refined.")] = True,
+    fit: Annotated[bool, typer.Option(help="Fit frame 0 to faulty rigs, as given and refined.")] = True,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Puts faults into calibrations: what frame 0 reports of each, and what refining them is worth.
+    """Adds faults to calibrations, and measures what frame 0 reports about each and how much refinement helps.
 
-    Leaves calibration.md in the study's folder; a fit that was measured is not measured again.
+    Writes calibration.md to the study's folder. Fits that were already measured are not repeated.
     """
     from studies.rigs.calibration import run
 

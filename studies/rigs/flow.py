@@ -1,8 +1,8 @@
 """Comparison of tracks with optical flow, for captures without ground truth.
 
-Corners of frame 0 are followed in each camera by themselves (Lucas-Kanade, kept where following them back leads to
-where they came from), and as tracks of the scene. A track that is right stays on its corner; and where a second camera
-sees the same point, its own corner stays on the epipolar line of the first one's.
+Corners of frame 0 are followed in each camera independently (Lucas-Kanade, kept if following them back returns to the
+start), and as tracks of the scene. A correct track stays on its corner. If a second camera sees the same point, its own
+corner stays on the epipolar line of the first camera's corner.
 """
 
 from __future__ import annotations
@@ -23,26 +23,28 @@ Float = NDArray[np.float64]
 Grey = Sequence[NDArray[np.uint8]]
 
 CORNERS, APART = 400, 4
-"""Corners of a picture at most, and pixels between them."""
+"""Maximum number of corners per image, and minimum distance between them in pixels."""
 MOVING = 2.0
-"""Pixels from frame 0 to the last that a corner must go: a static one says nothing of tracks."""
+"""Pixels that a corner must move from frame 0 to the last frame, because static ones say nothing about tracks."""
 BACK = 0.5
-"""Pixels by which a corner may miss where it came from, followed back frame by frame."""
+"""Largest error in pixels when a corner is followed back to the previous frame."""
 SAME = 0.01
-"""Of the distance: what two cameras see at a pixel is one point where it is no farther apart."""
+"""Largest distance, as a fraction of the depth, between the points that two cameras see if they are the same."""
 FEWEST = 20
-"""Positions, over points and frames, from which a median is taken."""
+"""Fewest positions, over points and frames, from which a median is computed."""
 
 
 def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row:
-    """Returns the median pixel error of tracks at moving corners, that of epipolar lines, and the number of corners.
+    """Returns the median errors of tracks at moving corners and of epipolar lines, and the number of corners.
 
     Args:
-        scene: has committed ``count`` frames. capture: as rendered; its training cameras are asked.
+        scene: scene with ``count`` committed frames.
+        capture: capture in the rendered resolution, whose training cameras are used.
+        count: number of frames.
 
     Returns:
-        ``flow_px``, ``epipolar_px`` (pixels of the pictures of ``capture``; None of too few, or where
-        most are lost) and ``flow_points``.
+        ``flow_px`` and ``epipolar_px``, in pixels of the images of ``capture``, each None if there are too few
+        positions or most are lost; and ``flow_points``.
     """
     rig, indices = capture.rig, list(range(count))
     films: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in rig.names}
@@ -73,10 +75,11 @@ def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row
 
 
 def followed(film: Grey, start: Float) -> Float:
-    """Tracks points through the pictures [T] of a camera: [T, Q, 2] pixels; NaN after a point is lost.
+    """Tracks points through the images of a camera; returns [T, Q, 2] pixels, NaN after a point is lost.
 
     Args:
-        film: grey pictures [H, W]. start: [Q, 2] pixels in the first, in which the middle of the first pixel is 0.5.
+        film: T grey images [H, W].
+        start: [Q, 2] pixels in the first image, where the centre of the first pixel is at 0.5.
     """
     paths = np.full((len(film), len(start), 2), np.nan)
     paths[0] = start
@@ -95,24 +98,28 @@ def followed(film: Grey, start: Float) -> Float:
 def _flow(
     picture: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Returns the positions [Q, 2] of points in the next picture, and [Q] whether they were found."""
+    """Returns the positions [Q, 2] of points in the next image, and [Q] whether they were found."""
     where, status, _ = cv2.calcOpticalFlowPyrLK(picture, after, points, points.copy())
     return np.asarray(where, np.float32), np.asarray(status).ravel() > 0
 
 
 def _corners(film: Grey) -> Float:
-    """Returns [T, Q, 2] corners of the first picture that move and are tracked to the last picture."""
-    start = np.asarray(cv2.goodFeaturesToTrack(film[0], CORNERS, 0.01, APART), np.float64)  # of None, NaN
+    """Returns [T, Q, 2] corners of the first image that move and can be tracked to the last image."""
+    start = np.asarray(cv2.goodFeaturesToTrack(film[0], CORNERS, 0.01, APART), np.float64)  # None becomes NaN
     paths = followed(film, start.reshape(-1, 2) + 0.5 if start.ndim else np.zeros((0, 2)))
     moves = np.linalg.norm(paths[-1] - paths[0], axis=1) >= MOVING  # False for NaN
     return paths[:, moves]
 
 
 def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Float, flow: Float, film: Grey) -> Float:
-    """Returns the pixel distances of a second camera's corners from the first one's epipolar lines, frame by frame.
+    """Returns the pixel distances of a second camera's corners from the first one's epipolar lines, in all frames.
 
     Args:
-        points: [Q, 3] in frame 0. flow: [T, Q, 2] in the first camera. film: of the second.
+        scene: the reconstructed scene.
+        pair: first and second camera.
+        points: [Q, 3] points in frame 0.
+        flow: [T, Q, 2] pixels in the first camera.
+        film: images of the second camera.
     """
     first, second = pair
     uv, depth = second.project(points)
@@ -120,7 +127,7 @@ def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Floa
     if not inside.any():
         return np.zeros(0)
     shown = scene.tracks_of_pixels(second, uv[inside], 0, [0]).positions[0]
-    near = np.linalg.norm(shown - points[inside], axis=1) < SAME * depth[inside]  # False for NaN: nothing is met there
+    near = np.linalg.norm(shown - points[inside], axis=1) < SAME * depth[inside]  # False for NaN, where nothing is hit
     rows = np.flatnonzero(inside)[near]
     other = followed(film, uv[rows])[1:]
     ones = np.ones((*flow.shape[:2], 1))[1:, rows]

@@ -1,7 +1,7 @@
 """``scripts/bench drift``: captures with two drifting cameras, with and without pose tracking.
 
-The pictures of a drifting camera are those that it would take if it turned: a turn needs no depth. One turns across,
-one down, by so many pixels a frame and up to so many. Test cameras stand.
+The images of a drifting camera are those that it would take if it rotated, because a rotation needs no depth. One
+camera rotates across and one down, by a number of pixels per frame, up to a maximum. Test cameras do not move.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ COLUMNS = (
     Column("found", "found"),
 )
 WAYS = ("stand", "drift")
-"""Of the cameras."""
+"""Whether the cameras stand or drift."""
 MODES = ("off", "auto")
-"""Of the effect."""
+"""Modes of the effect."""
 
 
 def run(
@@ -62,9 +62,14 @@ def run(
     """Updates each capture in four ways, prints the table and writes it to ``out/drift.md``.
 
     Args:
-        captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
-        pixels: of the capture's files that a camera drifts by in a frame. most: in all.
-        changes: to the settings. again: measure anew. report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the study, which stores each finished run; a second call continues.
+        updates: updates per capture.
+        pixels: drift of a camera per frame, in pixels of the capture's files.
+        most: largest drift, in pixels of the capture's files.
+        changes: changes to the settings.
+        again: whether to repeat finished runs.
+        report: prints the progress.
     """
     rows = []
     for folder in captures:
@@ -115,7 +120,7 @@ def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tu
 
 
 def _pixels(scene: Reconstruction, name: str, twist: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns [3] pixel offsets of the reconstruction's pictures, for content at the distance of the rig's middle."""
+    """Returns [3] pixel offsets in the reconstruction's images, for content as far away as the rig's centre."""
     camera = scene.rig[name]
     return pixel_offset(CameraArrays.of(camera).lens, twist, float(np.linalg.norm(camera.centre)))
 
@@ -125,7 +130,7 @@ def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
 
 
 def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float64]]) -> Frame:
-    """Returns a frame with some cameras rotated by pixels across, down and around the axis (``pixel_offset``)."""
+    """Returns a frame with some cameras rotated by pixels across, down and around its axis (``pixel_offset``)."""
     frame = capture.frame(index)
     images, masks = dict(frame.images), dict(frame.masks)
     for name, offset in offsets.items():
@@ -138,7 +143,7 @@ def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float6
 def _seen(
     picture: NDArray[np.uint8], camera: Camera, offset: NDArray[np.float64], order: Literal[0, 3]
 ) -> NDArray[np.uint8]:
-    """Resamples a picture [H, W] or [H, W, 3] for a rotated camera, with splines of an order and repeated borders."""
+    """Resamples an image [H, W] or [H, W, 3] for a rotated camera, using splines and repeated borders."""
     twist = np.concatenate([np.zeros(3), turn_from_pixels(CameraArrays.of(camera).lens) @ offset])
     back = camera.intrinsics @ twist_to_matrix(twist)[:3, :3].T @ np.linalg.inv(camera.intrinsics)
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

@@ -1,9 +1,10 @@
 """``scripts/bench rigs``: captures of third-party rigs, read from their folders, with default settings.
 
-Frame 0 has its limit of time here, for its seconds are what is asked: run it on a machine that does nothing else. With
-five cameras or more one is held out, and its picture compared with the nearest training picture, shown in its place.
-Of all, tracks are held against optical flow (``flow.py``).
-A folder's ``joints.npz`` (``points3d`` [T, J, 3], in the world of the calibration) is followed by tracks from frame 0.
+Frame 0 keeps its time limit, because its duration is measured; run the study on an otherwise idle machine. With five or
+more cameras, one is held out. Its image is also compared with the nearest training image shown in its place. In all
+captures, tracks are compared with optical flow (``flow.py``).
+If a folder has a ``joints.npz`` (``points3d`` [T, J, 3], in the calibration's world), tracks follow its points from
+frame 0.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
 
 ENOUGH_TO_HOLD_OUT = 5
-"""Cameras from which one is held out: of fewer each one sees what no other does."""
+"""Number of cameras from which one is held out; with fewer, each one sees something that no other sees."""
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -73,11 +74,14 @@ def run(
     """Reconstructs captures; prints the table and writes it to ``out/rigs.md``.
 
     Args:
-        captures: folders. out: folder of the study. Run again to continue.
-        frames: at most so many. longer: pixels along the longer side of the largest picture, at most.
-        changes: settings as ``"static.seconds=60"``. again: measure anew what ``out`` holds.
-        options: how the captures are read; ``options.test`` holds these cameras out in place of the middle one.
-        report: takes the printed lines.
+        captures: folders of the captures.
+        out: folder of the study; a second call continues.
+        frames: maximum number of frames.
+        longer: largest length of the longer side of the largest image, in pixels.
+        changes: changes to the settings, such as ``"static.seconds=60"``.
+        again: whether to repeat rows that ``out`` already contains.
+        options: how the captures are read; ``options.test`` names the cameras to hold out instead of the middle one.
+        report: prints the progress.
     """
     store, rows = Store(out), list[Row]()
     compile_in_processes()
@@ -97,7 +101,7 @@ def run(
 def measured(
     folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str], pictures: Path
 ) -> Row:
-    """Returns the row of one capture; arguments as in ``run``, ``pictures`` gets truth, rendering and difference."""
+    """Returns the row of one capture; arguments as in ``run``, ``pictures`` receives truth, render and difference."""
     names = options.open(folder).full_rig.names
     if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
         options = replace(options, test=(names[len(names) // 2],))
@@ -163,7 +167,7 @@ def _psnr(scene: Reconstruction, rig: Rig, frame: Frame) -> float:
 
 
 def _nearest_psnr(truth: Capture, unseen: Rig, index: int) -> float:
-    """Returns the mean PSNR in dB if each held-out picture is replaced by that of the nearest training camera."""
+    """Returns the mean PSNR in dB if each held-out image is replaced with that of the nearest training camera."""
     pictures, seen, scores = truth.test_frame(index).images, truth.frame(index).images, []
     centres = np.array([camera.centre for camera in truth.rig.cameras])
     for camera in unseen.cameras:
@@ -174,7 +178,7 @@ def _nearest_psnr(truth: Capture, unseen: Rig, index: int) -> float:
 
 
 def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Resizes a picture [H, W, 3] with nearest-neighbour sampling."""
+    """Resizes an image [H, W, 3] with nearest-neighbour sampling."""
     lines, columns = (np.arange(want) * have // want for want, have in zip(shape[:2], image.shape[:2], strict=True))
     resized: NDArray[np.uint8] = image[lines[:, None], columns[None]]
     return resized
@@ -193,7 +197,7 @@ def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:
             for camera in rig.cameras
         ]
     )
-    lost = np.isnan(error)  # what carried it has left the scene
+    lost = np.isnan(error)  # the Gaussian that carried it has left the scene
     error = np.where(lost, np.inf, error)
     return {
         "joints_px": float(np.median(error[:, 1:])),

@@ -1,1 +1,1 @@
-"""A service under study: its process, the frames sent to it, and scenarios."""
+"""A running service under study: its process, the frames sent to it, and scenarios."""

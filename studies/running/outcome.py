@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class ScenarioResult:
-    """A fault, its target and the outcome; with `faults`, the target is missed."""
+    """A fault, its target and the outcome; the target is missed if there are `faults`."""
 
     name: str
     target: str

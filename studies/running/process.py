@@ -1,4 +1,4 @@
-"""A service in its own process, which can be killed, and the requests that studies need."""
+"""A service in a separate process, which can be killed, and the requests that studies need."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def wait_until(done: Callable[[], bool], fault: str, seconds: float = PATIENCE_S
     """Waits until a condition holds.
 
     Raises:
-        StudyError: with the fault, where it does not within so long.
+        StudyError: the condition does not hold within ``seconds``; the message is ``fault``.
     """
     until = time.monotonic() + seconds
     while not done():
@@ -46,7 +46,8 @@ class Service:
     """A service on one data folder; `start` and `kill` may be called repeatedly.
 
     Args:
-        data: its folder. environment: further variables, as SCAS4D_TOKEN.
+        data: data folder of the service.
+        environment: additional environment variables, such as SCAS4D_TOKEN.
     """
 
     def __init__(self, data: Path, environment: Mapping[str, str] | None = None) -> None:
@@ -63,12 +64,12 @@ class Service:
 
     @property
     def pid(self) -> int:
-        """Process id of the service that answers."""
+        """Process id of the service."""
         assert self._process is not None
         return self._process.pid
 
     def start(self) -> None:
-        """Starts the service and waits until it answers."""
+        """Starts the service and waits until it is ready."""
         program = [sys.executable, "-m", "client.cli.main", "serve"]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self._process = subprocess.Popen(
@@ -80,7 +81,7 @@ class Service:
                 if self.http.get("/health/ready").status_code == 200:
                     return
             if self._process.poll() is not None or time.monotonic() > until:
-                raise StudyError(f"the service does not start; {self.data.name}.log beside its folder says why")
+                raise StudyError(f"the service does not start; see {self.data.name}.log next to its folder")
             time.sleep(EVERY_S)
 
     def kill(self) -> None:
@@ -123,7 +124,7 @@ class Service:
             raise StudyError(answer.text)
 
     def put(self, scene: str, index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes]) -> httpx.Response:
-        """Sends one frame, with one attempt."""
+        """Sends one frame without retries."""
         body = b"".join(frame_chunks(index, images, masks))
         return self.http.put(
             f"/v1/scenes/{scene}/frames/{index}", content=body, headers={"Content-Type": FRAME_MEDIA_TYPE}
@@ -142,7 +143,7 @@ class Service:
         return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"type":"worker_died"')
 
     def finish(self, scene: str, frames: int, every: float = EVERY_S) -> SceneStatus:
-        """Waits until a number of frames are finished, with a given polling interval."""
+        """Waits until a number of frames are finished, polling every ``every`` seconds."""
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             status = self.status(scene)

@@ -1,4 +1,4 @@
-"""Frames of a service study, their sender, and the compared states."""
+"""Frames of a service study, their sender, and the comparison of states."""
 
 from __future__ import annotations
 
@@ -28,11 +28,14 @@ Files = tuple[dict[str, bytes], dict[str, bytes]]
 
 @dataclass(frozen=True)
 class Study:
-    """Frames to be sent, and the service that receives them.
+    """Frames to send, and the service that receives them.
 
     Attributes:
-        folder: for data folders and logs. frames: encoded pictures and masks of each. settings: of the scene.
-        environment: of the service.
+        folder: folder for data folders and logs.
+        capture: capture of the frames.
+        frames: encoded images and masks of each frame.
+        settings: settings of the scene.
+        environment: environment variables of the service.
     """
 
     folder: Path
@@ -42,20 +45,20 @@ class Study:
     environment: Mapping[str, str]
 
     def service(self, name: str, environment: Mapping[str, str] | None = None) -> Service:
-        """Creates a service on a new folder; `environment` is added to its environment."""
+        """Creates a service on an empty folder; `environment` is added to its environment."""
         data = self.folder / name
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
         return Service(data, {**self.environment, **(environment or {})})
 
     def create(self, service: Service, **more: Any) -> str:
-        """Creates a scene that keeps all its pictures."""
+        """Creates a scene that keeps all its images."""
         rules = {"keep_frames": {}, "queue_frames": 100, **more}
         return service.create(self.capture.full_rig, self.settings, ingest=rules)
 
 
 def encoded_frames(capture: Capture, count: int) -> list[Files]:
-    """Returns a number of frames of a capture, played back and forth if it is too short to keep motion smooth."""
+    """Returns a number of frames of a capture, which is played back and forth if it is too short."""
     indices = [ping_pong(number, capture.frame_count) for number in range(count)]
     read = {index: _files(capture, index) for index in dict.fromkeys(indices)}
     return [read[index] for index in indices]
@@ -69,7 +72,7 @@ def _files(capture: Capture, index: int) -> Files:
 
 
 def digests(states: Path) -> dict[int, str]:
-    """Returns a SHA-256 over all arrays of each committed state, and the decisions in its report."""
+    """Returns, for each committed state, a SHA-256 over its arrays and the decisions in its report."""
     history = History.load(states)
     by_frame = {}
     for index in history.indices:
@@ -84,7 +87,7 @@ def digests(states: Path) -> dict[int, str]:
 
 
 def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence[int] = ()) -> list[str]:
-    """Returns differences of a run's states from the undisturbed run; frames in `but` may be missing."""
+    """Returns the differences between a run's states and the undisturbed run; frames in `but` may be missing."""
     wrong = [index for index in expected if index not in but and found.get(index) != expected[index]]
     missing = [index for index in wrong if index not in found]
     faults = [f"frames {missing} are not committed"] if missing else []
@@ -96,10 +99,10 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
 
 
 class Updates:
-    """Sends frames of a capture to a scene in portions, in the order of `encoded_frames`.
+    """Sends frames of a capture to a scene in batches, in the order of `encoded_frames`.
 
     Attributes:
-        next: index of the frame that is sent next.
+        next: index of the next frame to send.
     """
 
     def __init__(self, service: Service, scene: str, frames: Sequence[Files]) -> None:
@@ -107,7 +110,7 @@ class Updates:
         self.next = 0
 
     def run(self, count: int) -> list[float]:
-        """Sends a number of frames at once and waits for the commits; returns the seconds of each."""
+        """Sends a number of frames at once and waits for their commits; returns the seconds of each update."""
         first = self.next
         for index in range(first, first + count):
             answer = self._service.put(self._scene, index, *self._frames[ping_pong(index, len(self._frames))])
@@ -131,7 +134,7 @@ class FrameSender:
         self.faults: list[str] = []
 
     def send(self, index: int) -> None:
-        """Repeats a request until it is acknowledged."""
+        """Sends a frame repeatedly until it is acknowledged."""
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             try:
@@ -143,7 +146,7 @@ class FrameSender:
                 self.receipts[index] = answer.json()
                 return
             if answer.status_code not in (429, 503, 507):
-                self.faults.append(f"frame {index} was answered {answer.status_code}: {answer.text}")
+                self.faults.append(f"frame {index} got status {answer.status_code}: {answer.text}")
                 return
             time.sleep(AGAIN_S)
         self.faults.append(f"frame {index} was never acknowledged")
@@ -154,12 +157,12 @@ class FrameSender:
         for index, receipt in self.receipts.items():
             report = self.service.frame(self.scene, index)
             if report.state != FrameState.COMMITTED:
-                faults.append(f"frame {index} was acknowledged and is {report.state}: {report.error}")
+                faults.append(f"frame {index} was acknowledged but is {report.state}: {report.error}")
             if report.identity != receipt["identity"]:
-                faults.append(f"frame {index} has another identity than was acknowledged")
+                faults.append(f"frame {index} has a different identity than acknowledged")
             again = self.service.put(self.scene, index, *self.study.frames[index])
             if again.status_code != 202 or again.json() != receipt:
-                faults.append(f"frame {index}, sent again, is answered {again.status_code}: {again.text}")
+                faults.append(f"frame {index}, sent again, got status {again.status_code}: {again.text}")
         return faults
 
 
@@ -167,10 +170,13 @@ class FrameSender:
 def running(
     study: Study, name: str, environment: Mapping[str, str] | None = None, **rules: Any
 ) -> Iterator[tuple[Service, str, FrameSender]]:
-    """Provides a service on a new folder, a scene, and its sender; stops the service at the end.
+    """Yields a service on an empty folder, a scene, and its sender; stops the service at the end.
 
     Args:
-        environment: more of the service's. rules: of the scene, as in `Study.create`.
+        study: the study.
+        name: name of the folder.
+        environment: additional environment variables of the service.
+        rules: rules of the scene, as in `Study.create`.
     """
     service = study.service(name, environment)
     service.start()
@@ -192,5 +198,5 @@ def undisturbed(study: Study) -> tuple[dict[int, str], float]:
         service.finish(scene, len(study.frames))
         seconds = (time.monotonic() - began) / max(1, len(study.frames) - 1)
         if faults := sender.check():
-            raise StudyError(f"the undisturbed run: {'; '.join(faults)}")
+            raise StudyError(f"the undisturbed run failed: {'; '.join(faults)}")
         return digests(DataFolder(service.data).scene(scene).states), seconds

@@ -1,1 +1,1 @@
-"""Studies of cost versus size: pixels, Gaussians, cameras, share of moving pixels, frames."""
+"""Studies of cost against size: pixels, Gaussians, cameras, share of moving pixels, and frames."""

@@ -13,25 +13,25 @@ from studies.options import Page, write_page
 def scale(
     sweep: Annotated[
         list[str] | None,
-        typer.Option(help="Only this: Gaussians, pixels, cameras, share that moves. May be repeated."),
+        typer.Option(help="Only this sweep: Gaussians, pixels, cameras, share that moves. May be repeated."),
     ] = None,
     frames: Annotated[
-        list[int] | None, typer.Option(min=0, help="Frames after which memory is looked at; 0: not at all.")
+        list[int] | None, typer.Option(min=0, help="Frames after which memory is measured; 0: never.")
     ] = None,
-    work: Annotated[Path, typer.Option(help="Folder of figures; what it has is not measured again.")] = Path(
+    work: Annotated[Path, typer.Option(help="Folder of the figures; existing ones are not measured again.")] = Path(
         "out/scale"
     ),
-    picture: Annotated[Path | None, typer.Option(help="File of the plot, as scale.png.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="File of the plot, such as scale.png.")] = None,
     out: Page = None,
 ) -> None:
-    """Measures seconds and memory against pixels, Gaussians, cameras, the share that moves and frames: exponents.
+    """Measures how time and memory grow with pixels, Gaussians, cameras, the share that moves and frames: exponents.
 
     Example: NUMBA_NUM_THREADS=1 scripts/bench scale --sweep cameras
     """
     from studies.scale.scale import FRAMES, SWEEPS, plot, run, summarize
 
     if unknown := set(sweep or []) - set(SWEEPS):
-        raise typer.BadParameter(f"there is no sweep {sorted(unknown)[0]!r}; they are {', '.join(SWEEPS)}")
+        raise typer.BadParameter(f"unknown sweep {sorted(unknown)[0]!r}; choose from {', '.join(SWEEPS)}")
     counts = [count for count in frames or FRAMES if count]
     sizes_run = run(work.resolve(), sweep or list(SWEEPS), counts, typer.echo)
     text = summarize(sizes_run)

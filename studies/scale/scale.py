@@ -1,4 +1,4 @@
-"""``scripts/bench scale``: seconds and memory versus one size at a time, each measured in its own process."""
+"""``scripts/bench scale``: seconds and memory against one size at a time, each measured in a separate process."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from studies.options import Echo
 from studies.synthetic.wall import Size, known, rig, shown, wall
 
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}
-"""That of the footage: with another background, what stands would be found to be wrong, and mended."""
+"""Scene settings of the footage. With another background, static Gaussians would look wrong and be corrected."""
 ITERATIONS = 100
-"""Of an update, at every size: those of the paper."""
+"""Iterations per update at every size, as in the paper."""
 FIRST_ITERATIONS = 100
-"""Of frame 0."""
+"""Iterations of frame 0."""
 UPDATES = 4
-"""The first, which looks for the motion, does not count."""
+"""Number of updates. The first one searches for the motion and is not counted."""
 PIXELS = ((256, 256), (512, 512), (1280, 720), (1920, 1080))
 SWEEPS: Mapping[str, Sequence[Size]] = {
     "Gaussians": [Size(gaussians=count) for count in (5_000, 20_000, 50_000, 100_000, 200_000, 500_000)],
@@ -39,13 +39,13 @@ SWEEPS: Mapping[str, Sequence[Size]] = {
     "cameras": [Size(cameras=count) for count in (4, 8, 16, 32, 64, 100)],
     "share that moves": [Size(moving=share) for share in (0.05, 0.1, 0.2, 0.4, 0.8)],
 }
-"""Sizes by what rises in them; all else is that of ``Size()``."""
+"""Sizes by the quantity that grows; everything else is as in ``Size()``."""
 FRAMES = (100, 1_000, 10_000)
-"""Frames of one process; its memory is looked at after each of these numbers."""
+"""Numbers of frames of one process after which its memory is measured."""
 TURN = 16
-"""Frames after which the footage of these goes back."""
+"""Number of frames after which the footage of this measurement reverses."""
 KEPT = {"a folder": True, "the process": False}
-"""Where states of these are kept."""
+"""Where the states of this measurement are kept."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,10 @@ class Cost:
     """Measurements of one size.
 
     Attributes:
-        update: seconds of an update, median. view: seconds of a view. frame_0: seconds of frame 0 from its pictures and
-            a point a Gaussian, with few iterations. memory: MB, the most that the process had with updates and views,
-            frame 0 not among them.
+        update: median seconds per update.
+        view: median seconds per view.
+        frame_0: seconds of frame 0, from its images and one point per Gaussian, with few iterations.
+        memory: peak memory of the process in MB during updates and views, before frame 0 is fitted.
     """
 
     update: float
@@ -65,7 +66,7 @@ class Cost:
 
 
 def amount(name: str, size: Size) -> float:
-    """The size that varies in a sweep."""
+    """Returns the quantity that varies in a sweep."""
     if name.startswith("pixels"):
         return float(size.width * size.height)
     return float({"Gaussians": size.gaussians, "cameras": size.cameras, "share that moves": size.moving}[name])
@@ -81,7 +82,7 @@ def slope(amounts: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def cost(size: Size) -> Cost:
-    """Measures a size in this process."""
+    """Measures one size in this process."""
     settings = Settings.model_validate(
         {
             "scene": SCENE,
@@ -111,8 +112,8 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
     """Returns the peak memory in MB of a process after a number of frames of a small scene.
 
     Args:
-        frames: numbers of frames after which it is looked at. folder: states are kept in one, as by the service; else
-            by the process alone.
+        frames: numbers of frames after which the memory is measured.
+        folder: whether states are kept in a folder, as in the service, or only in the process.
     """
     from tempfile import TemporaryDirectory
 
@@ -125,7 +126,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
         history = History(Path(work) / "states") if folder else History()
         scene = Reconstruction.start(cameras, there[0], settings, static=known(state, cameras), history=history)
         for index in range(1, max(frames) + 1):
-            way = index % TURN if index % (2 * TURN) < TURN else TURN - index % TURN  # to and fro
+            way = index % TURN if index % (2 * TURN) < TURN else TURN - index % TURN  # back and forth
             scene.step(replace(there[way], index=index, time=index / 30))
             if index in frames:
                 peak[index] = _peak_mb()
@@ -170,7 +171,7 @@ def summarize(found: Mapping[str, Any]) -> str:
 
 
 def plot(found: Mapping[str, Any], path: Path) -> None:
-    """Plots the seconds of an update versus each size, relative to the smallest, on logarithmic axes."""
+    """Plots the seconds per update against each size, relative to the smallest size, on logarithmic axes."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -182,17 +183,17 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
         seconds = [one["update"] for one in costs]
         axes.loglog([each / amounts[0] for each in amounts], [each / seconds[0] for each in seconds], "o-", label=name)
     ends = axes.get_xlim()
-    axes.loglog([1, ends[1]], [1, ends[1]], "k:", linewidth=1, label="as its size")
-    axes.set(xlabel="size, of the smallest", ylabel="seconds of an update, of those at the smallest")
+    axes.loglog([1, ends[1]], [1, ends[1]], "k:", linewidth=1, label="proportional")
+    axes.set(xlabel="size, relative to the smallest", ylabel="seconds per update, relative to the smallest")
     axes.legend()
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
 
 
 def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
-    """Reads the figures of a size or frame count from the folder, or measures them in a new process."""
+    """Returns the figures of a size or frame count from the folder, or measures them in a new process."""
     name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
-    ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # what was measured otherwise
+    ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # distinguishes other settings
     file = work / f"{name}-{ways:08x}.json"
     if not file.exists():
         done = subprocess.run(

@@ -1,7 +1,7 @@
-"""Connections of a stranger without a token, held open by one light process: `python -m studies.service.attack`.
+"""Connections of a stranger without a token, held open by one lightweight process: `python -m studies.service.attack`.
 
-One endless header, headers that are half sent, uploads that stop; all at once. It writes one line of JSON when the last
-of them has been closed by the service, or its patience is over.
+These are one endless header, half-sent headers and stalled uploads, all at once. The process writes one line of JSON
+when the service has closed the last connection, or when its patience has run out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Hold:
 
 
 def upload(path: str) -> bytes:
-    """Returns the start of a body that never ends."""
+    """Returns the start of an upload whose body never ends."""
     return (
         (
             f"PUT {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/vnd.scas4d.frame\r\n"
@@ -41,20 +41,25 @@ def upload(path: str) -> bytes:
 
 
 def attack(port: int, path: str, header: int, halves: int, uploads: int, patience: float) -> dict[str, float]:
-    """Opens all connections, and waits until the service has closed them.
+    """Opens all connections and waits until the service has closed them.
 
     Args:
-        port: of the service, on the loopback. path: of the uploads. header: bytes of the endless header; 0 is none.
-        halves: half-sent headers. uploads: hanging uploads. patience: seconds.
+        port: port of the service on the loopback interface.
+        path: path of the uploads.
+        header: bytes of the endless header; 0 for none.
+        halves: number of half-sent headers.
+        uploads: number of stalled uploads.
+        patience: seconds to wait.
 
     Returns:
-        seconds: from the first connection until the last was closed. open: those that were not. sent: bytes of the
-        endless header that the system took.
+        seconds: time from the first connection until the last one was closed.
+        open: number of connections that were not closed.
+        sent: bytes of the endless header that the system accepted.
     """
     began = time.monotonic()
     ended, sent = began, 0
     with selectors.DefaultSelector() as waiting:
-        # The endless header comes last: the first ones give way where a cap is reached.
+        # The endless header comes last, because the first connections give way when a cap is reached.
         plans = [(HALF, 0)] * halves + [(upload(path), 0)] * uploads + [(HALF, header)] * (header > 0)
         for first, more in plans:
             connection = socket.socket()

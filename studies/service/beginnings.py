@@ -1,4 +1,4 @@
-"""Repeated restarts of a scene's reconstruction, with kills of the service meanwhile: no bit may differ."""
+"""Repeated restarts of a scene's reconstruction while the service is killed: the states must be bit-identical."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from studies.running.process import PATIENCE_S, Service, StudyError
 from studies.running.study import AGAIN_S, Study, compare, digests, running
 
 SPREADS_S = (0.1, 1.0)
-"""A kill comes within one of these seconds after the request: before its event, after it, or in the first frame."""
+"""Longest delays from a request to the kill: before its event, after it, or during the first frame."""
 
 
 def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int, echo: Echo) -> ScenarioResult:
     """Kills the whole service with `kill -9` at a random moment of each of `count` restarts.
 
-    Half of the frames are here before the first beginning, one more comes with each.
+    Half of the frames arrive before the first restart, and one more with each restart.
     """
     random_ = random.Random(seed)
     sent = len(study.frames) // 2
@@ -55,22 +55,22 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
             echo(f"killed in beginning {number} of {count}; the scene's reconstruction is {status.reconstruction}")
             if status.reconstruction != number:
                 raise StudyError(
-                    f"reconstruction {number} was acknowledged, and the scene's is {status.reconstruction}"
+                    f"reconstruction {number} was acknowledged, but the scene's is {status.reconstruction}"
                 )
         for index in range(sent, len(study.frames)):
             sender.send(index)
         service.finish(scene, len(study.frames))
         folder = replace(DataFolder(service.data).scene(scene), reconstruction=count)
         faults = sender.check() + compare(digests(folder.states), expected)
-        faults += [f"{path.name} is left" for path in folder.path.glob("states*") if path != folder.states]
-        faults += [f"damage was said: {said}" for said in service.status(scene).damage]
+        faults += [f"{path.name} was not deleted" for path in folder.path.glob("states*") if path != folder.states]
+        faults += [f"damage was reported: {said}" for said in service.status(scene).damage]
         summary = f"{ended['before']} ended before, {ended['after']} after; {len(expected)} states compared"
         target = "each ends wholly before or after; final state bit-identical to a run without any"
         return ScenarioResult(f"kill -9 in {count} beginnings of a reconstruction", target, summary, faults)
 
 
 def _begin(service: Service, scene: str, number: int) -> None:
-    """Repeats a request until it is acknowledged, like a client without an answer."""
+    """Repeats a request until it is acknowledged, like a client that gets no response."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         try:

@@ -15,24 +15,24 @@ def faults(
     capture: Repeated,
     frames: Annotated[int, typer.Option(min=4, help="Frames sent in every scenario.")] = 20,
     kills: Annotated[
-        int, typer.Option(min=0, help="kill -9 of the worker or the service, at random moments; and beginnings.")
+        int, typer.Option(min=0, help="Kills (kill -9) of the worker or the service, and beginnings.")
     ] = 30,
-    cuts: Annotated[int, typer.Option(min=0, help="Files of the log that are cut.")] = 20,
-    flips: Annotated[int, typer.Option(min=0, help="Files of the log in which a bit is flipped.")] = 1,
+    cuts: Annotated[int, typer.Option(min=0, help="Log files to truncate.")] = 20,
+    flips: Annotated[int, typer.Option(min=0, help="Log files in which to flip a bit.")] = 1,
     bits: Annotated[
-        int, typer.Option(min=0, help="Bits flipped one by one in states, checkpoints, journal and frames.")
+        int, typer.Option(min=0, help="Bits to flip one by one in states, checkpoints, journal and frames.")
     ] = 200,
     turns: Annotated[
-        int, typer.Option(min=1, help="Turns without strangers and with them, each with a token and without.")
+        int, typer.Option(min=1, help="Turns without and with strangers, each with and without a token.")
     ] = 3,
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster nodes, stopped, full, "
+            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster: nodes, stopped, full, "
             "head (needs redis-server), kills, beginnings, log or bits. May be repeated."
         ),
     ] = None,
-    placement: Annotated[str, typer.Option(help="`ray`: on a Ray cluster of three nodes, on this machine.")] = "local",
+    placement: Annotated[str, typer.Option(help="`ray`: on a Ray cluster of three nodes on this machine.")] = "local",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; its contents are deleted.")] = Path(
         "out/faults"
@@ -40,9 +40,9 @@ def faults(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Kills the service and its workers, cuts and damages its files, fills its disk; compares with an undisturbed run.
+    """Kills the service and its workers, damages its files and fills its disk; compares with an undisturbed run.
 
-    Then strangers without a token hold it up: an endless header, half-sent headers, hanging uploads, during updates.
+    Then clients without a token attack it during updates: an endless header, half-sent headers and stalled uploads.
 
     Example: scripts/bench faults samples/robot --set static.iterations=300 --set update.iterations=20
     """
@@ -96,15 +96,15 @@ def faults(
 
 
 def ingest(
-    frames: Annotated[int, typer.Option(min=1, help="Frames sent in a round.")] = 20,
+    frames: Annotated[int, typer.Option(min=1, help="Frames per round.")] = 20,
     cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 27,
     megabytes: Annotated[float, typer.Option(min=0.01, help="Size of one JPEG.")] = 1.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each measures both ways.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each measures every way of sending.")] = 5,
     senders: Annotated[int, typer.Option(min=1, help="Connections of the sending process.")] = 2,
-    work: Annotated[Path, typer.Option(help="Folder on the disk that is measured.")] = Path("out/ingest"),
+    work: Annotated[Path, typer.Option(help="Folder on the disk to measure.")] = Path("out/ingest"),
     out: Page = None,
 ) -> None:
-    """Measures ingest over the loopback against plain fsynced writes of the same records, in turns."""
+    """Measures ingest over the loopback interface against plain fsynced writes of the same records, in alternation."""
     from client.cli.extras import need_server
     from studies.service import ingest as of_ingest
 
@@ -122,10 +122,10 @@ def ingest(
 def views(
     capture: Repeated,
     rate: Annotated[
-        list[float] | None, typer.Option(min=0.1, help="Views a second, default 1, 5 and 20. May be repeated.")
+        list[float] | None, typer.Option(min=0.1, help="Views per second, default 1, 5 and 20. May be repeated.")
     ] = None,
-    updates: Annotated[int, typer.Option(min=1, help="Updates a turn, without views and with.")] = 8,
-    turns: Annotated[int, typer.Option(min=1, help="Turns of each rate.")] = 3,
+    updates: Annotated[int, typer.Option(min=1, help="Updates per turn, without and with views.")] = 8,
+    turns: Annotated[int, typer.Option(min=1, help="Turns per rate.")] = 3,
     width: Annotated[int, typer.Option(min=1, help="Width of a view in pixels.")] = 256,
     work: Annotated[Path, typer.Option(help="Folder for the service's data; its contents are deleted.")] = Path(
         "out/views"
@@ -133,7 +133,7 @@ def views(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Measures live views beside updates: latency under an open-loop load, and what it costs the updates.
+    """Measures live views during updates: their latency under an open-loop load, and what they cost the updates.
 
     Example: scripts/bench views captures/robot
     """
@@ -164,7 +164,7 @@ def crossing(
         Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture with points and test cameras.")
     ] = Path("samples/robot"),
 ) -> None:
-    """Lists the files that a frame crosses between PUT and commit, and a render; fails where they are too many."""
+    """Lists the source files that a frame runs through from PUT to commit, and a render; fails if too many."""
     from client.cli.extras import need_server
     from studies.service.crossing import run
 
@@ -175,10 +175,10 @@ def crossing(
 
 def memory(
     cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 24,
-    size: Annotated[int, typer.Option(min=16, help="Width and height of the pictures in pixels.")] = 256,
+    size: Annotated[int, typer.Option(min=16, help="Width and height of the images in pixels.")] = 256,
     gaussians: Annotated[int, typer.Option(min=100, help="Gaussians of the scene.")] = 10_000,
-    scale: Annotated[float, typer.Option(help="The setting scene.image_scale.")] = 1.0,
-    masks: Annotated[bool, typer.Option("--masks", help="Frames with masks.")] = False,
+    scale: Annotated[float, typer.Option(help="Value of the setting scene.image_scale.")] = 1.0,
+    masks: Annotated[bool, typer.Option("--masks", help="Send frames with masks.")] = False,
 ) -> None:
     """Measures the peak memory of a worker against the service's estimate; prints JSON."""
     import json
@@ -192,13 +192,13 @@ def memory(
 
 def sleeping(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene, DATA/scenes/ID.")],
-    count: Annotated[int, typer.Option(min=1, help="Scenes that sleep.")] = 500,
-    views: Annotated[int, typer.Option(min=1, help="Scenes that are woken by a view.")] = 5,
+    count: Annotated[int, typer.Option(min=1, help="Number of sleeping scenes.")] = 500,
+    views: Annotated[int, typer.Option(min=1, help="Number of scenes to wake with a view.")] = 5,
     work: Annotated[Path, typer.Option(help="Data folder of the copies; its contents are deleted.")] = Path(
         "out/sleeping"
     ),
 ) -> None:
-    """Measures memory, listing and first views of scenes that sleep: copies of one; prints JSON."""
+    """Measures memory, listing and first views of sleeping scenes, which are copies of one scene; prints JSON."""
     import json
 
     from client.cli.extras import need_server

@@ -1,9 +1,9 @@
-"""Source files that a frame passes through between PUT and commit, and a render between request and answer.
+"""Source files that a frame runs through from PUT to commit, and a render from request to response.
 
-Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
-process, for each of two frames, or of two renders: what a process happens to do meanwhile is ignored. So are
-`__init__` files, the kernels, the groups of effects (those that a scene has: a few of many) and `server/repair` (which
-looks at the disk every few seconds, whatever comes). The service runs as usual, with a profiler in each process.
+Both limit how many files a reader must open to follow a frame. A file counts if one of its functions runs, in any
+process, for each of two frames or of two renders, so that unrelated work is ignored. Also ignored are `__init__` files,
+the kernels, the groups of effects (of which a scene has only a few) and `server/repair` (which checks the disk every
+few seconds in any case). The service runs as usual, with a profiler in each process.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from studies.running.process import Service, wait_until
 
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26
-"""They are 62 and 26. The tail of what came before a frame would cross files of its own."""
+"""Limits; the current numbers are 62 and 26. Unfinished work from before a frame would add files of its own."""
 LATER = (3, 4)
-"""The frames that are followed: frame 0 and the first updates have work of their own."""
+"""Frames that are followed; frame 0 and the first updates do additional work."""
 SETTINGS = {
     "scene": {"image_scale": 0.25},
     "static": {"iterations": 300, "max_gaussians": 2500},
@@ -33,8 +33,8 @@ SETTINGS = {
 }
 COMMITTED_S = 120.0
 SETTLE_S = 0.3
-"""After the commit or the answer, for what a process still does about it; before, for what it did. Short: what
-runs in the background every few seconds does not belong to the frame."""
+"""Pause before and after each phase, in which the processes finish related work. It is short, because background work
+that runs every few seconds does not belong to the frame."""
 
 PROFILER = """
 import os, sys, threading, time
@@ -61,15 +61,15 @@ threading.Thread(target=follow, daemon=True).start()
 threading.setprofile(profile)
 sys.setprofile(profile)
 """
-"""`sitecustomize.py` of the service's processes: keeps the code that was called, by phase."""
+"""`sitecustomize.py` of the service's processes, which records the called code in each phase."""
 
 
 def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
-    """Returns sorted paths, relative to the checkout, of the files that a later "frame" and a "render" pass through.
+    """Returns the sorted files that a later "frame" and a "render" run through, relative to the checkout.
 
     Args:
-        folder: for the service's data; made when missing.
-        capture: has at least five frames and a test camera.
+        folder: folder for the service's data, created if missing.
+        capture: capture with at least five frames and a test camera.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sitecustomize.py").write_text(PROFILER)
@@ -105,7 +105,7 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
                 state = folder / "data" / "scenes" / scene / "states" / f"frame_{index:06d}.npz"
                 with _phase(folder, f"frame {index}"):
                     put(index)
-                    # Asking the service would cross other files.
+                    # Asking the service would involve other files.
                     wait_until(state.exists, "the frame was not committed", COMMITTED_S)
                 assert client.frame(scene, index).state is FrameState.COMMITTED
                 with _phase(folder, f"render {index}"):
@@ -142,11 +142,11 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
 
 
 def run(sample: Path, echo: Callable[[str], None] = print) -> bool:
-    """Prints both lists; returns whether both are short enough."""
+    """Prints both lists; returns whether both are within their limits."""
     with tempfile.TemporaryDirectory(prefix="scas4d-crossing-") as folder:
         files = crossed(Path(folder), open_measured(sample))
     for phase, most in (("frame", MOST_OF_A_FRAME), ("render", MOST_OF_A_RENDER)):
-        echo(f"a {phase} crosses {len(files[phase])} files (at most {most}):")
+        echo(f"a {phase} runs through {len(files[phase])} files (at most {most}):")
         for name in files[phase]:
             echo(f"  {name}")
     return len(files["frame"]) <= MOST_OF_A_FRAME and len(files["render"]) <= MOST_OF_A_RENDER

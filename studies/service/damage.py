@@ -1,8 +1,8 @@
-"""Single bit flips in stored files: each must be detected or harmless, and no picture may be wrong.
+"""Single bit flips in stored files: each must be noticed or harmless, and no image may be wrong.
 
-One scene, frame after frame. Before each frame one bit of one file is flipped, under the service as it runs, or while
-it is down; then views are asked for, the next frame is sent, and all is compared with a run that nothing disturbed.
-The bit is put right again where the service could not do that: the next frame is to be a single one too.
+One scene is sent frame by frame. Before each frame, one bit of one file is flipped, while the service runs or while it
+is down. The study then requests views, sends the next frame, and compares everything with an undisturbed run. If the
+service could not repair the bit, the study does, so that the next flip is again the only one.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from studies.running.study import AGAIN_S, Study, digests, running
 
 KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6
-"""Frames that are committed before the first bit is flipped."""
+"""Number of frames committed before the first bit is flipped."""
 NOTICED_S = 60.0
-"""So long a bit may stay unnoticed: the scrub runs without pauses here."""
+"""Time within which a flip must be noticed; here the scrub runs almost continuously."""
 KEPT = 100
-"""Frames whose pictures are held: states older than that cannot be recomputed, and are named."""
+"""Number of frames whose images are kept; older states cannot be recomputed and are reported as lost."""
 CLOSE_DB = 3.0
-"""A state that was made again may show the frame so much worse than the one that was lost."""
+"""Largest PSNR loss of a recomputed state against the lost one, on the images of its frame."""
 SCRUB = {"SCAS4D_SCRUB_MB_PER_SECOND": "1000", "SCAS4D_SCRUB_PAUSE_SECONDS": "0.2"}
 
 Pictures = dict[int, bytes]
@@ -46,9 +46,11 @@ class Flips:
     """Outcome of the bit flips.
 
     Attributes:
-        counts: noticed or harmless, by kind. recomputed, lost: frames whose state is another one, or gone.
-        unreported: frames whose state is as it was and whose report is gone.
-        faults: what should not be.
+        counts: number of noticed and of harmless flips, by kind of file.
+        recomputed: frames whose state was recomputed.
+        lost: frames whose state is lost.
+        unreported: frames whose state is unchanged but whose report is lost.
+        faults: violated requirements.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -59,7 +61,7 @@ class Flips:
 
 
 def frames_for(count: int) -> int:
-    """Returns the number of frames that a study with a number of flips sends."""
+    """Returns the number of frames that a study with ``count`` flips sends."""
     return BEFORE + count
 
 
@@ -74,7 +76,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
 
 
 def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> Flips:
-    """Flips `count` bits, equally many of each kind, half of them while the service is down."""
+    """Flips `count` bits, equally many of each kind, and half of them while the service is down."""
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
     counts = Flips()
@@ -104,7 +106,7 @@ def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> F
 
 
 class _Flip:
-    """One bit of one file."""
+    """One bit of one file, and what its flip must not break."""
 
     def __init__(
         self, study: Study, service: Service, scene: str, kind: str, frames: int, random_: random.Random
@@ -155,11 +157,11 @@ class _Flip:
                 break
             time.sleep(AGAIN_S)
         if not noticed and not harmless:
-            self.faults.append("it was not noticed, and it is not harmless")
+            self.faults.append("the flip is neither noticed nor harmless")
         while service.status(self.scene).error is not None and time.monotonic() < until:
             time.sleep(AGAIN_S)
         if (error := service.status(self.scene).error) is not None:
-            self.faults.append(f"the scene is left with: {error}")
+            self.faults.append(f"the scene still has the error: {error}")
         for index in sorted({0, self.index, self.frames // 2, self.frames - 1}):
             self._look(index, found, views)
         self._put_right(bytes(data))
@@ -168,7 +170,7 @@ class _Flip:
         return outcome
 
     def _harmless(self) -> bool:
-        """Returns whether everything that can be read from the file equals what was written."""
+        """Returns whether everything read from the file equals what was written."""
         try:
             if self.kind == "frame":
                 return bool(read_pictures(self.file.parent, self.file.name).images)
@@ -185,7 +187,7 @@ class _Flip:
         while (answer := _view(self.service, self.study, self.scene, index)).status_code == 503:
             self._no_path(answer)
             if time.monotonic() > until:
-                self.faults.append(f"a view of frame {index} is put off for ever: {answer.text}")
+                self.faults.append(f"a view of frame {index} is postponed forever: {answer.text}")
                 return
             time.sleep(AGAIN_S)
         self._no_path(answer)
@@ -193,25 +195,25 @@ class _Flip:
         if answer.status_code == 404 and report.deleted and not report.pictures_kept:
             found.lost.add(index)
         elif answer.status_code != 200:
-            self.faults.append(f"a view of frame {index} is answered {answer.status_code}: {answer.text}")
+            self.faults.append(f"a view of frame {index} got status {answer.status_code}: {answer.text}")
         elif report.recomputed:
             found.recomputed.add(index)
             truth = self.study.frames[index][0][self.study.capture.full_rig.names[0]]
             loss = _psnr(views[index], truth) - _psnr(answer.content, truth)
             if loss > CLOSE_DB:
-                self.faults.append(f"frame {index}, made again, is {loss:.1f} dB worse")
+                self.faults.append(f"frame {index}, recomputed, is {loss:.1f} dB worse")
         elif report.iterations is None:
             found.unreported.add(index)
         if answer.status_code == 200 and not report.recomputed and answer.content != views[index]:
-            self.faults.append(f"the view of frame {index} is another one")
+            self.faults.append(f"the view of frame {index} has changed")
 
     def _no_path(self, answer: httpx.Response) -> None:
         texts = [answer.text if answer.status_code != 200 else "", self.service.http.get("/v1/scenes").text]
         if any(str(self.service.data) in text for text in texts):
-            self.faults.append("an answer names a path of the server")
+            self.faults.append("a response contains a path of the server")
 
     def _put_right(self, flipped: bytes) -> None:
-        """Restores what the service could not repair, so that the next flip is the only one."""
+        """Repairs the byte if the service could not, so that the next flip is the only one."""
         try:
             with self.file.open("r+b") as opened:
                 opened.seek(self.at)

@@ -1,6 +1,6 @@
-"""Kills, truncation, bit flips, a full disk and attackers: no acknowledged frame and no bit may be lost.
+"""Kills, truncation, bit flips, a full disk and attackers: no acknowledged frame may be lost, and no bit may differ.
 
-Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
+Each scenario runs the whole service in a separate process. The undisturbed run comes first; the others are compared
 with it, state by state and bit by bit.
 """
 
@@ -32,12 +32,12 @@ from studies.service.beginnings import beginnings
 from studies.service.strangers import Attack, strangers
 
 TURN_S = 15.0
-"""Of updates without strangers; with them, until the last connection is closed."""
+"""Duration of updates without strangers. With strangers, updates continue until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
-"""The sixth fails a frame, as it should: the study stays below, and kills again when the next frame is at work."""
+"""Most kills of a worker at one frame. A sixth would fail the frame, as it should; further kills wait for the next."""
 
 PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
-"""The scenarios by name."""
+"""Names of the scenarios."""
 
 
 def kills(
@@ -67,7 +67,7 @@ def kills(
             thread.join()
         service.finish(scene, len(study.frames))
         service.kill()
-        service.start()  # and once more: all is found again
+        service.start()  # and once more: everything must be restored
         service.finish(scene, len(study.frames))
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         lost = len(study.frames) - len(sender.receipts)
@@ -82,7 +82,7 @@ def kills(
 
 
 def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
-    """Kills the scene's worker as soon as it is at a frame with fewer than the maximum number of kills."""
+    """Kills the scene's worker as soon as it processes a frame with fewer than the maximum number of kills."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         status = service.status(scene)
@@ -100,9 +100,9 @@ def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
 def damaged_log(
     study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Truncates log files or flips a bit while the service is down; then it must start, report this and continue.
+    """Truncates log files or flips a bit while the service is down; it must then start, report this and continue.
 
-    Half of the frames are committed, the other half wait, as after a kill.
+    Half of the frames are committed and the other half are waiting, as after a kill.
     """
     random_ = random.Random(seed)
     service = study.service("log")
@@ -131,23 +131,23 @@ def damaged_log(
         try:
             victim.http.post(f"/v1/scenes/{scene}/resume")
             status = victim.finish(scene, len(study.frames) if hit is None else 0)
-            echo(f"{said}: {'; '.join(status.damage) or 'nothing to say'}")
+            echo(f"{said}: {'; '.join(status.damage) or 'nothing reported'}")
             wrong = _check_damaged(victim, scene, sender, hit)
             wrong += compare(digests(folder.states), expected, range(hit, len(study.frames)) if hit else ())
             if hit is not None:
                 report = victim.frame(scene, hit)
                 dropped += 1
                 if report.state != FrameState.FAILED or not report.error:
-                    wrong.append(f"frame {hit} is {report.state}, its record is damaged")
+                    wrong.append(f"frame {hit} is {report.state}, although its record is damaged")
             elif not status.damage:
-                wrong.append("the damage was not said")
+                wrong.append("the damage was not reported")
             faults += [f"{said}: {fault}" for fault in wrong]
         except StudyError as error:
             faults.append(f"{said}: {error}")
         finally:
             victim.stop()
-    summary = f"started {cuts + flips} times; {dropped} frames failed with their reason, all others committed"
-    target = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    summary = f"started {cuts + flips} times; {dropped} frames failed with a reason, all others committed"
+    target = "starts, loses nothing acknowledged before the damage, reports what it dropped"
     return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, summary, faults)
 
 
@@ -177,15 +177,15 @@ def _check_damaged(service: Service, scene: str, sender: FrameSender, hit: int |
         if index != hit and report.state != FrameState.COMMITTED:
             faults.append(f"frame {index} is {report.state}: {report.error}")
         if report.identity != receipt["identity"]:
-            faults.append(f"frame {index} has another identity")
+            faults.append(f"frame {index} has a different identity")
     return faults
 
 
 def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> ScenarioResult:
-    """Prevents files from growing, first for the service, then for the worker; then makes room again.
+    """Prevents files from growing, first for the service and then for the worker; then lifts the limit again.
 
-    The limit on the size of files is set on the running processes (RLIMIT_FSIZE), so that every write fails where a
-    full disk would make it fail.
+    The file size limit is set on the running processes (RLIMIT_FSIZE), so that every write fails where a full disk
+    would make it fail.
     """
     faults: list[str] = []
     with running(study, "full") as (service, scene, sender):
@@ -196,12 +196,12 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
         with _no_room(service.pid):
             answers = [service.put(scene, half, *study.frames[half]) for _ in range(3)]
             echo(f"while the disk is full: {[answer.status_code for answer in answers]}")
-            faults += [f"answered {answer.status_code}, not 507" for answer in answers if answer.status_code != 507]
+            faults += [f"status {answer.status_code} instead of 507" for answer in answers if answer.status_code != 507]
             if service.status(scene).next_frame != half:
-                faults.append("a frame was taken that was not acknowledged")
+                faults.append("a frame was accepted but not acknowledged")
         worker = service.worker_pid(scene)
         assert worker is not None
-        before = service.status(scene).error  # it may say still that the service had no room
+        before = service.status(scene).error  # it may still say that the service had no room
         with _no_room(worker):
             sender.send(half)
             until = time.monotonic() + PATIENCE_S
@@ -214,7 +214,7 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
             sender.send(index)
         service.finish(scene, len(study.frames))
         faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-    target = "starts, loses nothing acknowledged before the damage, says what it dropped"
+    target = "starts, loses nothing acknowledged before the damage, reports what it dropped"
     return ScenarioResult(
         "disk full while ingesting", target, "507 meanwhile; all committed once there was room", faults
     )
@@ -236,10 +236,10 @@ def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioRes
     flipped = damage.flips(longer, count, seed, echo)
     counts = Counter(kind.rpartition(" ")[2] for kind in flipped.counts.elements())
     said = (
-        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.recomputed)} states made again from "
-        f"pictures, {len(flipped.lost)} named as lost, {len(flipped.unreported)} without their report"
+        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.recomputed)} states recomputed from "
+        f"images, {len(flipped.lost)} reported as lost, {len(flipped.unreported)} without their report"
     )
-    target = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
+    target = "each noticed or harmless; no wrong image, no 500, the scene continues"
     return ScenarioResult(
         f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", target, said, flipped.faults
     )
@@ -261,14 +261,21 @@ def run(
     """Runs the scenarios of `parts`.
 
     Args:
-        study: what is sent, and where to. moments: kills, and beginnings. cuts, flips: damaged files.
-        bits: flipped over everything on disk. seed: of the random moments.
-        attack: of the strangers, the whole of it where not given. turns: without and with it.
+        study: study that defines the frames and the service.
+        moments: number of kills, and of beginnings.
+        cuts: number of truncated log files.
+        flips: number of log files with a flipped bit.
+        bits: number of bits flipped in all files on disk.
+        seed: seed of the random moments.
+        attack: attack of the strangers; the full attack if None.
+        turns: number of turns without and with the attack.
+        parts: names of the scenarios to run.
+        echo: prints the progress.
     """
     outcomes = []
     if set(parts) & {"kills", "beginnings", "log", "disk"}:
         expected, update_s = undisturbed(study)
-        echo(f"undisturbed: {len(expected)} states, {update_s:.2f} s an update")
+        echo(f"undisturbed: {len(expected)} states, {update_s:.2f} s per update")
         if "kills" in parts:
             outcomes.append(kills(study, expected, update_s, moments, seed, echo))
         if "beginnings" in parts:

@@ -1,7 +1,7 @@
 """The frame cases on a running service: no status above 499, no dead worker, every failure explained and recovered.
 
-All cases go into one scene, one after the other with good frames between them; a scene beside it gets the good frames
-alone. What was committed is read from the scenes' folders and held against each other.
+All cases go into one scene, one after the other, with good frames between them. Another scene gets only the good
+frames. The committed states are read from the folders of the scenes and compared.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from studies.options import Echo
 from studies.running.process import PATIENCE_S, Service
 
 FARTHEST = 1.0
-"""Sizes that the object jumps: where it is by then, twice its size is out of the pictures."""
+"""Largest jump of the object, in multiples of its size; a jump of twice its size would leave the images."""
 BETWEEN = 2
-"""Good frames between the last that counts for one case and the first of the next."""
+"""Number of good frames between the last that counts for one case and the first of the next."""
 AGAIN_S = 0.05
 
 
 class BackAndForth:
-    """A footage that is played back and forth endlessly."""
+    """Footage that is played back and forth endlessly."""
 
     def __init__(self, footage: AnyFootage) -> None:
         self._footage = footage
@@ -68,7 +68,7 @@ class BackAndForth:
 
 @dataclass
 class ServiceCaseResult:
-    """Result of a case in one size, on the service."""
+    """Result of a case at one size, on the service."""
 
     case: FrameCase
     size: Any
@@ -88,7 +88,7 @@ class SentCase:
 
 
 def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent], list[SentCase]]:
-    """Returns all frames to send, and the ranges that are cases; a permanent jump is followed by one back."""
+    """Returns all frames to send and the cases among them; a permanent jump is followed by a jump back."""
     sent = [good(footage, index) for index in range(AT)]
     parts: list[SentCase] = []
     for case in cases:
@@ -111,7 +111,7 @@ def study(
     """Runs the cases whose name contains one of ``names``, or all.
 
     Returns:
-        Each case, and what went wrong with the service itself.
+        The result of each case, and the faults of the service itself.
     """
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "data").mkdir(parents=True)
@@ -134,7 +134,7 @@ def study(
         for violation in line.violations:
             echo(f"       ! {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    echo(f"{len(lines)} cases with sizes in {len(sent)} frames, {failed} do not hold; faults: {faults or 'none'}")
+    echo(f"{len(lines)} cases with sizes in {len(sent)} frames, {failed} fail; faults: {faults or 'none'}")
     return lines, faults
 
 
@@ -146,11 +146,11 @@ class Pushed:
     count: int
 
     def state(self, index: int) -> Gaussians:
-        """Returns the report of a frame."""
+        """Returns the committed state of a frame."""
         return self.committed.history.gaussians(index)
 
     def report(self, index: int) -> FrameReport:
-        """Returns the committed state of a frame."""
+        """Returns the report of a frame."""
         record = self.committed.history.report(index)
         known = {item.name: record[item.name] for item in fields(FrameReport) if item.name in record}
         alarms = [Alarm(AlarmKind(one["kind"]), one["camera"], one["evidence"]) for one in known.pop("alarms", [])]
@@ -182,7 +182,7 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
         while (answer := _send(service, scene, index, whole, *files)).status_code == 429 and time.monotonic() < until:
             time.sleep(AGAIN_S)
         if answer.status_code != 202:
-            faults.append(f"frame {index} was answered {answer.status_code}: {answer.text}")
+            faults.append(f"frame {index} got status {answer.status_code}: {answer.text}")
             break
         if index % 20 == 0:
             service.finish(scene, index + 1)
@@ -205,7 +205,7 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
 def _send(
     service: Service, scene: str, index: int, whole: bool, images: dict[str, bytes], masks: dict[str, bytes]
 ) -> httpx.Response:
-    """Sends a frame with all cameras, or each available camera; returns the first answer that is not successful."""
+    """Sends a frame as a whole or camera by camera; returns the first unsuccessful response, or the last response."""
     if whole:
         return service.put(scene, index, images, masks)
     address = f"/v1/scenes/{scene}/frames/{index}"
@@ -218,7 +218,7 @@ def _send(
 
 
 def encoded(frame: Frame) -> tuple[dict[str, bytes], dict[str, bytes]]:
-    """Encodes a frame's pictures and masks as PNG."""
+    """Encodes the images and masks of a frame as PNG."""
     images = {name: _png(np.asarray(frame.images[name])) for name in frame.images}
     return images, {name: _png(255 * np.asarray(frame.masks[name])) for name in frame.masks}
 

@@ -1,8 +1,8 @@
 """Ingest rate over the loopback interface, compared with plain fsynced writes of the same records.
 
-All in one run and in turns, because a disk's speed drifts and what follows heavy writing pays for it: a record is the
-encoded pictures of one frame. The scene is paused, so that ingest alone is measured: receive, check each picture's
-structure, hash, write, sync, acknowledge.
+Everything is measured in one run and in alternation, because a disk's speed drifts and heavy writing slows what follows
+it. A record contains the encoded images of one frame. The scene is paused, so that only ingest is measured: receive,
+check the structure of each image, hash, write, sync, acknowledge.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ UNANSWERED = 2
 
 @dataclass(frozen=True)
 class IngestTimes:
-    """Megabytes per second of plain writes, over HTTP and over a WebSocket, one value per round."""
+    """Megabytes per second of plain writes, over HTTP and over a WebSocket, with one value per round."""
 
     plain: list[float]
     ingest: list[float]
     socket: list[float]
 
     def share(self, ingest: Sequence[float]) -> float:
-        """Median of the ratios of all rounds."""
+        """Returns the median ratio to plain writes over all rounds."""
         return statistics.median(took / plain for took, plain in zip(ingest, self.plain, strict=True))
 
 
 def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
-    """Creates a noise JPEG of a given size: its quality is searched, and a comment fills the rest."""
+    """Creates a noise JPEG with the highest quality that fits into a given size."""
     rng = np.random.default_rng(seed)
     picture = Image.fromarray(rng.integers(0, 256, (side, side, 3), dtype=np.uint8))
     best = b""
@@ -100,7 +100,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
                 way = (turn + number) % 3
                 took = ways[way](first)
                 first += frames if way else 0
-                if number:  # the first round warms caches, connections and the pool of threads
+                if number:  # the first round warms up caches, connections and the thread pool
                     seconds[way].append(megabytes / took)
         return IngestTimes(*seconds)
     finally:
@@ -110,7 +110,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
 
 
 def _plain(folder: Path, bodies: Sequence[bytes], frames: int, first: int) -> float:
-    """Returns the seconds for writing and syncing each record to a new file; files are kept, since reuse is faster."""
+    """Returns the seconds to write and sync each record to a new file; files are kept, because reuse is faster."""
     folder.mkdir(exist_ok=True)
     began = time.perf_counter()
     for number in range(first, first + frames):
@@ -140,7 +140,7 @@ def _ingest(
                 text = answer.read()
                 if answer.status == 202:
                     break
-                if answer.status != 409:  # the frame before it has not begun: its sender is behind
+                if answer.status != 409:  # the previous frame has not begun: its sender is behind
                     faults.append(f"frame {index}: {answer.status} {text[:300]!r}")
                     return
 
@@ -148,7 +148,7 @@ def _ingest(
     began = time.perf_counter()
     for thread in threads:
         thread.start()
-        time.sleep(0.002)  # one behind the other, as frames are taken
+        time.sleep(0.002)  # staggered, in the order in which frames are accepted
     for thread in threads:
         thread.join()
     took = time.perf_counter() - began
@@ -198,7 +198,7 @@ def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, s
     )
     verdict = "reached" if measured.share(measured.ingest) >= TARGET else "missed"
     return (
-        f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB a round and way; "
+        f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB per round and way; "
         f"HTTP over {senders} connections, one WebSocket with {UNANSWERED} messages unanswered\n\n"
         "| round | plain fsynced writes, MB/s | HTTP, MB/s | share | WebSocket, MB/s | share |\n"
         f"|---|---|---|---|---|---|\n{rows}\n\n"

@@ -1,7 +1,8 @@
 """Peak memory of a reconstruction compared with the service's estimate (server/health/estimate.py).
 
-Frame 0 and two updates of a ball in the middle of a ring of cameras, in few iterations: memory does not depend on them.
-And memory of a service whose scenes all sleep, with the time of their listing and of a first view.
+Frame 0 and two updates of a ball in the middle of a ring of cameras are reconstructed with few iterations, on which
+memory does not depend. Another study measures a service whose scenes all sleep: its memory, and the time of
+listing and of a first view.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from studies.running.process import Service
 
 
 def ring(count: int, size: int) -> Rig:
-    """Creates cameras around the origin, at a distance of 2 m."""
+    """Creates a ring of cameras around the origin, at a distance of 2 m."""
     lens = np.array([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
     cameras = []
     for k in range(count):
@@ -42,7 +43,7 @@ def ring(count: int, size: int) -> Rig:
 
 
 def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
-    """Creates a ball that moves by one pixel per frame."""
+    """Creates a frame of a ball that moves by one pixel per frame."""
     rows, columns = np.mgrid[:size, :size]
     ball = np.hypot(rows - size / 2, columns - size / 2 - index) < 0.24 * size
     picture = np.zeros((size, size, 3), np.uint8)
@@ -52,11 +53,11 @@ def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
 
 
 def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) -> dict[str, float]:
-    """Reconstructs and returns measured and estimated peak MB, their ratio, and the number of Gaussians."""
+    """Returns the measured and estimated peak memory in MB, their ratio, and the number of Gaussians."""
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.warm_up import compile_in_processes
 
-    compile_in_processes()  # compilers would count
+    compile_in_processes()  # or the compilers would count
     static = {"iterations": 8, "max_gaussians": gaussians}
     settings = preset("scas4d", {"static": static, "update": {"iterations": 4}, "scene": {"image_scale": scale}})
     rig = ring(cameras, size)
@@ -66,7 +67,7 @@ def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) 
     first = frame(rig, size, 0, masks)
     static_scene = "scas4d_core.first_frame.static_scene"
     with varied(f"{static_scene}.INITIAL_SHARE", 1.0), varied(f"{static_scene}.MIN_VIEWS", 0):
-        reconstruction = Reconstruction.start(rig, first, settings, points=cloud)  # every Gaussian asked for stays
+        reconstruction = Reconstruction.start(rig, first, settings, points=cloud)  # keeps every requested Gaussian
     for index in (1, 2):
         reconstruction.step(frame(rig, size, index, masks))
     peak = peak_megabytes() or float("nan")
@@ -76,15 +77,17 @@ def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) 
 
 
 def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float]:
-    """Copies a scene's folder, starts a service on the sleeping copies, and requests views of some.
+    """Copies a scene's folder, starts a service on the sleeping copies, and requests views of some of them.
 
     Args:
-        scene: folder of a scene with committed frames, in the data folder of a service that has ended.
-        count: copies. views: scenes that are woken, one after the other. work: data folder; what is there goes.
+        scene: folder of a scene with committed frames, in the data folder of a service that has stopped.
+        count: number of copies.
+        views: number of scenes that are woken, one after the other.
+        work: data folder; its contents are deleted.
 
     Returns:
-        MB a scene; seconds from the start to the list, where the folders are new to the service and later; median and
-        longest seconds to the first view of a scene.
+        MB per scene; seconds from the start to the list, if the folders are new to the service and if they are not; and
+        median and longest seconds to the first view of a scene.
     """
     shutil.rmtree(work, ignore_errors=True)
     empty, full = work / "empty", DataFolder(work / "full")
@@ -95,7 +98,7 @@ def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float
         folder = full.scene(name)
         shutil.copytree(scene, folder.path)
         write_definition(folder, replace(definition, id=name))
-        os.utime(folder.journal, (0, 0))  # used long ago
+        os.utime(folder.journal, (0, 0))  # last used long ago
     megabytes = {}
     for name, data in (("empty", empty), ("new", full.path), ("again", full.path)):
         data.mkdir(exist_ok=True)

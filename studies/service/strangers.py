@@ -1,7 +1,7 @@
-"""Cost of clients without a token: `/health/live`, memory and updates with and without an attack, in alternation.
+"""Cost of clients without a token: `/health/live`, memory and updates, with and without an attack, in alternation.
 
-The attack is `studies.service.attack`, in a process of its own; a service runs with a token and one without. The scene
-goes on updating all the time, in the turns with the attack until its last connection is closed.
+The attack is `studies.service.attack`, in a separate process. One service runs with a token and one without. The scene
+is updated all the time; in turns with the attack, until its last connection is closed.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from studies.running.study import Study, Updates
 P99_MS, MEMORY_MB, CLOSED_S, SLOWER = 50.0, 50.0, 60.0, 1.1
 TOKEN = "of-the-study-and-of-nobody-else"
 EVERY_S = 0.05
-"""Between two questions to `/health/live`, each over a connection of its own."""
+"""Interval between two requests to `/health/live`, each over its own connection."""
 PATIENCE_S = 120.0
 AT_ONCE = 4
 WARM_UP = 3
-"""Updates before anything is measured: the first ones compile or load kernels and start cold."""
+"""Updates before the measurement: the first ones compile or load kernels and start cold."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """Size of an attack: bytes of an endless header, incomplete headers, hanging uploads."""
+    """Size of an attack: bytes of an endless header, half-sent headers, stalled uploads."""
 
     header: int = 300_000_000
     halves: int = 300
@@ -47,8 +47,10 @@ class AttackTimes:
     """Measurements of all rounds, with or without the attack.
 
     Attributes:
-        health: ms of each answer of `/health/live`. lost: questions without an answer of 200. memory: largest MB of the
-            process that answers. updates: seconds of each.
+        health: response time of each request to `/health/live`, in ms.
+        lost: number of these requests without a response of 200.
+        memory: largest memory of the service's process, in MB.
+        updates: seconds of each update.
     """
 
     health: list[float] = field(default_factory=list)
@@ -57,7 +59,7 @@ class AttackTimes:
     updates: list[float] = field(default_factory=list)
 
     def p(self, percent: float) -> float:
-        """Percentile of the health check, in ms."""
+        """Returns a percentile of the response times of the health check, in ms."""
         return float(np.percentile(self.health, percent))
 
 
@@ -98,8 +100,12 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
     """Runs the attack on one service.
 
     Args:
-        study: frames and settings of the scene. attack: how much. turns: without and with the attack.
-        seconds: of a turn without, at least. token: whether the service has one, which the attack does not know.
+        study: frames and settings of the scene.
+        attack: size of the attack.
+        turns: number of turns without and with the attack.
+        seconds: shortest duration of a turn without the attack.
+        token: whether the service has a token, which the attack does not know.
+        echo: prints the progress.
     """
     environment = {**study.environment, **({"SCAS4D_TOKEN": TOKEN} if token else {})}
     name = "strangers-token" if token else "strangers"
@@ -118,7 +124,7 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
                 while time.monotonic() < until:
                     without.updates += updates.run(AT_ONCE)
             with Watch(service, attacked):
-                upload = f"/v1/scenes/{scene}/frames/{updates.next + AT_ONCE}"  # of a frame that is never sent
+                upload = f"/v1/scenes/{scene}/frames/{updates.next + AT_ONCE}"  # for a frame that is never sent
                 attacker = _start(service.port, upload, attack)
                 while attacker.poll() is None:
                     attacked.updates += updates.run(AT_ONCE)
@@ -145,7 +151,12 @@ def compare(
     """Returns the row of the table.
 
     Args:
-        closed: seconds until the last connection was closed. left: connections that were not.
+        attack: size of the attack.
+        without: measurements without the attack.
+        attacked: measurements with the attack.
+        closed: seconds until the last connection was closed.
+        left: number of connections that were not closed.
+        token: whether the service has a token.
     """
     slower = statistics.median(attacked.updates) / statistics.median(without.updates)
     memory = attacked.memory - without.memory
@@ -154,7 +165,7 @@ def compare(
         said
         for missed, said in (
             (late > P99_MS, f"/health/live p99 {late:+.1f} ms"),
-            (attacked.lost > 0, f"{attacked.lost} health checks without an answer"),
+            (attacked.lost > 0, f"{attacked.lost} health checks without a response"),
             (memory > MEMORY_MB, f"memory {memory:+.0f} MB"),
             (left > 0 or closed > CLOSED_S, f"{left} connections left, the others closed after {closed:.0f} s"),
             (slower > SLOWER, f"updates {slower:.2f} times"),
@@ -163,14 +174,14 @@ def compare(
     ]
     summary = (
         f"/health/live p50 {without.p(50):.1f} → {attacked.p(50):.1f} ms, p99 {without.p(99):.1f} → "
-        f"{attacked.p(99):.1f} ms, {attacked.lost} of {len(attacked.health)} without an answer; memory "
-        f"{without.memory:.0f} → {attacked.memory:.0f} MB; all closed after {closed:.0f} s; an update "
+        f"{attacked.p(99):.1f} ms, {attacked.lost} of {len(attacked.health)} without a response; memory "
+        f"{without.memory:.0f} → {attacked.memory:.0f} MB; all closed after {closed:.0f} s; update "
         f"{statistics.median(without.updates):.3f} → {statistics.median(attacked.updates):.3f} s ({slower:.2f} times)"
     )
     return ScenarioResult(
         f"strangers, {'a token' if token else 'no token'}: an endless header of {attack.header / 1e6:.0f} MB, "
-        f"{attack.halves} half-sent headers, {attack.uploads} hanging uploads at once",
-        f"/health/live answers, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "
+        f"{attack.halves} half-sent headers, {attack.uploads} stalled uploads at once",
+        f"/health/live responds, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "
         f"update ≤ {SLOWER:g} times",
         summary,
         faults,

@@ -1,8 +1,9 @@
-"""Live views during updates: a scene under an open-loop load of renders, and how each slows the other.
+"""Live views during updates: how much updates and an open-loop load of renders slow each other.
 
-A service runs in a process of its own. For each rate: views while nothing is updated, updates while nobody looks, and
-both together, in turns, because a machine's speed drifts. Arrivals are at fixed times whatever came of the requests
-before, and latency counts from the time that a request was due: a service that falls behind shows.
+A service runs in a separate process. For each rate, the study measures views while nothing is updated, updates while
+nobody views, and both together, in alternation, because a machine's speed drifts. Requests start at fixed times,
+whatever became of the earlier ones. Latency counts from the time at which a request was due, so that a service that
+falls behind is noticed.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from studies.running.study import Updates, encoded_frames
 
 TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0
-"""Of views while nothing is updated, a turn."""
+"""Duration of views per turn while nothing is updated."""
 WARM_UP = 3
-"""Updates before anything is measured: the first ones compile or load kernels and start cold."""
+"""Updates before the measurement: the first ones compile or load kernels and start cold."""
 
 
 @dataclass
@@ -40,8 +41,12 @@ class ViewTimes:
     """Latencies and update times at one rate of views.
 
     Attributes:
-        idle, loaded: ms, latency of each view without and during updates. alone, together: seconds of each update
-            without and with views. refused: views without an answer of 200.
+        rate: views per second.
+        idle: latency of each view without updates, in ms.
+        loaded: latency of each view during updates, in ms.
+        alone: seconds of each update without views.
+        together: seconds of each update with views.
+        refused: number of views without a response of 200.
     """
 
     rate: float
@@ -53,7 +58,7 @@ class ViewTimes:
 
     @property
     def latency(self) -> float:
-        """Ratio of the median during updates to the median without."""
+        """Ratio of the median latency during updates to the median without."""
         return statistics.median(self.loaded) / statistics.median(self.idle)
 
     @property
@@ -118,12 +123,18 @@ def measure(
     environment: Mapping[str, str],
     echo: Echo,
 ) -> list[ViewTimes]:
-    """Runs the study.
+    """Measures views and updates, alone and together, at each rate.
 
     Args:
-        folder: for the service's data; what is there goes.
-        rates: views a second. updates: a turn, without and with views. turns: of each rate.
-        width: pixels of a view. settings: of the scene. environment: of the service.
+        capture: capture whose frames are sent.
+        folder: folder for the service's data; its contents are deleted.
+        rates: views per second.
+        updates: updates per turn, without and with views.
+        turns: turns per rate.
+        width: width of a view in pixels.
+        settings: settings of the scene.
+        environment: environment variables of the service.
+        echo: prints the progress.
     """
     shutil.rmtree(folder, ignore_errors=True)
     data = folder / "data"
@@ -141,7 +152,7 @@ def measure(
         frames.run(WARM_UP)
         url = f"http://127.0.0.1:{service.port}/v1/scenes/{scene}/"
         names = capture.rig.names
-        with Load(url, names, 2.0, width):  # connections, the reader's kernels
+        with Load(url, names, 2.0, width):  # opens connections and loads the reader's kernels
             time.sleep(3.0)
         times = [ViewTimes(rate) for rate in rates]
         for _ in range(turns):
@@ -180,8 +191,8 @@ def line(row: ViewTimes) -> str:
 def table(rows: Sequence[ViewTimes]) -> str:
     """Formats the results as Markdown, with the target."""
     head = [
-        "| views a second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
-        "slower | no answer |",
+        "| views per second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
+        "slower | no response |",
         "|---|---|---|---|---|---|---|---|",
     ]
     text = "\n".join([*head, *map(line, rows)])
@@ -189,7 +200,7 @@ def table(rows: Sequence[ViewTimes]) -> str:
         if row.rate == TARGET_RATE:
             reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0
             text += (
-                f"\n\nTarget at {TARGET_RATE:g} a second: median at most {TARGET_LATENCY:g} times the idle one, "
+                f"\n\nTarget at {TARGET_RATE:g} per second: median at most {TARGET_LATENCY:g} times the idle one, "
                 f"updates at most {100 * TARGET_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
                 f"({row.latency:.2f} times, {100 * row.slower:+.0f} %)."
             )
@@ -197,7 +208,7 @@ def table(rows: Sequence[ViewTimes]) -> str:
 
 
 def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turns: int) -> str:
-    """Returns the table with the machine and sources that it was measured on."""
+    """Returns the table with the date and the machine of the measurement."""
     day = datetime.now(UTC).date().isoformat()
     return (
         f"Measured {day} on {in_words(machine())}: `{capture}`, views {width} pixels wide as JPEG, every camera of the "

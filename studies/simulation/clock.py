@@ -12,11 +12,11 @@ Arguments = TypeVarTuple("Arguments")
 
 
 class StandstillError(RuntimeError):
-    """Raised if every task waits and there is no timer that could wake one."""
+    """Raised if every task is waiting and no timer can wake one."""
 
 
 class _Jump(selectors.SelectSelector):
-    """A selector that never waits for files, but advances the clock by the requested waiting time."""
+    """A selector that never waits for files, but advances the clock by the requested timeout."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,7 +24,7 @@ class _Jump(selectors.SelectSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         if timeout is None:
-            raise StandstillError("nothing is left to happen, and the simulation has not ended")
+            raise StandstillError("no timer is left, but the simulation has not ended")
         self.now += max(0.0, timeout)
         return []
 

@@ -1,4 +1,4 @@
-"""Ray from the service's point of view: a queue, a head that places and detects, and nodes that fail and return."""
+"""Ray from the service's point of view: a queue, a head that places processes, and nodes that fail and return."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from studies.simulation.nodes import Capacity, Node, NodeState, Placed
 
 
 class SimulatedCluster:
-    """Places processes on nodes with room, in the order of waiting time among those that fit.
+    """Places processes on nodes with room; of the processes that fit, the one that has waited longest is next.
 
     Args:
-        count: of nodes. cpus, memory: of each. kinds: of needs. random: draws delays and nodes.
+        count: number of nodes.
+        cpus: CPUs per node.
+        memory: bytes of memory per node.
+        kinds: kinds of resource needs.
+        random: generator that draws delays and nodes.
 
     Attributes:
-        answers: the head places and notices.
+        answers: whether the head responds, that is, places processes and detects failures.
     """
 
     def __init__(self, count: int, cpus: float, memory: int, kinds: Sequence[ResourceNeeds], random: Random) -> None:
@@ -34,7 +38,7 @@ class SimulatedCluster:
         self._serving = False
         self.answers = True
         self._silent: list[Node] = []
-        """Fell silent while the head did not answer."""
+        """Nodes that fell silent while the head did not respond."""
         for _ in range(count):
             self.join()
 
@@ -43,10 +47,10 @@ class SimulatedCluster:
         return self.loop.call_later(self.random.uniform(*delay) if isinstance(delay, tuple) else delay, call)
 
     def running(self) -> list[Node]:
-        """Returns the nodes that run and that Ray knows."""
+        """Returns the running nodes that Ray knows."""
         return [node for node in self.nodes if node.listed and node.state is NodeState.RUNNING]
 
-    # Places.
+    # Placement.
 
     def queue(self, process: Placed) -> None:
         """Requests a place for a process."""
@@ -69,7 +73,7 @@ class SimulatedCluster:
             self.later(1 / PLACED_PER_S, self._serve)
 
     def _first(self) -> int | None:
-        """Returns the kind of the next process to place."""
+        """Returns the kind of the next process to place, or None if none can be placed."""
         best: tuple[int, int] | None = None
         for kind, queue in enumerate(self._queues):
             while queue and not queue[0][1].queued:  # it was given up meanwhile
@@ -99,21 +103,21 @@ class SimulatedCluster:
     # Failures.
 
     def join(self) -> None:
-        """Adds a new node."""
+        """Adds a new node to the cluster."""
         node = Node(self._made, self._cpus, self._memory)
         self._made += 1
         self.nodes.append(node)
         self._changed(node)
 
     def kill(self, node: Node) -> None:
-        """Ends a node with all its processes; a new one joins after a delay."""
+        """Kills a node with all its processes; a new node joins after a delay."""
         self._fails(node, NodeState.DEAD)
         for process in tuple(node.processes):
             process.kill()
         self.later(REPLACED_S, self.join)
 
     def stop(self, node: Node, seconds: float) -> None:
-        """Stops a node for a while, and its workers with it."""
+        """Stops a node and its workers for a while."""
         self._fails(node, NodeState.STOPPED)
         for process in tuple(node.processes):
             process.pause()
@@ -125,7 +129,7 @@ class SimulatedCluster:
         self.later(seconds, lambda: self._back(node))
 
     def head_down(self, seconds: float) -> None:
-        """Suspends placement and failure detection of the head for a while."""
+        """Suspends placement and failure detection by the head for a while."""
         self.answers = False
         self.capacity.head(False)
         self.later(seconds, self._head_back)

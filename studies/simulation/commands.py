@@ -11,20 +11,20 @@ from studies.simulation.delays import HEAD_S
 
 
 def simulate(
-    scenes: Annotated[int, typer.Option(min=8, help="Scenes, which fill 85 % of the CPUs.")] = 5000,
-    nodes: Annotated[int, typer.Option(min=3, help="Nodes.")] = 200,
-    failures: Annotated[int, typer.Option(min=20, help="Failures, of nodes, workers, the service, the head.")] = 1000,
-    frames: Annotated[int, typer.Option(min=2, help="Frames of each scene.")] = 40,
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    scenes: Annotated[int, typer.Option(min=8, help="Number of scenes, which fill 85 % of the CPUs.")] = 5000,
+    nodes: Annotated[int, typer.Option(min=3, help="Number of nodes.")] = 200,
+    failures: Annotated[int, typer.Option(min=20, help="Failures of nodes, workers, service and head.")] = 1000,
+    frames: Annotated[int, typer.Option(min=2, help="Frames per scene.")] = 40,
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     silent: Annotated[
         tuple[float, float],
-        typer.Option(help="The head of the cluster does not answer for so long, from and to, seconds."),
+        typer.Option(help="Shortest and longest time without the head of the cluster, in seconds."),
     ] = HEAD_S,
     out: Page = None,
 ) -> None:
-    """Simulates a big cluster by a virtual clock: is a frame lost or run twice, and how soon have scenes a place?
+    """Simulates a large cluster on a virtual clock: are frames lost or run twice, and how soon do scenes get a place?
 
-    The supervision of workers and the epochs of their folders are the service's own; Ray, nodes and workers are models.
+    The supervision of workers and the epochs of their folders are the service's; Ray, nodes and workers are models.
 
     Example: scripts/bench simulate --scenes 400 --nodes 16 --failures 200
     """

@@ -12,11 +12,11 @@ from studies.simulation.delays import PAUSE_S, Range
 from studies.simulation.service import SimulatedService
 
 AGAIN_S = 5.0
-"""A failure for which there is no object, as a node that runs, is tried again after so long."""
+"""Delay before a failure is tried again if it found no target, for example no running node."""
 
 
 class Failure(StrEnum):
-    """A component that can fail, in words."""
+    """A kind of failure, in words."""
 
     KILLED = "a node killed"
     STOPPED = "a node stopped and continued"
@@ -35,7 +35,7 @@ SHARES = {
     Failure.HEAD: 0.01,
 }
 LEAST = 2
-"""Of each kind."""
+"""Smallest number of failures of each kind."""
 
 
 def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[float, Failure]]:
@@ -52,13 +52,15 @@ def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[fl
 
 
 class Failures:
-    """Executes the failures.
+    """Triggers the failures.
 
     Args:
-        silent: the head does not answer for so long.
+        cluster: the cluster.
+        service: the service.
+        silent: shortest and longest time for which the head does not respond, in seconds.
 
     Attributes:
-        happened: number by kind.
+        happened: number of failures that have happened, by kind.
     """
 
     def __init__(self, cluster: SimulatedCluster, service: SimulatedService, silent: Range) -> None:

@@ -1,4 +1,4 @@
-"""Nodes of the modelled cluster, and the time during which one of them had room."""
+"""Nodes of the modelled cluster, and the time during which at least one of them had room."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from server.cluster.resource_needs import ResourceNeeds
 
 
 class NodeState(Enum):
-    """The actual state of a node, which Ray learns with a delay."""
+    """Actual state of a node, which Ray learns with a delay."""
 
     RUNNING = auto()
     STOPPED = auto()
-    """By SIGSTOP: its workers stand still."""
+    """Stopped by SIGSTOP, together with its workers."""
     CUT = auto()
-    """Its workers go on; no message passes."""
+    """Disconnected: its workers continue, but no message passes."""
     DEAD = auto()
 
 
 class Placed(Protocol):
-    """A process from the point of view of its node."""
+    """A process as its node sees it."""
 
     needs: ResourceNeeds
 
@@ -37,7 +37,7 @@ class Placed(Protocol):
         """Called when the node is stopped."""
 
     def resume(self) -> None:
-        """Called when the node is continued."""
+        """Called when the node resumes."""
 
     def kill(self) -> None:
         """Called when the node has ended."""
@@ -51,8 +51,14 @@ class Node:
     """A machine of the cluster.
 
     Attributes:
-        cpus, memory: of it, bytes. listed: Ray counts with it. failed_at: when it last fell silent, seconds.
-        held: calls that wait until it can be reached again; dropped where Ray takes it for lost before.
+        number: number of the node.
+        cpus: number of CPUs.
+        memory: bytes of memory.
+        state: actual state of the node.
+        listed: whether Ray considers the node alive.
+        failed_at: time at which it last fell silent, in seconds.
+        processes: processes on the node.
+        held: calls that wait until the node can be reached again; dropped if Ray declares it lost before.
     """
 
     number: int
@@ -72,7 +78,7 @@ class Node:
         return self.free_cpus >= needs.cpus and self.free_memory >= needs.memory
 
     def load(self) -> float:
-        """Share of the node's scarcest resource that is in use."""
+        """Returns the used share of the node's scarcest resource."""
         return max(1 - self.free_cpus / self.cpus, 1 - self.free_memory / self.memory)
 
     def take(self, process: Placed) -> None:
@@ -92,13 +98,14 @@ class Node:
 
 
 class Capacity:
-    """Seconds during which a running, reachable node had room, per kind of resource needs.
+    """Measures the seconds during which a running, reachable node had room, per kind of resource needs.
 
     Args:
-        kinds: of needs. now: the clock.
+        kinds: kinds of resource needs.
+        now: returns the current time.
 
     Attributes:
-        listed: nodes with room by kind, as Ray knows them: one that is silent and not yet lost is among them.
+        listed: number of nodes with room per kind, as known to Ray, including silent nodes that are not yet lost.
     """
 
     def __init__(self, kinds: Sequence[ResourceNeeds], now: Callable[[], float]) -> None:
@@ -117,13 +124,13 @@ class Capacity:
         return self._numbers[needs.cpus, needs.memory]
 
     def seconds(self, kind: int) -> tuple[float, float]:
-        """Returns the seconds with room so far, and the part in which the head responded."""
+        """Returns the seconds with room so far, and the part of them in which the head responded."""
         self._count(kind)
         total, answered = self._seconds[kind]
         return total, answered
 
     def changed(self, node: Node) -> None:
-        """Re-evaluates a node."""
+        """Updates the counts after a node has changed."""
         none = [False] * len(self.kinds)
         listed_before, usable_before = self._seen.get(node, (none, none))
         fits = [node.fits(needs) for needs in self.kinds]

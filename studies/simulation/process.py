@@ -19,10 +19,11 @@ from studies.simulation.work import Work
 
 
 class SimulatedProcess:
-    """A worker process as described by `RayProcess`: after its end was reported, nothing of it reaches the service.
+    """A worker process that behaves like `RayProcess`: after its end was reported, nothing from it reaches the service.
 
     Attributes:
-        over: the service has given it up, or has ended. work: None before it has a place, and when it has ended.
+        over: whether the service has given the process up or has ended.
+        work: work of the process; None before it has a place and after it has ended.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class SimulatedProcess:
         """Whether the process waits for a place."""
         return self.node is None and not self.over
 
-    # Of the service.
+    # Called by the service.
 
     def send(self, message: Any) -> None:
         """See `ProcessHandle`."""
@@ -75,7 +76,7 @@ class SimulatedProcess:
             self._finish()
 
     def abandon(self) -> None:
-        """Handles the end of the service: the actor ends later; on a stopped node, after it continues."""
+        """Handles the end of the service: the actor ends later; on a stopped node, after the node resumes."""
         self._let_go()
         if self.work is not None:
             self.work.drift()
@@ -86,7 +87,7 @@ class SimulatedProcess:
         self.over = True
         self._placement.drop(self)
 
-    # Of the node.
+    # Called by the node.
 
     def place(self, node: Node) -> None:
         """Starts on the node that Ray has chosen, as soon as the node can be reached."""
@@ -104,12 +105,12 @@ class SimulatedProcess:
             self.work.resume()
 
     def kill(self) -> None:
-        """Ends with its node, before Ray detects it."""
+        """Ends with its node, before Ray notices."""
         if self.work is not None:
             self.work.end()
 
     def lost(self) -> None:
-        """Handles that Ray considers the node lost."""
+        """Handles that Ray has declared the node lost."""
         assert self.node is not None
         if self.work is not None:
             self.work.drift()
@@ -137,7 +138,7 @@ class SimulatedProcess:
         self.work = Work(self._cluster, frames, scene, folder, self._number, longest, self._say, self._gone)
 
     def _gone(self) -> None:
-        """Handles that the worker has ended by itself."""
+        """Handles that the worker has ended on its own."""
         assert self.node is not None
         if self.over:
             self._cluster.give(self.node, self)
@@ -193,7 +194,11 @@ class SimulatedPlacement(Placement):
     """Starts workers on the modelled cluster for one service instance.
 
     Args:
-        needs: of a scene's worker. between_s: seconds between the frames of a scene.
+        cluster: the modelled cluster.
+        frames: record of the frames.
+        times: record of placement and recovery times.
+        needs: returns the resource needs of a scene's worker.
+        between_s: seconds between the frames of a scene.
     """
 
     fenced = True
@@ -225,7 +230,7 @@ class SimulatedPlacement(Placement):
         return process
 
     def ending(self, stop: Coroutine[Any, Any, None]) -> None:
-        """Keeps the task that stops the worker of a scene that ends."""
+        """Keeps a reference to the task that stops the worker of an ending scene."""
         task = self.simulated.loop.create_task(stop)
         self._endings.add(task)
         task.add_done_callback(self._endings.discard)

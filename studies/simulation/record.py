@@ -1,12 +1,14 @@
-"""Record of a simulation: frames acknowledged, committed and reported; times of placement and of recovery.
+"""Record of a simulation: acknowledged, committed and reported frames, and times of placement and recovery.
 
-A frame is **run twice** if the service knew of one worker's commit of it (`FrameCommitted` or `Ready` of the scene's
-worker, or found by a new service; from then on clients see it), and another worker's commit was reported after it,
-or none. Two processes of one scene at a time, neither given up, count as well. A worker is **given up** for the folder
-of states once the service has started the next one: until then, what it still commits is taken over and kept.
+A frame is **run twice** if the service knew of one worker's commit of it, and later another worker's commit was
+reported, or none was left. The service knows of a commit from `FrameCommitted` or `Ready` of the scene's worker, or
+because a new service finds it; from then on clients see it. Two processes of one scene that run at the same time,
+neither given up, count as well. A worker is **given up** for the folder of states once the service has started the
+next one. Until then, its commits are taken over and kept.
 
-What a worker commits after the states were linked for the next, and before the link moves, is updated again by design
-(docs/cluster.md, Fencing). It was not reported, so it does not count as run twice; it is counted apart.
+Frames that a worker commits after the states were linked for the next worker, but before the link moves, are updated
+again by design (docs/cluster.md, Fencing). They were not reported, so they do not count as run twice; they are counted
+separately.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ class Hurried(Protocol):
 
 @dataclass(frozen=True)
 class FoundFrame:
-    """The file of a frame: its content, the worker that wrote it, and the number of that write."""
+    """File of a frame: its content, the worker that wrote it, and the number of that write."""
 
     state: str
     worker: int
@@ -39,12 +41,16 @@ class FoundFrame:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Counts of frames at the end. All except `read` and `again` must be 0.
+    """Counts of frames at the end; all except `read` and `again` must be 0.
 
     Attributes:
-        read: through the links. lost: acknowledged, and not read. foreign: read, and written by a worker that was given
-            up. different: read, and other bytes than an undisturbed chain has. twice: run twice. beside: processes that
-            began while another of their scene ran. again: updated again after a commit that was not reported.
+        read: frames read through the links.
+        lost: acknowledged frames that were not read.
+        foreign: frames that were read but written by a worker that was given up.
+        different: frames that were read but differ from those of an undisturbed chain.
+        twice: frames that were run twice.
+        beside: processes that started while another one of their scene was running.
+        again: frames that were updated again after a commit that was not reported.
     """
 
     read: int
@@ -60,8 +66,9 @@ class FrameRecord:
     """Frames of each scene.
 
     Attributes:
-        acknowledged: number of frames, on the service's disk. works: of workers that run, given up or not.
-        workers: that were started, each with an epoch of its own.
+        acknowledged: number of acknowledged frames on the service's disk, by scene.
+        works: work of running workers, given up or not, by scene.
+        workers: number of workers started, each with its own epoch.
     """
 
     def __init__(self) -> None:
@@ -77,7 +84,7 @@ class FrameRecord:
         self._twice: dict[str, set[int]] = {}
 
     def start(self, scene: str, beside: bool) -> int:
-        """Registers a started worker; returns its number. `beside`: whether the scene's previous one is active."""
+        """Registers a started worker; returns its number. `beside`: whether another process of the scene is active."""
         self.workers += 1
         self._newest[scene] = self.workers
         self._beside += beside
@@ -85,28 +92,28 @@ class FrameRecord:
 
     @property
     def adrift(self) -> int:
-        """Returns the number of files that workers wrote after they were given up."""
+        """Number of files that workers wrote after they were given up."""
         return len(self._adrift)
 
     def write(self, scene: str, worker: int) -> int:
-        """Registers a write of a worker; returns its number, which is stored in the file."""
+        """Registers a write by a worker; returns the number of the write, which is stored in the file."""
         self._writes += 1
         if worker != self._newest[scene]:
             self._adrift.add(self._writes)
         return self._writes
 
     def wrote(self, scene: str, index: int, worker: int) -> None:
-        """Records that the file of a frame is written."""
+        """Records that the file of a frame was written."""
         if worker == self._newest[scene]:
             self._kept.setdefault(scene, {})[index, worker] = None
 
     def report(self, scene: str, index: int, worker: int) -> None:
-        """Records that the service was informed of a committed frame."""
+        """Records that the service learned of a committed frame."""
         if self._reported.setdefault(scene, {}).setdefault(index, worker) != worker:
             self._twice.setdefault(scene, set()).add(index)
 
     def untold(self, scene: str, count: int) -> list[int]:
-        """Returns the committed ones of the first `count` frames that the service did not know."""
+        """Returns which of the first `count` frames are committed but were unknown to the service."""
         reported = self._reported.setdefault(scene, {})
         if gone := {index for index in reported if index >= count}:
             self._twice.setdefault(scene, set()).update(gone)
@@ -116,7 +123,9 @@ class FrameRecord:
         """Checks the frames of a scene that are read at the end.
 
         Args:
-            found: by index. chain: contents of an undisturbed run.
+            scene: id of the scene.
+            found: the frames that were read, by index.
+            chain: contents of the frames in an undisturbed run.
         """
         reported = self._reported.get(scene, {})
         twice = self._twice.get(scene, set()) | {
@@ -145,10 +154,13 @@ class TimeRecord:
     """Placement and recovery times of each scene.
 
     Attributes:
-        placed: seconds with room until a worker had a place, by the reason for which it was wanted; and those of them
-            in which the head answered. resumed: seconds from a failure until the scene went on, by failure; and those
-            of them without room. waited: seconds of processes that waited longer than `WAIT_S` for a place.
-        unexplained: those of them whose scene was not given a reason.
+        capacity: measures the time with room.
+        now: returns the current time.
+        placed: seconds with room until a worker got a place, and the part of them in which the head responded, by the
+            reason for the request.
+        resumed: seconds from a failure until the scene continued, and the part of them without room, by failure.
+        waited: seconds that processes waited for a place, if longer than `WAIT_S`.
+        unexplained: number of these processes whose scene was given no reason.
     """
 
     capacity: Capacity
@@ -166,7 +178,7 @@ class TimeRecord:
 
     @property
     def waiting(self) -> int:
-        """Returns the number of workers without a place."""
+        """Number of workers without a place."""
         return len(self._wanted)
 
     def want(self, scene: str, reason: str, kind: int) -> None:
@@ -194,7 +206,7 @@ class TimeRecord:
             self.unexplained += scene not in self._explained
 
     def forget(self) -> None:
-        """Drops all requests, because there is no service."""
+        """Drops all requests, because the service is down."""
         self._wanted.clear()
 
     def drop(self, scene: str) -> None:
@@ -203,7 +215,7 @@ class TimeRecord:
         self._hit.pop(scene, None)
 
     def hit(self, scene: str, failure: str, at: float, kind: int) -> None:
-        """Records a failure of the scene, at a time that may be past; an earlier unresolved failure has priority."""
+        """Records a failure of the scene at a time that may be past; an earlier unresolved failure has priority."""
         without = self.now() - self.capacity.seconds(kind)[0]
         self._hit.setdefault(scene, (failure, at, without))
 
@@ -216,5 +228,5 @@ class TimeRecord:
 
 
 def left_over(folder: Path) -> int:
-    """Returns the number of epoch folders of a scene, complete or not, in addition to the current one."""
+    """Returns the number of epoch folders of a scene, complete or not, besides the current one."""
     return sum(name.startswith("states.") for name in os.listdir(folder)) - 1

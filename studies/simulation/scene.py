@@ -1,4 +1,4 @@
-"""A scene of the simulated service: acknowledges frames, gives the worker one at a time, and counts the reports."""
+"""A scene of the simulated service: acknowledges frames, sends them to the worker one by one, and counts reports."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from studies.simulation.work import frame_file, listed, read_frame
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The requests of a user for a scene.
+    """A user's requests for a scene.
 
     Attributes:
-        frames: when each is sent, seconds. ends: when the scene may end, once all its frames are committed.
+        spec: specification of the scene.
+        kind: kind of its worker's resource needs.
+        frames: times at which its frames are sent, in seconds.
+        ends: time from which the scene may end, once all its frames are committed; None if it does not end.
     """
 
     spec: SceneSpec
@@ -39,7 +42,10 @@ class SimulatedScene:
     """Replacement for `server.updates.updates.Updates` of one service instance.
 
     Attributes:
-        worker: the real one. trouble: as in the scene's status. ended: a user has ended the scene.
+        plan: requests for the scene.
+        worker: the service's own supervision of the worker.
+        trouble: error in the scene's status.
+        ended: whether a user has ended the scene.
     """
 
     def __init__(self, plan: ScenePlan, placement: SimulatedPlacement, reason: str) -> None:
@@ -79,17 +85,17 @@ class SimulatedScene:
             self._next.cancel()
 
     def _recover(self) -> None:
-        """Reads which frames are committed, as a service does when it starts."""
+        """Reads which frames are committed, as a service does on startup."""
         states = self.plan.spec.folder.states
         if states.exists():
             self._learn(len(listed(states)))
 
     def _learn(self, count: int) -> None:
-        """Registers committed frames; their writer is read through the link, as by clients."""
+        """Registers committed frames; their writer is read through the link, as clients would."""
         for index in self._frames.untold(self.plan.name, count):
             try:
                 worker = read_frame(frame_file(self.plan.spec.folder.states, index)).worker
-            except FileNotFoundError:  # reported, and not to be read: no worker has this number
+            except FileNotFoundError:  # reported but unreadable: no worker has this number
                 worker = 0
             self._frames.report(self.plan.name, index, worker)
         self._committed = count

@@ -1,4 +1,4 @@
-"""The simulated service: owns all scenes, and recreates them from their folders after a restart."""
+"""The simulated service, which owns all scenes and recreates them from their folders after a restart."""
 
 from __future__ import annotations
 
@@ -16,17 +16,24 @@ from studies.simulation.scene import ScenePlan, SimulatedScene
 from studies.simulation.takeover import Takeovers
 
 INTERRUPTED = 20
-"""Scenes at most that an ending service was beginning an epoch of."""
+"""Maximum number of scenes whose epoch is just starting when the service ends."""
 
 
 class SimulatedService:
     """Runs one instance of the service at a time.
 
     Args:
-        needs: of a scene's worker. between_s: seconds between the frames of a scene.
+        cluster: the modelled cluster.
+        frames: record of the frames.
+        times: record of placement and recovery times.
+        takeovers: actions at the start of an epoch.
+        needs: returns the resource needs of a scene's worker.
+        between_s: seconds between the frames of a scene.
 
     Attributes:
-        up: it runs. plans: of all scenes that were asked for and not ended by their users.
+        up: whether the service is running.
+        plans: plans of all scenes that were requested and not ended by their users.
+        scenes: scenes of the running instance, by id.
     """
 
     def __init__(
@@ -52,14 +59,14 @@ class SimulatedService:
         return self.up and all(name in self.scenes and self.scenes[name].done for name in self.plans)
 
     def create(self, plan: ScenePlan) -> None:
-        """Creates a scene; while the service is down, creation waits until it is back."""
+        """Creates a scene; if the service is down, the scene is opened after the restart."""
         self.plans[plan.name] = plan
         plan.spec.folder.path.mkdir(parents=True)
         if self.up:
             self._open(plan, "new")
 
     async def restart(self) -> None:
-        """Ends the service and restarts it later, scene by scene."""
+        """Ends the service and restarts it later; scenes are recovered one by one."""
         self.up = False
         now = self._cluster.loop.time()
         living = [scene for scene in self.scenes.values() if not scene.ended]

@@ -1,4 +1,4 @@
-"""`scripts/bench simulate`: runs a cluster through its failures, and checks what remains in the folders."""
+"""`scripts/bench simulate`: runs a cluster through failures and checks what remains in the folders."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ RIGS = (
     (0.35, Size(width=640, height=480)),
     (0.15, Size(width=1280, height=720, cameras=24)),
 )
-"""Rigs of scenes, and how many of the scenes have each."""
+"""Rigs, each with the share of the scenes that have it."""
 FULL = 0.85
-"""Share of the CPUs that the scenes take."""
+"""Share of the CPUs that the scenes use."""
 CPU_BYTES = 1.6e9
-"""Memory of a node for each of its CPUs; the scenes' workers take 1.3 GB on average."""
+"""Memory of a node per CPU; a scene's worker takes 1.3 GB on average."""
 APART_S = 1440.0
-"""Seconds between the failures, for each node."""
+"""Mean seconds between the failures of one node."""
 CREATED_S = 60.0
-"""Scenes are created within so long."""
+"""Time within which the scenes are created."""
 MORE = 0.25
-"""Scenes beyond the room, as a share of the CPUs: with them more are asked for than there are."""
+"""Scenes beyond the capacity, as a share of the CPUs; with them, demand exceeds supply."""
 MORE_AT, LEAVE_AT = 0.5, 0.6
-"""When those are asked for, and when as many others end, as shares of the time."""
+"""When these scenes are requested, and when as many others end, as fractions of the duration."""
 PATIENCE_S = 3600.0
-"""Frames that are not committed so long after the last failure are lost."""
+"""Frames that are not committed this long after the last failure are lost."""
 CALM_S = 420.0
-"""Whatever was stopped goes on and ends within so long, and folders are swept."""
+"""Time in which everything that was stopped resumes and ends, and folders are cleaned up."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,12 @@ class Sizes:
     """The size of a simulation.
 
     Attributes:
-        frames: of a scene. silent: the head of the cluster does not answer for so long, seconds.
+        scenes: number of scenes.
+        nodes: number of nodes.
+        failures: number of failures.
+        frames: frames per scene.
+        seed: seed of all random draws.
+        silent: shortest and longest time for which the head does not respond, in seconds.
     """
 
     scenes: int = 5000
@@ -75,12 +80,12 @@ class Sizes:
 
     @property
     def more(self) -> int:
-        """Number of scenes that exceed the capacity."""
+        """Number of scenes beyond the capacity."""
         return min(self.scenes, math.ceil(MORE * self.nodes * self.cpus))
 
     @property
     def seconds(self) -> float:
-        """Duration in which frames are sent and failures happen."""
+        """Seconds during which frames are sent and failures happen."""
         return self.failures * APART_S / self.nodes
 
 
@@ -89,10 +94,18 @@ class Outcome:
     """The results of a simulation.
 
     Attributes:
-        placed, resumed, waited, unexplained: see `TimeRecord`. unplaced: workers that are wanted and have no place at
-            the end. happened: failures by kind. workers: that were started. adrift: files written by workers that were
-            given up. folders: of earlier epochs that are left, of
-            scenes that no user has ended. seconds: of virtual time.
+        sizes: size of the simulation.
+        frames: counts of the frames.
+        placed: see `TimeRecord`.
+        resumed: see `TimeRecord`.
+        waited: see `TimeRecord`.
+        unexplained: see `TimeRecord`.
+        unplaced: number of workers without a place at the end.
+        happened: number of failures by kind.
+        workers: number of workers started.
+        adrift: number of files written by workers that were given up.
+        folders: number of folders of earlier epochs that are left in scenes that no user has ended.
+        seconds: duration in virtual time.
     """
 
     sizes: Sizes
@@ -147,7 +160,7 @@ async def _run(sizes: Sizes, data: DataFolder) -> Outcome:
         await asyncio.sleep(CALM_S)
         service.end()
     if faults:
-        raise RuntimeError(f"the simulation went wrong: {faults[0]['message']}") from faults[0].get("exception")
+        raise RuntimeError(f"the simulation failed: {faults[0]['message']}") from faults[0].get("exception")
     kept = [plan.spec.folder for plan, _ in plans if plan.ends is None]
     return Outcome(
         sizes=sizes,
@@ -172,7 +185,7 @@ def _needs(spec: SceneSpec) -> ResourceNeeds:
 
 
 def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: Random) -> list[tuple[ScenePlan, float]]:
-    """Returns all scenes with creation times; the first ones end in time for those that exceed the capacity."""
+    """Returns all scenes and their creation times; the first ones end in time for those beyond the capacity."""
     end, plans = sizes.seconds, []
     shares = [share for share, _ in RIGS]
     for number in range(sizes.scenes + sizes.more):
@@ -190,7 +203,7 @@ def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: R
 
 
 def _checked(frames: FrameRecord, plan: ScenePlan) -> FrameCounts:
-    """Reads the states of a scene through the link, as clients do."""
+    """Checks the states of a scene, which are read through the link, as by clients."""
     states, name = plan.spec.folder.states, plan.name
     counts_by_frame = {index: read_frame(frame_file(states, index)) for index in listed(states)}
     chain, state = [], name

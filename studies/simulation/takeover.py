@@ -14,7 +14,7 @@ from server.storage.layout import SceneFolder
 from studies.simulation.record import FrameRecord
 
 HURRIED = 0.5
-"""Chance that a worker of the scene commits at a moment: far more often than by itself."""
+"""Probability that a worker of the scene commits at such a moment, far higher than without intervention."""
 
 
 class _Interrupted(Exception):
@@ -22,10 +22,10 @@ class _Interrupted(Exception):
 
 
 class Takeovers:
-    """Runs other actions whenever `begin_epoch` syncs a folder.
+    """Inserts other actions whenever `begin_epoch` syncs a folder.
 
-    It does so when the states are linked, and their folder has no name yet; when it has, and the link has not moved;
-    and when that has moved.
+    This happens when the states are linked but their folder has no name yet, when it has a name but the link has not
+    moved, and after the link has moved.
     """
 
     def __init__(self, record: FrameRecord, random: Random) -> None:
@@ -34,12 +34,12 @@ class Takeovers:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Runs these actions inside the context."""
+        """Enables these actions within the context."""
         with mock.patch.object(fencing, "sync_folder", self._sync):
             yield
 
     def interrupt(self, folder: SceneFolder) -> None:
-        """Ends the service during the start of an epoch of the scene, at one of these points."""
+        """Ends the service during the start of an epoch of the scene, at one of these moments."""
         self._left = self._random.randrange(3)
         with suppress(_Interrupted):
             fencing.begin_epoch(folder.states, folder.worker_lock)
@@ -48,7 +48,7 @@ class Takeovers:
     def _sync(self, folder: Path) -> None:
         part = folder.name.endswith(fencing.PART)
         if self._left == 0:
-            if part:  # a service that is killed does not clean up
+            if part:  # a killed service does not clean up
                 folder.with_name(folder.name.replace(fencing.PART, f".left{fencing.PART}")).mkdir()
             raise _Interrupted
         if self._left is not None:

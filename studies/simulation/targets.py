@@ -10,7 +10,7 @@ from studies.simulation.delays import WAIT_S
 from studies.simulation.simulate import Outcome
 
 SOON_S, SHARE = 10.0, 0.99
-"""This share of the workers has a place so soon, counted while a node has room."""
+"""Target: this share of the workers gets a place within this time, counted only while a node has room."""
 REASONS = {"new": "of a new scene", "loss": "after a loss", "restart": "after a restart of the service"}
 AFTER = {"node": "a node's failure", "worker": "a worker's end", "service": "the service's end"}
 
@@ -50,7 +50,7 @@ def rows(outcome: Outcome) -> list[Row]:
     for reason, words in REASONS.items():
         if times := outcome.placed.get(reason):
             room, answered = (_share(each) for each in zip(*times, strict=True))
-            share_of = f"{room:.2%} of {len(times):,}; while the head answers {answered:.2%}"
+            share_of = f"{room:.2%} of {len(times):,}; while the head responds {answered:.2%}"
             table_rows.append(Row(f"… {words}", share_of))
     longest = max(outcome.waited, default=0.0)
     table_rows += [
@@ -60,16 +60,16 @@ def rows(outcome: Outcome) -> list[Row]:
             f" of {len(outcome.waited):,}",
         ),
         _none(
-            "scenes that have no worker in the end",
+            "scenes without a worker at the end",
             outcome.unplaced,
-            f"; {outcome.sizes.more:,} were asked for beyond the room, the longest wait was {longest:.0f} s",
+            f"; {outcome.sizes.more:,} were requested beyond the capacity, the longest wait was {longest:.0f} s",
         ),
-        _none("folders of workers before that are left in the end", outcome.folders),
+        _none("folders of earlier workers left at the end", outcome.folders),
         Row("frames updated again after a commit that was not reported", f"{frames.again:,}"),
     ]
     for failure, words in AFTER.items():
         if times := outcome.resumed.get(failure):
-            table_rows.append(Row(f"from {words} until the scene goes on, while a node has room", _seconds(times)))
+            table_rows.append(Row(f"from {words} until the scene continues, while a node has room", _seconds(times)))
     return table_rows
 
 
@@ -103,6 +103,6 @@ def _seconds(times: Sequence[tuple[float, float]]) -> str:
     late = with_room[int(0.99 * (len(with_room) - 1))]
     longest = max(total for total, _ in times)
     return (
-        f"median {median(with_room):.1f} s, 99 % {late:.1f} s, most {with_room[-1]:.1f} s; "
-        f"with waits for room, most {longest:.0f} s"
+        f"median {median(with_room):.1f} s, 99 % {late:.1f} s, maximum {with_room[-1]:.1f} s; "
+        f"with waits for room, maximum {longest:.0f} s"
     )

@@ -1,4 +1,4 @@
-"""The work of a modelled worker: commits frames in order to its epoch's folder, and continues after it is given up."""
+"""Work of a modelled worker: commits frames in order to its epoch's folder, and continues after it is given up."""
 
 from __future__ import annotations
 
@@ -90,14 +90,20 @@ class _Timer:
 
 
 class Work:
-    """The activity of a worker process.
+    """Work of a worker process.
 
-    A worker that was given up and still runs is a harder opponent than a real one: it has no orders, and yet commits
-    all frames that are acknowledged, and its own newest again and again.
+    A worker that was given up but still runs is harder to deal with than a real one: without any orders, it commits all
+    acknowledged frames and rewrites its own newest frame again and again.
 
     Args:
-        scene: its name. folder: of its epoch. worker: its number. longest: seconds of an update.
-        say: sends a message to the service. gone: called when it ends by itself.
+        cluster: the modelled cluster.
+        record: record of the frames.
+        scene: id of the scene.
+        folder: folder of the worker's epoch.
+        worker: number of the worker.
+        longest: longest duration of an update, in seconds.
+        say: sends a message to the service.
+        gone: called when the worker ends on its own.
     """
 
     def __init__(
@@ -124,7 +130,7 @@ class Work:
         self._step.set(START_S, self._open)
 
     def order(self, message: FrameReady) -> None:
-        """Accepts a frame."""
+        """Accepts a frame to process."""
         if self._ended or self._adrift or self._at is not None:
             return
         if message.index != self._frames:
@@ -153,7 +159,7 @@ class Work:
                 self._go_on()
 
     def hurry(self) -> None:
-        """Commits the next frame immediately, at the worst moment as chosen by the caller."""
+        """Commits the next frame immediately; the caller chooses the worst moment for it."""
         if not self._opened or self._stopped or self._ended:
             return
         if self._at is not None or (self._adrift and self._frames < self._record.acknowledged[self._scene]):
@@ -177,7 +183,7 @@ class Work:
             self._frames = self._first_own = len(listed(self._folder))
             if self._frames:
                 self._state = read_frame(frame_file(self._folder, self._frames - 1)).state
-        except FileNotFoundError:  # removed: it was given up long ago
+        except FileNotFoundError:  # the folder was removed: the worker was given up long ago
             self._leave()
             return
         self._opened = True

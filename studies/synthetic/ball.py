@@ -11,14 +11,17 @@ from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 
 SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
-"""Metres, and radians about the vertical, from the first frame to the second."""
+"""Shift in metres, and rotation in radians about the vertical axis, from the first frame to the second."""
 
 
 def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> Rig:
     """Returns square cameras of ``size`` pixels that look at the origin, alternately from above and below; y is down.
 
     Args:
-        count: even, so that their mean is the origin. turned: radians, of all of them about the vertical.
+        size: width and height of the images in pixels.
+        count: number of cameras; even, so that their mean position is the origin.
+        turned: rotation of all cameras about the vertical axis, in radians.
+        names: prefix of the camera names.
     """
     lens = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
     cameras = []
@@ -35,7 +38,7 @@ def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> 
 
 
 def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
-    """Creates a ball of 0.25 m with ``count`` moving Gaussians, and a quarter as many static ones as background."""
+    """Creates a ball of radius 0.25 m with ``count`` moving Gaussians, and a floor of a quarter as many static ones."""
     standing, total = count // 4, count + count // 4
     normals = rng.normal(size=(count, 3))
     ball = 0.25 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -66,7 +69,7 @@ def moved(before: Gaussians) -> Gaussians:
 
 
 def photograph(gaussians: Gaussians, cameras: Rig) -> Frame:
-    """Returns frame 1 at 1 s: pictures and masks of a rig in the internal world, rendered on the CPU."""
+    """Renders images and masks of a rig in the internal world on the CPU; returns them as frame 1 at 1 s."""
     images, masks = {}, {}
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
     for camera in cameras.cameras:

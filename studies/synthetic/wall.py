@@ -13,17 +13,20 @@ from scas4d_core.gaussians import Gaussians
 from studies.synthetic.ball import photograph
 
 WIDTH_M, AWAY_M, BASELINE_M = 2.0, 3.0, 1.0
-"""Of the wall; the cameras before it; from the first camera to the last."""
+"""Width of the wall, distance from the cameras to it, and distance from the first camera to the last."""
 SLIDE_M = 0.008
 RATE = 30.0
 
 
 @dataclass(frozen=True)
 class Size:
-    """A scene to be measured.
+    """Size of a scene.
 
     Attributes:
-        gaussians: about so many: the wall is as many by as many. width, height: pixels of each camera.
+        gaussians: approximate number of Gaussians, which form a square grid.
+        width: width of the images in pixels.
+        height: height of the images in pixels.
+        cameras: number of cameras.
         moving: share of the wall that moves.
     """
 
@@ -40,7 +43,7 @@ def wall(size: Size) -> Gaussians:
     lines = np.linspace(-WIDTH_M / 2, WIDTH_M / 2, side)
     x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
     rng = np.random.default_rng(5)
-    patches = rng.uniform(0.1, 0.9, (50, 50, 3))  # the same picture whatever it is made of
+    patches = rng.uniform(0.1, 0.9, (50, 50, 3))  # the same texture for any number of Gaussians
     row, column = (np.minimum(((axis / WIDTH_M + 0.5) * 50).astype(int), 49) for axis in (y, x))
     points = np.stack([x, y, 0.01 * rng.standard_normal(len(x))], axis=1)
     gaussians = Gaussians.of_points(points, radius=0.6 * WIDTH_M / side, colours=patches[row, column])
@@ -49,7 +52,7 @@ def wall(size: Size) -> Gaussians:
 
 
 def rig(size: Size) -> Rig:
-    """Creates a row of cameras in front of the wall, which fills their pictures vertically."""
+    """Creates a row of cameras in front of the wall, which fills their images vertically."""
     focal = size.height * AWAY_M / WIDTH_M
     lens = np.array([[focal, 0, size.width / 2], [0, focal, size.height / 2], [0, 0, 1]])
     cameras = []
@@ -63,7 +66,7 @@ def rig(size: Size) -> Rig:
 
 
 def shown(state: Gaussians, index: int, cameras: Rig) -> Frame:
-    """Returns the frame after a number of slides."""
+    """Returns frame ``index``, after as many slides."""
     way = np.array([SLIDE_M * index, 0.5 * SLIDE_M * index, 0], np.float32)
     means = state.means + np.where(state.moving[:, None], way, np.float32(0))
     return replace(photograph(state.replace(means=means.astype(np.float32)), cameras), index=index, time=index / RATE)

@@ -20,24 +20,24 @@ def variants(
         list[str],
         typer.Option(
             metavar="'NAME: CHANGE ...'",
-            help="Settings that compete: a preset's name, or a name, a colon and changes as update.iterations=80, "
-            "preset=adaptive, or a constant by its dotted name. The first is what the others are compared with.",
+            help="Settings that compete: a preset's name, or a name, a colon and changes: update.iterations=80, "
+            "preset=adaptive, or a constant by its dotted name. The first contender is the baseline.",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the study: rows, frames 0. Run again to continue.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder of the study: rows, frames 0. A second run continues it.")] = Path(
         "out/variants"
     ),
-    variant: Annotated[list[str] | None, typer.Option(help="Only this variant; all when left out.")] = None,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates, default 0. Repeat it.")] = None,
-    frames: Annotated[int | None, typer.Option(min=2, help="At most so many frames of each variant.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="The screen: half the pixels, six updates.")] = False,
+    variant: Annotated[list[str] | None, typer.Option(help="Only this variant; all by default.")] = None,
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates; may be repeated.")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="Maximum number of frames per variant.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Quick screening: half the pixels, six updates.")] = False,
     again: Again = False,
     page: Page = None,
 ) -> None:
-    """Compares settings on variants of captures: backwards, every second frame, half of the cameras or pixels, later.
+    """Compares settings on variants of captures: backwards, every second frame, half the cameras or pixels, later.
 
-    Reports what each contender gains against the first on every variant, how often it is behind, and for each capture
-    what the contender gains on it that wins on all others.
+    Reports the gain of each contender over the first on every variant, and how often it is behind. For each capture, it
+    also reports the gain of the contender that wins on all other captures.
 
     Example: scripts/bench variants captures/robot captures/wheel --contender scas4d --contender adaptive --quick
     """

@@ -1,4 +1,4 @@
-"""The page of the variants: gains of contenders, and cross-validation over captures."""
+"""Page of the variants: gains of contenders, and cross-validation over captures."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from client.cli.scores import Row
 
 BEHIND_DB = -0.05
-"""From which a difference counts as behind: less is in the spread of seeds."""
+"""Differences down to this do not count as behind, because they are within the spread over seeds."""
 
 Place = tuple[str, str]
-"""A capture and its variant."""
+"""A capture and one of its variants."""
 Figures = dict[tuple[Place, str], list[Row]]
 """Rows of all seeds by place and contender."""
 
@@ -21,8 +21,8 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
     """Formats the results as Markdown tables.
 
     Args:
-        rows: with ``capture``, ``of``, ``contender``, ``seed``; failed ones have ``error``.
-        contenders: the first is what the others are compared with.
+        rows: rows with ``capture``, ``of``, ``contender`` and ``seed``; failed rows have ``error``.
+        contenders: names of the contenders; the first is the baseline.
     """
     figures: Figures = {}
     for row in rows:
@@ -59,7 +59,7 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
 
 
 def left_out(figures: Figures, places: Sequence[Place], contenders: Sequence[str]) -> list[str]:
-    """Returns, for each capture, the contender that wins on all others, and its gain on this one."""
+    """Returns a table of each capture with the contender that wins on all others, and its gain on this capture."""
     lines = ["| left out | chosen without it | gains on it dB |", "|---|---|---|"]
     first = contenders[0]
     for capture in dict.fromkeys(place[0] for place in places):
@@ -80,7 +80,7 @@ def gain(figures: Figures, place: Place, name: str, first: str) -> float:
 
 
 def ratio(rows: Sequence[Row], base: Sequence[Row]) -> float:
-    """Returns the time of an update relative to other rows."""
+    """Returns the time of an update relative to the time in other rows."""
     return mean(rows, "seconds_update") / mean(base, "seconds_update")
 
 

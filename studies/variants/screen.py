@@ -1,8 +1,8 @@
 """``scripts/bench variants``: contenders for the default, on variants of captures.
 
-Every row (capture, variant, contender, seed) runs in a process of its own and stays on disk, as those of
-``scripts/bench quality``; contenders follow one another row by row, so that their seconds are of the same minutes, and
-share frame 0 wherever their settings of it are the same.
+Every row (capture, variant, contender, seed) runs in a separate process and stays on disk, like the rows of
+``scripts/bench quality``. The contenders alternate row by row, so that they are timed within the same minutes. They
+share frame 0 if their settings for it are the same.
 """
 
 from __future__ import annotations
@@ -23,21 +23,23 @@ from studies.variants.page import page
 from studies.variants.variants import VARIANTS
 
 QUICK = ("half the pixels", "backwards", "every second", "half the cameras")
-"""The variants of the screen: all at half the pixels."""
+"""Variants of the quick screening, all at half the pixels."""
 QUICK_FRAMES = 7
-"""Frames of the screen: the first updates, in which most is decided."""
+"""Number of frames in the quick screening: the first updates, which decide most."""
 QUICK_CHANGES = ("scene.image_scale=0.5",)
 CONSTANTS = "scas4d_core."
-"""What a change begins with that gives a constant of the method another value."""
+"""Prefix of the changes that set a constant of the method."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """Settings that compete for the default.
+    """Settings that are compared as candidates for the default.
 
     Attributes:
-        name: for tables. preset: that it starts from. changes: settings as ``"update.iterations=80"``.
-        constants: of the method, by dotted name.
+        name: name in tables.
+        preset: preset that the settings start from.
+        changes: changes such as ``"update.iterations=80"``.
+        constants: changed constants of the method, as pairs of dotted name and value.
 
     >>> Contender.read("seeded: update.seed=2 scas4d_core.update.warm_start.WARM_START=0.5")
     Contender(name='seeded', preset='scas4d', changes=('update.seed=2',), constants=(('scas4d_core...', 0.5),))
@@ -52,17 +54,17 @@ class Contender:
 
     @classmethod
     def read(cls, text: str) -> Contender:
-        """Parses ``NAME`` of a preset, or ``NAME: CHANGE CHANGE …``; ``preset=NAME`` is one of the changes.
+        """Parses the ``NAME`` of a preset, or ``NAME: CHANGE CHANGE …``; ``preset=NAME`` is one of the changes.
 
         Raises:
-            ValueError: it cannot be read.
+            ValueError: the text cannot be parsed.
         """
         name, sign, rest = text.partition(":")
         if not sign:
             return cls(text.strip(), text.strip())
         given = rest.split()
         if not name.strip() or not all("=" in change for change in given):
-            raise ValueError(f"contender {text!r} cannot be read; write it as 'longer: update.cold_start_iterations=2'")
+            raise ValueError(f"contender {text!r} is invalid; write it as 'longer: update.cold_start_iterations=2'")
         presets = [change.removeprefix("preset=") for change in given if change.startswith("preset=")]
         constants = [change.split("=", 1) for change in given if change.startswith(CONSTANTS)]
         changes = [c for c in given if not c.startswith((CONSTANTS, "preset="))]
@@ -72,10 +74,10 @@ class Contender:
 
 @dataclass(frozen=True)
 class VariantJob(Job):
-    """A row of a variant.
+    """Measures one variant of a capture.
 
     Attributes:
-        of: the variant's name.
+        of: name of the variant.
     """
 
     of: str = "as it is"
@@ -90,7 +92,7 @@ class VariantJob(Job):
 
     @property
     def variant(self) -> str:
-        """Names the row without its capture; the variant is part of the name."""
+        """Name of the row without its capture; it includes the variant."""
         return f"{super().variant}-{self.of.replace(' ', '-')}"
 
 
@@ -110,15 +112,19 @@ def run(
     """Measures every contender on every variant of every capture; returns the page and writes ``out/variants.md``.
 
     Args:
-        captures: folders. contenders: the first is what the others are compared with.
-        out: rows and frames 0 go here; run again with the same folder to go on.
-        variants: names out of ``VARIANTS``; none: all, or those of the screen.
-        seeds: of the updates; frame 0 has the first in all.
-        frames: at most so many. quick: the screen, see ``QUICK``. again: measure rows anew that are on disk.
-        options: how the captures are read. report: takes the lines that are printed.
+        captures: folders of the captures.
+        contenders: settings to compare; the first is the baseline.
+        out: folder for rows and frames 0; a second call with the same folder continues.
+        variants: names from ``VARIANTS``; if empty, all of them or those of the quick screening.
+        seeds: seeds of the updates; frame 0 always uses the first one.
+        frames: maximum number of frames per variant.
+        quick: whether to run only the quick screening, see ``QUICK``.
+        again: whether to measure rows again that are already on disk.
+        options: how the captures are read.
+        report: prints the progress.
 
     Raises:
-        ValueError: an unknown preset or setting, or a value out of range.
+        ValueError: a preset or setting is unknown, or a value is out of range.
     """
     variants = variants or (QUICK if quick else tuple(VARIANTS))
     frames = frames or (QUICK_FRAMES if quick else None)

@@ -1,6 +1,6 @@
-"""The variants of a capture; test cameras, masks, truth and points are restricted to the selected frames.
+"""Variants of a capture; test cameras, masks, truth and points are restricted to the selected frames.
 
-A cloud is of the capture's first frame: a variant that begins elsewhere has none.
+A point cloud belongs to the capture's first frame, so a variant that starts at another frame has none.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Variant:
     """A transformation of one capture into another.
 
     Attributes:
-        made: the other capture. changes: settings that it has, as ``"scene.image_scale=0.5"``.
+        made: creates the other capture.
+        changes: settings of the variant, such as ``"scene.image_scale=0.5"``.
     """
 
     made: Callable[[Capture], Capture]
@@ -33,7 +34,8 @@ class ChosenFrames:
     """Selected frames of a reader in a given order, with times that increase from 0.
 
     Args:
-        reader: of all frames. frames: which ones, in their new order.
+        reader: reader of all frames.
+        frames: the selected frames, in their new order.
     """
 
     def __init__(self, reader: PictureReader, frames: Sequence[int]) -> None:
@@ -45,12 +47,12 @@ class ChosenFrames:
         return len(self._frames)
 
     def time(self, index: int) -> float | None:
-        """Returns the seconds since the first selected frame, or None if the pictures have no times."""
+        """Returns the seconds since the first selected frame, or None if the images have no times."""
         first, now = (self._reader.time(self._frames[i]) for i in (0, index))
         return None if first is None or now is None else abs(now - first)
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes a picture, [H, W, 3]."""
+        """Decodes an image, [H, W, 3]."""
         return self._reader.image(self._frames[index], camera)
 
     def has_mask(self, index: int, camera: str) -> bool:
@@ -62,7 +64,7 @@ class ChosenFrames:
         return self._reader.mask(self._frames[index], camera)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the file of a picture."""
+        """Returns the file of an image."""
         return self._reader.encoded_image(self._frames[index], camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
@@ -71,7 +73,7 @@ class ChosenFrames:
 
 
 def of_frames(capture: Capture, frames: Sequence[int]) -> Capture:
-    """Returns the capture with these frames only, in this order, and a frame rate that matches their spacing.
+    """Returns the capture with only these frames, in this order, and a frame rate that matches their spacing.
 
     >>> from scas4d_core.captures import open_capture
     >>> slow = of_frames(open_capture("samples/robot"), [0, 2, 4])
@@ -110,7 +112,7 @@ def every_second(capture: Capture) -> Capture:
 
 
 def later(capture: Capture) -> Capture:
-    """Removes the first third, so that frame 0 is a different one."""
+    """Removes the first third of the frames, so that frame 0 is a different one."""
     return of_frames(capture, range(capture.frame_count // 3, capture.frame_count))
 
 
@@ -127,4 +129,4 @@ VARIANTS: Mapping[str, Variant] = {
     "half the pixels": Variant(lambda capture: capture, ("scene.image_scale=0.5",)),
     "later": Variant(later),
 }
-"""By the name that tables have."""
+"""Variants by their name in tables."""

@@ -90,7 +90,7 @@ def test_on_one_machine_it_is_not_offered(sized, service, finished):
 
 def test_nodes_and_what_waits(sized, stubbed, finished):
     dialog(sized)
-    assert sized.locator("#cluster-words").inner_text() == "3 nodes alive, 1 lost. 1 process waits for a node."
+    assert sized.locator("#cluster-words").inner_text() == "3 nodes alive, 1 lost. 1 process is waiting for a node."
     cards = sized.locator("#cluster-nodes > li")
     lost, head, first, third = cards.all_inner_texts()  # the lost first, then by name
     assert lost.split() == ["stage-2.studio.example", "lost"]
@@ -100,7 +100,7 @@ def test_nodes_and_what_waits(sized, stubbed, finished):
     assert "0 of 8" in third
     late, begins = sized.locator("#cluster-waits li").all_inner_texts()
     needs = "1 CPU and 0.7 GB of memory on a node with rig=stage-b"
-    assert late.split("\n") == ["ba9876543210", f"The worker has waited for 3 min. It needs {needs}."]
+    assert late.split("\n") == ["ba9876543210", f"The worker has been waiting for 3 min. It needs {needs}."]
     assert begins.split("\n") == [f"ring ({finished[:6]})", "The export is about to start."]
     looked_at(sized, "cluster")
     box = sized.locator("#cluster").bounding_box()
@@ -119,11 +119,11 @@ def test_it_follows_while_it_is_open_and_keeps_the_focus(sized, stubbed, finishe
     until(sized, "document.getElementById('cluster-nodes').innerText.includes('7.25 of 8')")
     assert sized.evaluate("document.activeElement.dataset.scene") == finished
     assert sized.locator("#cluster-waiting").is_hidden()
-    assert sized.locator("#cluster-words").inner_text().endswith("No process waits for a node.")
+    assert sized.locator("#cluster-words").inner_text().endswith("No process is waiting for a node.")
     stubbed.answer = {**changed, "head_responds": False}
-    until(sized, f"{WORDS}.startsWith('The head of the cluster does not answer')")
+    until(sized, f"{WORDS}.startsWith('The head of the cluster does not respond')")
     stubbed.answer = None
-    until(sized, f"{WORDS}.startsWith('The service ends. What is below')")
+    until(sized, f"{WORDS}.startsWith('The service ends. The list below')")
     assert "7.25 of 8" in sized.locator("#cluster-nodes").inner_text()
     stubbed.answer = changed
     until(sized, f"{WORDS}.startsWith('3 nodes')")

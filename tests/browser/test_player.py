@@ -154,7 +154,7 @@ def test_a_file_that_was_cut_says_so(offline, player, tmp_path):
     file.write_bytes(player.with_name("bent.s4d").read_bytes()[:300])
     write_player(tmp_path / "cut.html", "<b>cut & run</b>", [file])
     offline.goto((tmp_path / "cut.html").as_uri())
-    until(offline, "document.getElementById('curtain-words').innerText.includes('damaged or cut')")
+    until(offline, "document.getElementById('curtain-words').innerText.includes('damaged or truncated')")
     assert offline.title() == "<b>cut & run</b>"
 
 

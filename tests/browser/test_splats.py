@@ -162,9 +162,9 @@ def test_a_file_that_was_cut_is_read_up_to_there(page, service, file):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda data: b"PNG" + data[3:], "no compact 4D file"),
-        (lambda data: data.replace(b'"version": 1', b'"version": 9'), "damaged or cut"),
-        (lambda data: data[:400], "damaged or cut"),
+        (lambda data: b"PNG" + data[3:], "not a compact 4D file"),
+        (lambda data: data.replace(b'"version": 1', b'"version": 9'), "damaged or truncated"),
+        (lambda data: data[:400], "damaged or truncated"),
     ],
 )
 def test_what_is_no_such_file_is_refused_with_the_reason(page, service, file, damage, words):

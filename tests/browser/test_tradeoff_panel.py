@@ -50,9 +50,9 @@ def test_what_was_measured_and_what_is_extrapolated_are_told_apart(page, service
     assert said.startswith("40 iterations")
     assert "error 0.0250" in said
     assert "measured" in said
-    assert "only its time" in page.locator("#tradeoff .point.extrapolated title").first.text_content()
+    assert "time only" in page.locator("#tradeoff .point.extrapolated title").first.text_content()
     assert text(page, "tradeoff-unit").startswith("error")
-    assert "40 iterations a frame, from frame 4 on" in text(page, "budget-words")
+    assert "40 iterations per frame, from frame 4 on" in text(page, "budget-words")
     assert page.locator("#seconds .change").count() == 1  # where the budget changed
     assert page.faults == []
 
@@ -63,9 +63,9 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     until(page, "document.getElementById('budget-value').innerText === '40 iterations'")
     page.focus("#budget")
     page.keyboard.press("End")
-    until(page, "document.getElementById('budget-words').innerText.includes('1000 iterations a frame, from frame 9')")
+    until(page, "document.getElementById('budget-words').innerText.includes('1000 iterations per frame, from frame 9')")
     assert sdk.budget(id).requested == Budget(iterations=1000)
-    assert text(page, "budget-effect").startswith("No frame since")
+    assert text(page, "budget-effect").startswith("No frames since")
     push(sdk, id, 9)
     until(page, "document.querySelectorAll('#seconds .change').length === 2")
     until(page, "document.getElementById('budget-effect').innerText.startsWith('Since then, one frame: 8 s')")
@@ -125,14 +125,14 @@ def test_other_budgets_are_measured_on_request_until_told_to_stop(page, service,
     until(page, "!document.getElementById('measure').disabled")
     page.click("#measure")
     until(page, "document.querySelectorAll('#tradeoff .point.replayed').length === 4")  # 25, 50, 200 and its own 40
-    assert "compare replayed times with each other" in text(page, "replay-words")
+    assert "comparable only with each other" in text(page, "replay-words")
     assert text(page, "measure").startswith("Measure 25")
     push(sdk, id, 9, red=fakes.SLOW)  # two seconds in a replay, too
     sdk.wait(id, 9)
     page.click("#measure")
     until(page, "document.getElementById('measure').innerText === 'Stop'")
     page.click("#measure")
-    until(page, "document.getElementById('replay-words').innerText.includes('ended on request')")
+    until(page, "document.getElementById('replay-words').innerText.includes('stopped on request')")
     assert sdk.tradeoff(id).replay.state == "failed"
     assert page.faults == []
 

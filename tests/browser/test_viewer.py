@@ -219,7 +219,7 @@ def test_it_connects_again_when_the_service_restarts(page, tmp_path):
         shown(page, frame="0")
         service.stop()
         page.wait_for_selector("#banner:not([hidden])")
-        assert "connection to the service is lost" in page.locator("#banner").inner_text()
+        assert "connection to the service was lost" in page.locator("#banner").inner_text()
         assert page.locator("#curtain").is_hidden()  # the last picture stays
         service = Running(settings, service.port, core=browser_engine.install)
         page.wait_for_selector("#banner[hidden]", state="attached")

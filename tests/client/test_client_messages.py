@@ -92,7 +92,7 @@ def test_evaluate_says_that_it_measures_on_the_training_cameras(capture_folder, 
             (tmp_path / file.name).symlink_to(file)
     done = scas4d("evaluate", tmp_path, "--out", tmp_path / "out", "--set", "update.iterations=2")
     assert done.returncode == 0
-    assert "no test cameras: the scores are those of the training cameras" in done.stdout
+    assert "no test cameras: scoring the training cameras instead" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_evaluate_says_that_it_measures_on_the_training_cameras(capture_folder, 
         ("update.iterations=x", "setting update.iterations='x': "),
         (
             "update.iteration=4",
-            "there is no setting of this name; did you mean update.iterations?",
+            "there is no setting with this name; did you mean update.iterations?",
         ),
     ],
 )

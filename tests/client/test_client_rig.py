@@ -68,13 +68,13 @@ def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
 def test_the_summary_says_how_far_behind():
     lateness = Lateness(late=[-0.1, -0.1, 0.4], busy=1.5, busy_count=2, outage=3, outage_count=4, began=0, ended=2)
     said = lateness.summary(5)
-    assert "sent 3 frames at 1.00 of 5 a second" in said
-    assert "1 acknowledged after the next was due, at most 0.40 s" in said
+    assert "sent 3 frames at 1.00 of 5 per second" in said
+    assert "1 acknowledged after the next frame was due, at most 0.40 s" in said
     assert "1.5 s for a full queue (2 times)" in said
     assert "3.0 s for the service (4 tries)" in said
     assert Lateness().summary(None) == "sent 0 frames"
     first = Lateness(late=[40.0, -0.1, -0.1, 0.4], began=40, ended=42, before=1)
-    assert "sent 4 frames, those after frame 0 at 1.00 of 5 a second; 1 acknowledged after" in first.summary(5)
+    assert "sent 4 frames, those after frame 0 at 1.00 of 5 per second; 1 acknowledged after" in first.summary(5)
 
 
 @pytest.mark.parametrize("websocket", [False, True])
@@ -119,7 +119,7 @@ def test_a_scene_is_gone_on_with(client, capture):
     assert second.scene == first.scene
     assert second.status.committed == 4
     assert len(second.lateness.late) == 2
-    assert said == [f"scene {first.scene} goes on with frame 2"]
+    assert said == [f"scene {first.scene} continues with frame 2"]
     assert client.frame(first.scene, 3).time == pytest.approx(3 / 30)
     again = push(capture, client, scene=first.scene)
     assert again.lateness.late == []
@@ -129,7 +129,7 @@ def test_a_scene_of_another_rig_is_refused(client, capture):
     from running import make_rig
 
     scene = client.create_scene(make_rig())
-    with pytest.raises(RuntimeError, match=r"has the cameras c0, c1, tiny has 0, 1"):
+    with pytest.raises(RuntimeError, match=r"has the cameras c0, c1, but tiny has 0, 1"):
         push(capture, client, scene=scene.id)
 
 
@@ -200,7 +200,7 @@ def test_a_restart_of_the_service_is_waited_out(capture, tmp_path):
             restarting.join()
             assert [client.frame(delivery.scene, index).state for index in range(20)] == ["committed"] * 20
         assert delivery.lateness.outage_count > 0
-        assert any("cannot be used" in sentence for sentence in said)
+        assert any("is unavailable" in sentence for sentence in said)
     finally:
         for service in back or [running]:
             service.stop()

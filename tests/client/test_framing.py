@@ -30,7 +30,7 @@ def test_every_cut_and_what_is_too_much_is_refused():
     for length in range(len(data)):
         with pytest.raises(FramingError):
             parse_frame(data[:length])
-    with pytest.raises(FramingError, match="its head says"):
+    with pytest.raises(FramingError, match="its header declares"):
         parse_frame(data + b"\0")
 
 

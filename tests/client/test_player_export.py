@@ -57,7 +57,7 @@ def test_some_frames_are_written_anew(file, tmp_path):
     [
         (["--player", "out.zip"], "ends in .html"),
         (["--player", "out.html", "--frames", "90:95"], "are not in"),
-        (["--player", "out.html", "--format", "ply"], "--player stands alone"),
+        (["--player", "out.html", "--format", "ply"], "--player cannot be combined"),
         ([], "give --format, or --player"),
     ],
 )
@@ -79,6 +79,6 @@ def test_modules_that_cannot_be_linked_are_refused(tmp_path):
 
 def test_too_much_for_a_browser_is_refused(file, tmp_path, monkeypatch):
     monkeypatch.setattr("client.exports.player.LARGEST", 1000)
-    with pytest.raises(InputError, match="more than browsers open"):
+    with pytest.raises(InputError, match="more than browsers can open"):
         export_player(str(file), tmp_path / "out.html", **NOWHERE)
     assert list(tmp_path.iterdir()) == []

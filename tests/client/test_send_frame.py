@@ -103,7 +103,7 @@ def test_a_wrong_token_and_a_gap_are_told(guarded_service, scene, begin):
     status, out, err = ended(begin(guarded_service.url, scene, 0, pictures(), token="another-token-of-that-length"))
     assert (status, out) == (1, "")
     assert err.startswith("401 ")
-    assert "the token is wrong" in err
+    assert "the token is invalid" in err
     status, out, err = ended(begin(guarded_service.url, scene, 5, pictures()))
     assert (status, out) == (1, "")
     assert err.startswith("409 ")

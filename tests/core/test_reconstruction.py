@@ -277,7 +277,7 @@ def test_pictures_that_were_not_believed_are_not_taken_for_what_stands() -> None
             report = scene.step(replace(FRAMES[1], index=index, time=5 + index / 1000))
             assert report.outcome is FrameOutcome.REJECTED_MISFIT
     back = scene.step(replace(FRAMES[0], index=13, time=5.03))
-    assert (back.attempts, back.degraded) == (["the same pictures again"], None)
+    assert (back.attempts, back.degraded) == (["repeated images"], None)
 
 
 def test_masks_that_weigh_nothing_or_are_not_used_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:

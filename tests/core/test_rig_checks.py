@@ -72,10 +72,10 @@ def test_sound_rigs_are_not_suspected(kind, origin):
 def test_poses_the_wrong_way_round_are_suspected(origin):
     rig = inverted(rig_of(RIGS["inward"](np.array(origin, float))))
     (said,) = pose_warnings(rig)
-    assert "wrong way round" in said
+    assert "the poses seem to be inverted" in said
     assert "invert them" in said
     (said,) = pose_warnings(rig, origin + CLOUD)
-    assert "of the points are in view of a camera on average, inverted" in said
+    assert "of the points are in view of a camera on average, " in said
 
 
 @pytest.mark.parametrize(("unit", "warned"), [(1.0, False), (1000.0, True), (0.01, False), ("auto", False)])
@@ -87,7 +87,7 @@ def test_an_unusual_unit_is_named(unit, warned):
 
 @pytest.mark.parametrize(
     ("times", "shift", "warned"),
-    [(1, 0, ""), (1000, 0, "radii of the rig"), (1, 900, "radii of the rig"), (1, -8, "the cameras have only")],
+    [(1, 0, ""), (1000, 0, "rig radii away"), (1, 900, "rig radii away"), (1, -8, "the cameras see only")],
 )
 def test_a_cloud_of_another_world_is_named(times, shift, warned):
     """In millimetres before cameras in metres, beside them or far away."""
@@ -106,7 +106,7 @@ def test_points_speak_for_two_cameras_too():
 
 def test_points_behind_all_cameras_are_refused():
     rig = rig_of(RIGS["planar array"](np.zeros(3)))
-    with pytest.raises(RigError, match=r"all points lie behind all cameras; .*have to be inverted") as refused:
+    with pytest.raises(RigError, match=r"all points are behind all cameras; .*must be inverted") as refused:
         check_points(rig, CLOUD - [0, 5, 0])
     assert (refused.value.field, refused.value.value) == ("points", "300 points")
     check_points(rig, np.concatenate([CLOUD - [0, 5, 0], np.add(CLOUD, [0, 5, 0])]))
@@ -132,7 +132,7 @@ def test_a_left_handed_frame_is_named():
         ),
         (7e5, (640, 480), {}, "rig.cameras.0.intrinsics", "focal length 700000 px"),
         (500.0, (640, 480), {"image_scale": 0.01}, "settings.scene.image_scale", "leaves 6x5 of .* at least 0.03"),
-        (8.0, (10, 30), {}, "rig.cameras.0", "has 10x30 pixels; give pictures of at least 11 pixels a side"),
+        (8.0, (10, 30), {}, "rig.cameras.0", "has 10x30 pixels; give images of at least 11 pixels per side"),
         (500.0, (640, 480), {"metres_per_unit": 1e-9}, "settings.scene.metres_per_unit", "radius .*e-09 m; .*'auto'"),
         (500.0, (640, 480), {"metres_per_unit": 1e12}, "settings.scene.metres_per_unit", "radius"),
     ],
@@ -170,5 +170,5 @@ def test_a_reconstruction_refuses_the_same_before_it_looks_at_pictures():
     with pytest.raises(RigError, match="one camera, and no points"):
         Reconstruction.start(Rig(rig.cameras[:1]), frame, Settings())
     behind = InitialPoints(np.full((3, 3), 50.0) * [[0], [0], [1]] + [-50, 0, 0], np.zeros((3, 3), np.float32))
-    with pytest.raises(RigError, match="all points lie behind all cameras"):
+    with pytest.raises(RigError, match="all points are behind all cameras"):
         Reconstruction.start(rig_of(RIGS["planar array"](np.array([0, 60.0, 0]))), frame, Settings(), points=behind)

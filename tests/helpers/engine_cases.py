@@ -116,7 +116,7 @@ def apart(mine: np.ndarray, true: np.ndarray) -> float:
     return float(np.linalg.norm(np.asarray(mine, np.float64) - true) / max(np.linalg.norm(true), 1e-12))
 
 
-def case(previous: Gaussians | None = None, **plan: object) -> Case:
+def case(previous: Gaussians | None = None, clusters: tuple[int, ...] = CLUSTERS, **plan: object) -> Case:
     """A scene with a plan of images and all parameters of the deformation, and what ``plan`` adds."""
     glossy = bool(plan.get("gloss"))
     previous = gaussians(glossy=glossy) if previous is None else previous
@@ -127,7 +127,7 @@ def case(previous: Gaussians | None = None, **plan: object) -> Case:
     )  # fmt: skip
     made = replace(standard, **plan)  # type: ignore[arg-type]
     sound = previous.replace(means=np.nan_to_num(previous.means))
-    hierarchy = build_hierarchy(sound.means, previous.moving, CLUSTERS, 4)
+    hierarchy = build_hierarchy(sound.means, previous.moving, clusters, 4)
     neighbours = build_neighbours(sound.means[hierarchy.rows], 6, 20.0) if made.neighbour_terms else None
     structure = structure_of(hierarchy, neighbours, sound)
     renderer, after = CpuRenderer(made.background, limits=made.limits), moved(sound)

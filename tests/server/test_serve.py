@@ -67,7 +67,7 @@ def test_a_data_folder_in_use_is_one_line(tmp_path):
     lock = FolderLock(tmp_path / "service.lock", wait=False)
     said = refused(tmp_path, 0)
     lock.release()
-    assert f"another service uses {tmp_path}" in said
+    assert f"another service is using {tmp_path}" in said
     assert "--data" in said
 
 
@@ -77,7 +77,7 @@ def test_a_data_folder_that_cannot_be_is_one_line(tmp_path):
 
 
 def test_a_host_of_another_machine_is_one_line(tmp_path):
-    with pytest.raises(RuntimeError, match=r"cannot listen at 192\.0\.2\.1"):  # of a network for documents
+    with pytest.raises(RuntimeError, match=r"cannot listen on 192\.0\.2\.1"):  # of a network for documents
         listen("192.0.2.1", 0)
 
 
@@ -127,7 +127,7 @@ def test_plain_lines_in_a_terminal_and_json_elsewhere(tmp_path, terminal):
     lines = said.decode().splitlines()
     if terminal:
         assert f"viewer at http://127.0.0.1:{port}, scenes in {tmp_path}" in lines[0]
-        assert [line.split(" ", 1)[1] for line in lines[1:]] == ["DELETE /v1/scenes/none 404", "ended"]
+        assert [line.split(" ", 1)[1] for line in lines[1:]] == ["DELETE /v1/scenes/none 404", "stopped"]
     else:
         messages = [json.loads(line)["message"] for line in lines]
         assert "GET /v1/scenes 200" in messages

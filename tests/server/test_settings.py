@@ -33,7 +33,7 @@ def test_what_is_given_wins_over_the_environment_and_that_over_the_file(tmp_path
         ("max_scenes = 0", "setting max_scenes.*greater than or equal to 1"),
         ('host = "::"', "no token"),
         ('allowed_origins = ["studio.example"]', "allowed_origins.*scheme"),
-        ('token_file = "nowhere"', "there is no file nowhere"),
+        ('token_file = "nowhere"', "file nowhere does not exist"),
         ('token = "a-token-of-thirty-two-characters"\ntoken_file = "nowhere"', "both set"),
     ],
 )
@@ -45,7 +45,7 @@ def test_a_bad_file_is_refused_by_name(tmp_path, text, said):
 
 
 def test_the_value_is_quoted_unless_it_may_be_a_secret():
-    with pytest.raises(SettingsError, match=r"setting port is 'abc', which cannot be: .*integer"):
+    with pytest.raises(SettingsError, match=r"setting port is 'abc', which is invalid: .*integer"):
         ServerSettings.from_environment({"SCAS4D_PORT": "abc"})
     with pytest.raises(SettingsError) as refused:
         ServerSettings.from_environment({"SCAS4D_TOKEN": "hush"})
@@ -53,7 +53,7 @@ def test_the_value_is_quoted_unless_it_may_be_a_secret():
 
 
 def test_a_file_that_is_not_there_is_refused():
-    with pytest.raises(SettingsError, match="no file"):
+    with pytest.raises(SettingsError, match="does not exist"):
         ServerSettings.from_environment({"SCAS4D_CONFIG": "nowhere.toml"})
 
 

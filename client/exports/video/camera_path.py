@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 CameraPath = Callable[[float], Camera]
-"""Function from seconds since the start of the video to a camera in the user's world, at the size of the video."""
+"""Maps a time in seconds since the start of the video to a camera in the user's world, at the size of the video."""
 
 MAX_ELEVATION = np.radians(88)
 """Maximum elevation of an orbit in radians; at 90 degrees the up direction would be undefined."""
 
 
 def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Returns a camera for another image size (width, height), in which the original image is centred and fits.
+    """Returns the camera for another image size (width, height), with the original image scaled to fit and centred.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> wide = fit_to_size(camera, (256, 96))
@@ -42,7 +42,7 @@ def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def centre_axis(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Returns the camera like ``fit_to_size``, but with square pixels and the principal point at the image centre."""
+    """Like ``fit_to_size``, but returns a camera with square pixels and the principal point at the image centre."""
     fitted_camera = fit_to_size(camera, size)
     scale = min(fitted_camera.fx, fitted_camera.fy)
     lens = np.array([[scale, 0, size[0] / 2], [0, scale, size[1] / 2], [0, 0, 1]])
@@ -61,11 +61,11 @@ def fixed_path(camera: Camera, size: tuple[int, int]) -> CameraPath:
 
 
 def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> CameraPath:
-    """Returns an orbit around the point at which the rig looks.
+    """Returns an orbit around the point that the rig looks at.
 
     Args:
         rig: rig that defines the orbit's centre and up direction.
-        start: camera at which the orbit starts, and whose image fits into the video.
+        start: camera at which the orbit starts; its image is scaled to fit the video.
         size: (width, height) of the video.
         turn: angular speed in degrees per second, towards the camera's right.
 
@@ -100,16 +100,16 @@ def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> C
 def key_pose_path(
     file: Path, rig: Rig, size: tuple[int, int], seconds_of_frame: Mapping[int, float], start: Camera
 ) -> CameraPath:
-    """Returns the path through the key poses of a file; the camera rests before the first and after the last key.
+    """Returns the path through the key poses in a file; the camera is static before the first and after the last key.
 
-    Positions follow a natural cubic spline. If every key has a `look_at` point, these points follow one as well.
-    Otherwise the rotations are interpolated with ``scipy.spatial.transform.RotationSpline``.
+    Positions follow a natural cubic spline. If every key has a `look_at` point, these points follow a spline as
+    well. Otherwise, rotations are interpolated with ``scipy.spatial.transform.RotationSpline``.
 
     Args:
         file: JSON file of key poses.
         rig: rig that defines the default up direction.
         size: (width, height) of the video.
-        seconds_of_frame: time in the video of each frame of the scene.
+        seconds_of_frame: video time in seconds of each frame of the scene, keyed by frame index.
         start: camera that defines the field of view if no key does.
 
     Raises:
@@ -148,11 +148,13 @@ def _times(given: KeyPoses, seconds_of_frame: Mapping[int, float], file: Path) -
             times.append(seconds_of_frame[key.frame])
         else:
             held = f"{min(seconds_of_frame)} to {max(seconds_of_frame)}"
-            raise InputError(f"{file.name}: keys[{place}].frame {key.frame} is not shown", f"shown are frames {held}")
+            raise InputError(
+                f"{file.name}: keys[{place}].frame {key.frame} is not in the video", f"the video shows frames {held}"
+            )
         if place and times[-1] <= times[-2]:
             field = "time" if key.time is not None else "frame"
             raise InputError(
-                f"{file.name}: keys[{place}].{field} {getattr(key, field)} is not after that of keys[{place - 1}]",
+                f"{file.name}: keys[{place}].{field} {getattr(key, field)} is not later than that of keys[{place - 1}]",
                 "list the keys in chronological order",
             )
     return np.array(times)
@@ -168,7 +170,7 @@ def _camera(key: KeyPose, place: int, lens: Camera, up: Float, file: Path) -> Ca
 
 
 def _focal_lengths(given: KeyPoses, times: Float, lens: Camera) -> Float:
-    """Returns the focal lengths [K] of the keys in pixels; keys without a field of view are interpolated."""
+    """Returns the focal length [K] of each key in pixels; interpolated for keys without a field of view."""
     said = [
         (time, lens.height / 2 / np.tan(np.radians(key.field_of_view) / 2))
         for time, key in zip(times.tolist(), given.keys, strict=True)

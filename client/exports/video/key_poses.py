@@ -17,10 +17,10 @@ class KeyPose(Model):
 
     Attributes:
         time: seconds since the start of the video.
-        frame: frame of the scene that is shown at that time, as an alternative to `time`.
-        position: position of the camera.
+        frame: scene frame at whose time the pose applies, as an alternative to `time`.
+        position: camera centre.
         look_at: point that appears at the image centre.
-        world_to_camera: 4×4 matrix, as an alternative to `position` and `look_at`.
+        world_to_camera: 4×4 pose matrix, as an alternative to `position` and `look_at`.
         field_of_view: vertical field of view in degrees.
     """
 
@@ -34,10 +34,10 @@ class KeyPose(Model):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (self.time is None) == (self.frame is None):
-            raise ValueError("give time (seconds of the video) or frame (of the scene), one of them")
+            raise ValueError("give either time (seconds in the video) or frame (of the scene)")
         placed = self.position is not None or self.look_at is not None
         if placed == (self.world_to_camera is not None):
-            raise ValueError("give position and look_at, or world_to_camera, one of them")
+            raise ValueError("give either position and look_at, or world_to_camera")
         if placed and (self.position is None or self.look_at is None):
             raise ValueError("position and look_at go together; give both")
         if placed and self.position == self.look_at:
@@ -49,8 +49,8 @@ class KeyPoses(Model):
     """Camera path defined by key poses.
 
     Attributes:
-        keys: key poses in order of time.
-        up: up direction of the image for poses with `look_at`; None for the rig's up direction.
+        keys: key poses in chronological order.
+        up: up direction for poses with `look_at`; None for the rig's up direction.
     """
 
     keys: Annotated[list[KeyPose], Field(min_length=1, max_length=10_000)]
@@ -87,7 +87,7 @@ def read_key_poses(path: Path) -> KeyPoses:
         fault = first["msg"].removeprefix("Value error, ")
         raise InputError(
             f"{path.name}: {field + given + ': ' if field else ''}{fault[0].lower()}{fault[1:]}",
-            "docs/videos.md has the format",
+            "see docs/videos.md for the format",
         ) from None
 
 

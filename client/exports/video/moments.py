@@ -1,4 +1,4 @@
-"""States at the times of a video: the nearest reconstructed state, or an interpolated one."""
+"""States at arbitrary video times: the nearest reconstructed state, or an interpolated one."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Moment(NamedTuple):
 def moments(
     states: Iterable[tuple[int, float, Gaussians]], wanted: Iterable[float], *, between: bool = False
 ) -> Iterator[Moment]:
-    """Yields the states at the given times, with two states in memory at a time.
+    """Yields the states at the given times, holding two states in memory at a time.
 
     Args:
-        states: index, time in seconds and state of the frames, in order.
-        wanted: times in seconds in ascending order; times outside the frames give the first or last state.
-        between: whether to interpolate states; otherwise the nearest state is used, and the earlier one on a tie.
+        states: (index, time in seconds, state) of each frame, in order.
+        wanted: times in seconds in ascending order; times outside the sequence yield the first or last state.
+        between: whether to interpolate states; otherwise, the nearest state is used, or the earlier one on a tie.
 
     >>> at = [(k, float(k), Gaussians.of_points([[k, 0, 2]], radius=0.1)) for k in range(3)]
     >>> [moment.frame for moment in moments(at, [0, 0.4, 0.6, 1.5, 9])]
@@ -49,11 +49,11 @@ def moments(
 
 
 def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
-    """Returns the state interpolated between two states of a scene, at fraction ``share`` (0…1) from ``a`` to ``b``.
+    """Interpolates between two states of a scene, at the fraction ``share`` (0…1) of the way from ``a`` to ``b``.
 
     Centres and colours are interpolated linearly. Covariance factors are interpolated in the rotating frame of each
-    Gaussian, so that rotating Gaussians keep their size. Gaussians present in only one of the states keep their
-    position and fade.
+    Gaussian, so that rotating Gaussians keep their size. Gaussians that are present in only one of the states
+    keep their position and fade in or out.
 
     >>> a = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> b = a.concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1))

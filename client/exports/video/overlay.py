@@ -22,7 +22,7 @@ WIDTH = 1 / 200
 OPAQUE = 0.5
 """Minimum opacity of a Gaussian that counts as part of a surface rather than haze."""
 CANDIDATES_PER_ROW = 0.5
-"""Fraction of the moving Gaussians, those with the largest motion, from which tracks are selected."""
+"""Fraction of the moving Gaussians from which tracks are selected; those with the largest motion are considered."""
 
 
 def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
@@ -31,8 +31,8 @@ def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
     The result is empty if nothing moves.
 
     Args:
-        states: states of a few frames, the earliest first; motion is measured relative to it. Only Gaussians that are
-            moving in all of them are considered.
+        states: states of a few frames, in order; motion is measured relative to the first one. Only Gaussians that are
+            moving in all of these states are considered.
         count: maximum number of rows.
 
     >>> a = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [2, 0, 2]], radius=0.1)
@@ -58,12 +58,12 @@ def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
 
 
 class Trails:
-    """Trails of the latest positions of selected Gaussians, which can be drawn from any camera.
+    """Trails of the most recent positions of selected Gaussians, which can be drawn in any view.
 
     Args:
-        rows: rows of the Gaussians.
+        rows: row indices of the Gaussians.
         world: transform between the user's world and the internal world.
-        length: number of positions kept per Gaussian, at least 2.
+        length: number of positions to keep per Gaussian, at least 2.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> trails = Trails(np.array([0]), WorldFrame(np.zeros(3)), length=9)
@@ -86,7 +86,7 @@ class Trails:
         self._places.append(places)
 
     def draw(self, picture: Picture, camera: Camera) -> Picture:
-        """Returns the image [H, W, 3] with the trails drawn over it.
+        """Returns the image [H, W, 3] with the trails drawn on top of it.
 
         Args:
             picture: rendered image.

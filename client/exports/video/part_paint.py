@@ -1,4 +1,4 @@
-"""Colours of Gaussians by part that preserve the shading of the scene."""
+"""Colours Gaussians by part while preserving the shading of the scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def part_colours(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
     """Returns RGB [N, 3]: the part's colour scaled by the Gaussian's brightness, or grey if it belongs to no part.
 
     Args:
-        state: state with N Gaussians.
+        state: state of N Gaussians.
         labels: [M] part label of each Gaussian, −1 for none; Gaussians beyond the M-th belong to no part.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=1.0)

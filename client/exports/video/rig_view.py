@@ -22,7 +22,7 @@ FAR = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RigView:
-    """Location of a scene derived from its rig, in the user's world and units.
+    """Target, up direction and radius derived from a rig, in the user's world and units.
 
     Attributes:
         target: point [3] closest to all optical axes; if they are parallel, a point in front of the cameras.
@@ -65,7 +65,7 @@ class RigView:
 
 
 def _nearest_to_axes(centres: Float, ahead: Float) -> Float | None:
-    """Returns the point [3] with the least sum of squared distances to N lines, or None if it is not unique."""
+    """Returns the point [3] with the smallest sum of squared distances to N lines, or None if it is not unique."""
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     matrix = across.sum(axis=0)
     if len(centres) < 2 or abs(np.linalg.det(matrix)) < PARALLEL * np.abs(matrix).max() ** 3:

@@ -29,17 +29,17 @@ class VideoOptions:
 
     Attributes:
         path: `orbit`, `camera`, or a JSON file of key poses (docs/videos.md).
-        camera: name of a camera of the rig or the compared capture, used as viewpoint or start of the orbit; None for
-            the first.
+        camera: name of a camera in the rig or the compared capture, used as viewpoint or start of the orbit; None for
+            the first one.
         orbit_speed: angular speed of the orbit in degrees per second, towards the camera's right.
-        fps: frame rate of the video; None for the rate of the source.
+        fps: frame rate of the video; None for the frame rate of the source.
         speed: seconds of scene time per second of video.
-        seconds: duration of the video; None for the duration of the frames.
+        seconds: duration of the video in seconds; None for the duration of the frames.
         size: (width, height) of the rendered image; None for the size of the camera.
-        interpolate: whether states are interpolated between frames.
+        interpolate: whether to interpolate states between frames.
         tracks: number of tracks to draw.
         trail: length of the tracks in seconds of video.
-        parts: whether Gaussians are coloured by part.
+        parts: whether to colour Gaussians by part.
         background: RGB in 0…1; None for the scene's background.
     """
 
@@ -63,13 +63,13 @@ class Shot:
 
     Attributes:
         given: source of the states.
-        times: times in seconds of the shown frames, by index.
+        times: time in seconds of each shown frame, keyed by frame index.
         options: requested options.
         fps: frame rate of the video.
-        count: number of images.
+        count: number of images in the video.
         size: (width, height) of the rendered image.
         path: camera path.
-        truth: returns the ground truth image of a frame at that size; None without a comparison.
+        truth: function that returns the ground truth image of a frame at this size; None if there is no comparison.
     """
 
     given: Source
@@ -87,7 +87,7 @@ class Shot:
         return self.size[0] * (1 if self.truth is None else 2), self.size[1]
 
     def pictures(self) -> Iterator[Picture]:
-        """Yields the images [H, W, 3] of the video, with two states in memory at a time."""
+        """Yields the images [H, W, 3] of the video, holding two states in memory at a time."""
         from scas4d_core.engines.limits import DEFAULT, rig_limits
         from scas4d_core.query.view import ViewRenderer
 
@@ -113,7 +113,7 @@ class Shot:
         labels = self.given.parts()
         if labels is None:
             raise InputError(
-                f"parts: {self.given.name} holds none", "leave --parts out; a scene without motion has no parts"
+                f"parts: {self.given.name} contains no parts", "leave --parts out; a scene without motion has no parts"
             )
         return labels
 
@@ -121,7 +121,7 @@ class Shot:
         rows = moving_rows(self.given.some(list(self.times)), self.options.tracks)
         if not rows.size:
             raise InputError(
-                "tracks: there is no motion in these frames", "leave --tracks out, or choose other --frames"
+                "tracks: there is no motion in these frames", "leave --tracks out, or choose other frames with --frames"
             )
         return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
 
@@ -137,11 +137,11 @@ def plan_shot(
         high: last frame.
         options: requested options.
         compared: capture whose ground truth images are shown on the right, or None.
-        even: whether width and height must be even. The odd size of a camera is rounded down; an odd requested size is
-            an error.
+        even: whether width and height must be even. An odd camera size is rounded down; an odd requested size
+            is an error.
 
     Raises:
-        InputError: frames, a camera or images do not exist, or options contradict each other.
+        InputError: frames, a camera or images do not exist, or options are incompatible.
     """
     _check(options, compared)
     times = given.within(low, high)
@@ -151,8 +151,8 @@ def plan_shot(
     length = (last - first) / options.speed + 1 / fps if options.seconds is None else options.seconds
     if length * fps > MOST_PICTURES:
         raise InputError(
-            f"fps {fps:g} and speed {options.speed:g} make {length * fps:.0f} pictures",
-            f"give --frames, --fps or --speed that make at most {MOST_PICTURES}",
+            f"fps {fps:g} and speed {options.speed:g} result in {length * fps:.0f} images",
+            f"change --frames, --fps or --speed to get at most {MOST_PICTURES}",
         )
     camera = _camera(given, options.camera, compared)
     size = _size(options.size, camera, even)
@@ -165,16 +165,18 @@ def plan_shot(
 def _check(options: VideoOptions, compared: Capture | None) -> None:
     if compared is not None and options.path != "camera":
         raise InputError(
-            f"compare is given for path {options.path!r}", "give --path camera: cameras have true pictures"
+            f"compare is given for path {options.path!r}", "use --path camera: only cameras have ground-truth images"
         )
     if compared is not None and options.interpolate:
         raise InputError(
-            "compare and interpolate exclude each other: there is no truth between frames", "leave one out"
+            "compare and interpolate are mutually exclusive: there is no ground truth between frames", "leave one out"
         )
 
 
 def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera:
-    """Returns a camera by name, or the first without a name; refined cameras of the scene precede those of the capture.
+    """Returns the camera with a given name, or the first camera if the name is None.
+
+    Refined cameras of the scene take precedence over those of the capture.
 
     Raises:
         InputError: there are no cameras, or none with this name.
@@ -190,13 +192,13 @@ def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera
         }
     if not cameras:
         raise InputError(
-            f"{given.name} has no cameras; those of USD and .glb are not read back",
-            "give the folder of scas4d reconstruct, its .s4d file, or --compare a capture",
+            f"{given.name} has no cameras; they are not read from USD and .glb files",
+            "give the output folder of scas4d reconstruct, its .s4d file, or a capture with --compare",
         )
     if name is None:
         return next(iter(cameras.values()))
     if name not in cameras:
-        raise InputError(f"camera {name!r} is not there", f"give one of {', '.join(cameras)}")
+        raise InputError(f"camera {name!r} does not exist", f"give one of {', '.join(cameras)}")
     return cameras[name]
 
 
@@ -223,13 +225,13 @@ def _path(
 
 
 def _truth(compared: Capture, camera: Camera, size: tuple[int, int], last: int) -> Callable[[int], Picture]:
-    """Returns a function that gives the ground truth image of a frame, placed like the camera's in ``fit_to_size``."""
+    """Returns a function that maps a frame index to the ground truth image, placed as in ``fit_to_size``."""
     training = camera.name in compared.full_rig.names
     if not training and (compared.full_test_rig is None or camera.name not in compared.full_test_rig.names):
         raise InputError(f"compare: capture {compared.name} has no camera {camera.name!r}", "give another --camera")
     if last >= compared.frame_count:
         raise InputError(
-            f"compare: capture {compared.name} has {compared.frame_count} frames, and frame {last} is shown",
+            f"compare: capture {compared.name} has {compared.frame_count} frames, but frame {last} is shown",
             f"give --frames up to {compared.frame_count - 1}, or the capture that was reconstructed",
         )
     scale = min(size[0] / camera.width, size[1] / camera.height)

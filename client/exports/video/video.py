@@ -27,14 +27,14 @@ def make_video(
     url: str,
     token: str | None,
 ) -> Path:
-    """Renders a video and returns its path; two states and one image are in memory at a time.
+    """Renders a video and returns its path, holding two states and one image in memory at a time.
 
     Args:
         source: source of the states, see `opened`.
         out: path that ends in `.mp4` or `.webp`; None for an MP4 next to the source, named after it.
         options: options of the video.
-        frames: range `A:B`, inclusive; None for all.
-        compared: capture whose ground truth image of the same camera is shown to the right of each rendered image.
+        frames: inclusive range `A:B`; None for all frames.
+        compared: capture whose ground truth images from the same camera are shown to the right of the rendered images.
         url: address of the service.
         token: token of the service.
 
@@ -48,7 +48,7 @@ def make_video(
     pyav()  # fail early, before anything is downloaded or compiled
     with opened(source, low, high, options.parts, url, token) as given, Bars() as bars:
         if given.of.damage is not None:
-            console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
+            console.print(f"only part of the source can be read: {given.of.damage}", soft_wrap=True)
         target = out or given.beside / f"{given.name}-{Path(options.path).stem}.mp4"
         planned = plan_shot(given, low, high, options, compared, even=check_suffix(target) == ".mp4")
         _compile_kernels(bars)
@@ -58,7 +58,7 @@ def make_video(
                 bars("rendering", number + 1, planned.count)
     width, height = planned.whole_size
     seconds, size = planned.count / planned.fps, target.stat().st_size / 1e6
-    summary = f"{planned.count} pictures of {width}x{height}, {seconds:.1f} s, {size:.1f} MB"
+    summary = f"{planned.count} images of {width}x{height}, {seconds:.1f} s, {size:.1f} MB"
     console.print(f"{target}: {summary}", highlight=False, soft_wrap=True)
     return target
 
@@ -73,7 +73,7 @@ def picture_size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SMALLEST <= side <= LARGEST for side in size):
         raise InputError(
-            f"size {text!r} is not a picture size", f"give WIDTHxHEIGHT, such as 1280x720, {SMALLEST} to {LARGEST} each"
+            f"size {text!r} is not an image size", f"give WIDTHxHEIGHT, such as 1280x720, {SMALLEST} to {LARGEST} each"
         )
     return size
 

@@ -17,13 +17,13 @@ Picture = NDArray[np.uint8]
 
 SUFFIXES = (".mp4", ".webp")
 QUALITY = {".mp4": {"crf": "18", "preset": "medium"}, ".webp": {"quality": "90", "lossless": "0"}}
-"""Encoder options, chosen for visually lossless quality."""
+"""Encoder options for visually lossless quality."""
 FINEST_RATE = 65535
 """Largest denominator of a frame rate that the containers can store."""
 
 
 def check_suffix(path: Path) -> str:
-    """Returns the suffix of a video file in lower case.
+    """Returns the suffix of a video file in lowercase.
 
     Raises:
         InputError: the suffix is not supported.
@@ -44,10 +44,10 @@ def check_suffix(path: Path) -> str:
 
 @contextmanager
 def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
-    """Writes images of equal size to a video; missing folders are created, and the file appears once it is complete.
+    """Writes images of equal size to a video, creating missing folders; the file appears only once it is complete.
 
     An MP4 uses 8-bit 4:2:0 for compatibility, with BT.709 colours in limited range, tagged as such. A WebP loops
-    forever. Images are encoded as they are added and are not kept.
+    endlessly. Images are encoded as they are added and are not kept.
 
     Args:
         path: path that ends in `.mp4` or `.webp`.
@@ -55,7 +55,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
 
     Yields:
         A function that adds an image [H, W, 3] with sRGB values 0…255. In an MP4, an odd last row or column is cropped,
-        as required by the encoding.
+        because the encoding requires even sizes.
 
     Raises:
         InputError: the suffix is not supported, no image was added, or the file cannot be written.
@@ -75,7 +75,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
             encoder = _Encoder(beside, suffix, fps)
             yield encoder.add
             if not encoder.count:
-                raise InputError(f"out {str(path)!r} would hold no picture", "give frames that exist")
+                raise InputError(f"out {str(path)!r} would contain no images", "choose frames that exist")
             encoder.finish()
         except av.FFmpegError as error:
             remedy = "give a smaller size, or another --fps"

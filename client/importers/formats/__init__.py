@@ -1,1 +1,1 @@
-"""Readers of calibrations, one file per tool; each returns a `Calibration`."""
+"""Calibration readers, one module per tool; each returns a `Calibration`."""

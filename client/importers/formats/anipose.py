@@ -19,11 +19,11 @@ from client.importers.formats.opencv_camera import opencv_camera, picture_size
 from scas4d_core.captures import CaptureError
 
 INTRINSICS_FOLDER = re.compile(r"int_(.+)_img")
-"""Folder name from which Pose2Sim names a camera; the group is the name of the camera's videos."""
+"""Folder name that Pose2Sim uses as a camera name; the group is the name of the camera's videos."""
 
 
 def is_anipose(document: Mapping[str, Any]) -> bool:
-    """Returns whether a table of the file has a camera matrix and a pose."""
+    """Returns whether any table in the file has a camera matrix and a pose."""
     return any(isinstance(table, Mapping) and {"matrix", "rotation"} <= table.keys() for table in document.values())
 
 
@@ -31,17 +31,17 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
     """Reads the rig from a parsed file.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names file, camera, field and remedy.
+        CaptureError: a field is missing or invalid; the message names the file, camera, field and remedy.
     """
     cameras = []
     for key, table in document.items():
         if key == "metadata":
             continue
         if not isinstance(table, Mapping):
-            raise CaptureError(f"{path}: {key} is not the table of a camera; leave it out")
+            raise CaptureError(f"{path}: {key} is not a camera table; remove it")
         name = table.get("name", key)
         if not isinstance(name, str | int):
-            raise CaptureError(f"{path}: [{key}] has the name {name!r}; give text")
+            raise CaptureError(f"{path}: [{key}] has the name {name!r}; give a string")
         inner = INTRINSICS_FOLDER.fullmatch(str(name))
         where = f"{path}: [{key}]"
         cameras.append(

@@ -1,10 +1,9 @@
 """Reads caliscope's `camera_array.toml`.
 
 Each camera has a table `[cameras.<id>]` with `size` (width, height), `matrix` and `distortions` (5, or 4 if `fisheye`).
-Its `rotation`, a matrix [3][3] or Rodrigues vector [3], and its `translation` are world to camera. A camera is named
-after its
-video, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of `cam_id`.
-`rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is not used. Cameras that
+Its `rotation`, a matrix [3][3] or Rodrigues vector [3], and its `translation` are world to camera. Cameras are named
+after their videos, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of `cam_id`.
+`rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is ignored. Cameras that
 are marked as ignored or have no pose are left out, with a remark.
 (github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
 """
@@ -29,13 +28,13 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
     """Reads the rig from a parsed file.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names file, camera, field and remedy.
+        CaptureError: a field is missing or invalid; the message names the file, camera, field and remedy.
     """
     cameras, left_out = [], []
     for key, table in document["cameras"].items():
         where = f"{path}: [cameras.{key}]"
         if not isinstance(table, Mapping):
-            raise CaptureError(f"{where} is not the table of a camera; leave it out")
+            raise CaptureError(f"{where} is not a camera table; remove it")
         name = f"{'port' if 'port' in table else 'cam'}_{table.get('cam_id', table.get('port', key))}"
         if table.get("ignore") is True or not _calibrated(table):
             left_out.append(name)
@@ -52,10 +51,10 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
                 fisheye=table.get("fisheye") is True,
             )
         )
-    why = f"{path.name}: left out, ignored or without a pose there"
+    why = f"{path.name}: left out cameras that are ignored or have no pose"
     return calibration_of_cameras(path, cameras, left_out, why)
 
 
 def _calibrated(table: Mapping[str, Any]) -> bool:
-    """Returns whether the camera has intrinsics and a pose; rtoml wrote missing values as the text "null"."""
+    """Returns whether the camera has intrinsics and a pose; rtoml writes missing values as the text "null"."""
     return all(isinstance(table.get(field), list) for field in ("matrix", "rotation", "translation"))

@@ -1,4 +1,4 @@
-"""Reads COLMAP models, text or binary: `cameras`, `images` and, if present, `points3D`. Needs only numpy.
+"""Reads COLMAP models, text or binary: `cameras`, `images` and, if present, `points3D`. Requires only numpy.
 
 Poses are world to camera with OpenCV axes, as a quaternion (w, x, y, z) and a translation. Principal points are
 relative to the upper left corner of the image. Both conventions match this project's.
@@ -61,7 +61,7 @@ def is_model(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> Calibration:
-    """Reads the rig and the point cloud of a model.
+    """Reads the rig and the point cloud from a model.
 
     Raises:
         CaptureError: a file is missing or malformed, or a camera is invalid; the message names the file and the
@@ -71,12 +71,12 @@ def read_colmap(folder: Path) -> Calibration:
     files = {name: folder / f"{name}{end}" for name in ("cameras", "images", "points3D")}
     for name in ("cameras", "images"):
         if not files[name].is_file():
-            raise CaptureError(f"{files[name]}: no such file, though {folder} has other files of a COLMAP model")
+            raise CaptureError(f"{files[name]}: no such file, although {folder} contains other files of a COLMAP model")
     binary = end == ".bin"
     cameras = _binary_cameras(files["cameras"]) if binary else _text_cameras(files["cameras"])
     images = list(_binary_images(files["images"]) if binary else _text_images(files["images"]))
     if not images:
-        raise CaptureError(f"{files['images']}: no picture was registered; calibrate again with more overlap")
+        raise CaptureError(f"{files['images']}: no images were registered; calibrate again with more overlap")
     points = None
     if files["points3D"].is_file():
         points = _cloud(list(_binary_points(files["points3D"]) if binary else _text_points(files["points3D"])))
@@ -90,19 +90,21 @@ def _lens(files: dict[str, Path], cameras: dict[int, _Camera], image: _Image) ->
     camera = cameras.get(image.camera)
     if camera is None:
         raise CaptureError(
-            f"{files['images']}: picture {image.name} is of camera {image.camera}, which {files['cameras'].name} lacks"
+            f"{files['images']}: image {image.name} has camera {image.camera}, which {files['cameras'].name} lacks"
         )
     q, t = np.array(image.quaternion), np.array(image.translation)
     length = np.linalg.norm(q)
     if not (np.isfinite(length) and abs(length - 1) < 1e-2 and np.isfinite(t).all()):
         listed = " ".join(f"{value:g}" for value in (*image.quaternion, *image.translation))
-        raise CaptureError(f"{files['images']}: picture {image.name} has no pose ({listed}); q must have length 1")
+        raise CaptureError(
+            f"{files['images']}: image {image.name} has an invalid pose ({listed}); q must have length 1"
+        )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _rotation(q / length), t
     names = MODELS.get(camera.model, ())
     if names and len(names) != len(camera.parameters):
         raise CaptureError(
-            f"{files['cameras']}: camera {image.camera} has {len(camera.parameters)} parameters; {camera.model} has "
+            f"{files['cameras']}: camera {image.camera} has {len(camera.parameters)} parameters; {camera.model} needs "
             f"{len(names)}: {', '.join(names)}"
         )
     parameters = dict(zip(names, camera.parameters, strict=False))
@@ -149,12 +151,12 @@ def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[A
     """
     words = line.split(maxsplit=len(kinds) - 1 if kinds.endswith("s") else -1)
     if len(words) < len(kinds):
-        raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: {what}")
+        raise CaptureError(f"{path}: line {number} has {len(words)} fields; expected: {what}")
     read = {"i": int, "f": float, "s": str}
     try:
         return [read[kinds[min(place, len(kinds) - 1)]](word) for place, word in enumerate(words)]
     except ValueError as fault:
-        raise CaptureError(f"{path}: line {number}: {fault}; needed: {what}") from fault
+        raise CaptureError(f"{path}: line {number}: {fault}; expected: {what}") from fault
 
 
 def _text_cameras(path: Path) -> dict[int, _Camera]:
@@ -163,14 +165,14 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
         if line:
             words = line.split(maxsplit=2)
             if len(words) < 3:
-                raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: id MODEL width height …")
+                raise CaptureError(f"{path}: line {number} has {len(words)} fields; expected: id MODEL width height …")
             values = _fields(path, number, f"{words[0]} {words[2]}", "iiif", "id MODEL width height parameters")
             cameras[values[0]] = _Camera(words[1], values[1], values[2], tuple(values[3:]))
     return cameras
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    # Every second line lists the image's points, and may be empty.
+    # Every second line lists the image's points and may be empty.
     is_image = True
     for number, line in _lines(path):
         if is_image and not line:
@@ -191,7 +193,7 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 class _Bytes:
-    """Sequential reader of a binary file whose errors say where the file ends prematurely."""
+    """Sequential reader for a binary file, whose errors state where a truncated file ends."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -217,7 +219,7 @@ class _Bytes:
     def text(self, what: str) -> str:
         end = self._data.find(b"\0", self._at, self._at + LONGEST_NAME)
         if end < 0:
-            raise CaptureError(f"{self.path}: {what} has no end; is this a COLMAP {self.path.name}?")
+            raise CaptureError(f"{self.path}: {what} is not terminated; is this a COLMAP {self.path.name}?")
         text = self._data[self._at : end].decode("utf-8", "replace")
         self._at = end + 1
         return text
@@ -233,8 +235,8 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
         name = MODEL_IDS.get(model)
         if name not in MODELS:  # the parameter count is known only for supported models
             raise CaptureError(
-                f"{path}: camera {id} has the model {name or f'number {model}'}, which is not read; calibrate with one "
-                f"of {', '.join(MODELS)}"
+                f"{path}: camera {id} has the model {name or f'number {model}'}, which is not supported; "
+                f"calibrate with one of {', '.join(MODELS)}"
             )
         cameras[id] = _Camera(name, width, height, file.take(f"{len(MODELS[name])}d", what))
     return cameras
@@ -242,9 +244,9 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
 
 def _binary_images(path: Path) -> Iterator[_Image]:
     file = _Bytes(path)
-    (count,) = file.take("Q", "the number of pictures")
+    (count,) = file.take("Q", "the number of images")
     for number in range(count):
-        what = f"picture {number + 1} of {count}"
+        what = f"image {number + 1} of {count}"
         _, *pose, camera = file.take("i4d3di", what)
         name = file.text(f"the name of {what}")
         (points,) = file.take("Q", what)

@@ -1,7 +1,7 @@
-"""Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files; `scas4d[importers]` has OpenCV.
+"""Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files. Requires OpenCV.
 
 `names` lists the cameras. Per camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in some
-versions, `H_<name>` and `W_<name>`; without them, the size is that of the camera's images. `extri.yml` has `Rot_<name>`
+versions, `H_<name>` and `W_<name>`; without them, the size is that of the images. `extri.yml` has `Rot_<name>`
 [3, 3], or only `R_<name>` [3] (Rodrigues vector), and `T_<name>` [3], world to camera. A camera without a pose is left
 out, with a remark.
 (github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)
@@ -22,11 +22,11 @@ from scas4d_core.captures import CaptureError
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 APART = 1e-3
-"""Largest entry-wise difference between a rotation matrix and its Rodrigues vector; EasyMocap writes six digits."""
+"""Maximum entrywise difference between a rotation matrix and that of its Rodrigues vector; files have six digits."""
 
 
 def is_easymocap(folder: Path) -> bool:
-    """Returns whether the folder contains both files."""
+    """Returns whether the folder contains both calibration files."""
     return all((folder / name).is_file() for name in (INTRINSICS, EXTRINSICS))
 
 
@@ -34,7 +34,7 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
     """Reads the rig from a folder.
 
     Args:
-        folder: folder of the two files.
+        folder: folder that contains the two calibration files.
         capture: folder with `images/` or `videos/`, from which missing image sizes are read.
 
     Raises:
@@ -47,12 +47,12 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
     intrinsics, extrinsics = read_storage(folder / INTRINSICS), read_storage(folder / EXTRINSICS)
     names = intrinsics.get("names")
     if not isinstance(names, list) or not names:
-        raise CaptureError(f"{folder / INTRINSICS}: has no list `names` of its cameras")
+        raise CaptureError(f"{folder / INTRINSICS}: has no list `names` of cameras")
     texts = [name if isinstance(name, str) else f"{name:g}" for name in names if isinstance(name, str | float)]
     posed = [name for name in texts if extrinsics.get(f"T_{name}") is not None]
     left_out = [name for name in texts if name not in posed and name != "none"]
     cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in posed]
-    why = f"{INTRINSICS}: left out, without a pose in {EXTRINSICS}"
+    why = f"{INTRINSICS}: left out cameras that have no pose in {EXTRINSICS}"
     return calibration_of_cameras(folder, cameras, left_out, why)
 
 
@@ -61,7 +61,7 @@ def _camera(
 ) -> LensCamera:
     where = f"{folder / EXTRINSICS}: camera {name!r}"
     if not can_be_named(name):
-        raise CaptureError(f"{where}: {NAMES}; rename it there and its pictures")
+        raise CaptureError(f"{where}: {NAMES}; rename the camera and its images")
     rotation, vector = extrinsics.get(f"Rot_{name}"), extrinsics.get(f"R_{name}")
     if rotation is None:
         rotation = vector

@@ -1,6 +1,6 @@
-"""Reads OpenCV's FileStorage format, YAML or XML, and the sizes of images that such files often omit.
+"""Reads OpenCV's FileStorage format (YAML or XML), and image sizes, which such files often omit.
 
-This needs OpenCV, because no other library parses its `%YAML:1.0` header and `!!opencv-matrix` tags.
+This requires OpenCV, because no other library parses its `%YAML:1.0` header and `!!opencv-matrix` tags.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ LEVELS = np.zeros(256, np.int8)
 LEVELS[[ord("["), ord("{")]], LEVELS[[ord("]"), ord("}")]] = 1, -1
 DASHES = re.compile(rb" *(?:- )+")
 DEEPEST = 32
-"""Maximum nesting depth. OpenCV parses recursively and crashes at some ten thousand levels."""
+"""Maximum nesting depth. OpenCV parses recursively and crashes at about ten thousand levels."""
 
 
 def read_storage(path: Path) -> dict[str, Any]:
-    """Returns the top-level fields of a file by name.
+    """Returns the top-level fields of a file, keyed by name.
 
     Values are matrices as arrays [rows, cols], lists, numbers and strings; anything else is None.
 
@@ -39,17 +39,17 @@ def read_storage(path: Path) -> dict[str, Any]:
     cv2 = load("cv2", needed="reading OpenCV's YAML and XML files")
     try:
         if path.stat().st_size > LARGEST_FILE:
-            raise CaptureError(f"{path}: has more than {LARGEST_FILE >> 20} MB, which no calibration has")
+            raise CaptureError(f"{path}: is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
         if _depth(path.read_bytes()) > DEEPEST:
-            raise CaptureError(f"{path}: is nested deeper than {DEEPEST} levels, which no calibration is")
+            raise CaptureError(f"{path}: is nested more than {DEEPEST} levels deep; this is not a calibration file")
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         if not storage.isOpened():
-            raise CaptureError(f"{path}: cannot be read as a file of OpenCV (FileStorage, YAML or XML)")
+            raise CaptureError(f"{path}: cannot be read as an OpenCV FileStorage file (YAML or XML)")
         root = storage.root()
         return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - a FileNode is no mapping
     except (OSError, SystemError, cv2.error) as fault:
         first = str(fault).strip().splitlines()[0] if str(fault).strip() else type(fault).__name__
-        raise CaptureError(f"{path}: cannot be read as a file of OpenCV, YAML or XML ({first})") from fault
+        raise CaptureError(f"{path}: cannot be read as an OpenCV FileStorage file ({first})") from fault
 
 
 def _depth(data: bytes) -> int:
@@ -86,7 +86,7 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
     Args:
         folder: folder of the capture.
         camera: name of the camera.
-        where: position in the calibration that lacks the size, for messages.
+        where: position in the calibration at which the size is missing, for messages.
 
     Raises:
         CaptureError: there is neither an image nor a video, or it cannot be read.
@@ -110,6 +110,6 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
             except (av.FFmpegError, IndexError) as fault:
                 raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
     raise CaptureError(
-        f"{where} says nothing of the pictures' size, and there is no {images}/ nor {folder / 'videos' / camera}.mp4 "
-        "to measure it; give the pictures there, or the size in the file"
+        f"{where} has no image size, and neither {images}/ nor {folder / 'videos' / camera}.mp4 exists "
+        "to read it from; add the images there, or the size to the file"
     )

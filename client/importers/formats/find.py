@@ -43,7 +43,7 @@ def _calibrations_in(folder: Path) -> list[Path]:
 
 
 def _is_toml(path: Path) -> bool:
-    """Returns whether the name is calibration.toml, Calib*.toml, or FreeMoCap's <recording>_camera_calibration.toml."""
+    """Returns whether the file is calibration.toml, Calib*.toml, or FreeMoCap's <recording>_camera_calibration.toml."""
     name = path.name.lower()
     return name.endswith("_calibration.toml") or (name.startswith("calib") and name.endswith(".toml"))
 
@@ -59,8 +59,8 @@ def read_calibration_file(path: Path, capture: Path) -> Calibration:
     """Reads a calibration file, or the only calibration in a folder.
 
     Args:
-        path: a file, or a folder with one calibration.
-        capture: folder of the images, from which image sizes missing in the file are read.
+        path: calibration file, or folder that contains exactly one calibration.
+        capture: folder of the images, from which image sizes that the file omits are read.
 
     Raises:
         CaptureError: the format is unknown, the folder has several calibrations, or the file cannot be read.
@@ -89,10 +89,10 @@ def single_calibration(found: list[Path], folder: Path) -> Path:
     if len(found) == 1:
         return found[0]
     if not found:
-        raise CaptureError(f"{folder}: has no calibration; give {READ}")
+        raise CaptureError(f"{folder}: contains no calibration; give {READ}")
     listed = ", ".join(str(path.relative_to(folder)) for path in found)
     raise CaptureError(
-        f"{folder}: has {len(found)} calibrations ({listed}); say which: --calibration {found[0]}, or leave one"
+        f"{folder}: contains {len(found)} calibrations ({listed}); choose one: --calibration {found[0]}, or keep one"
     )
 
 
@@ -106,4 +106,4 @@ def _read_toml(path: Path) -> Calibration:
         return read_caliscope(path, document)
     if is_anipose(document):
         return read_anipose(path, document)
-    raise CaptureError(f"{path}: has no tables of cameras with matrix and rotation; give {READ}")
+    raise CaptureError(f"{path}: contains no camera tables with matrix and rotation; give {READ}")

@@ -1,10 +1,10 @@
-"""Reads nerfstudio's `transforms.json`, also written by instant-ngp. Needs only numpy.
+"""Reads nerfstudio's `transforms.json`, which instant-ngp also writes. Requires only numpy.
 
 Each image has `file_path`, `transform_matrix` (camera to world, OpenGL axes: x right, y up, z back), and optionally
 `time`. The intrinsics `camera_model`, `w`, `h`, `fl_x`, `fl_y` (or `camera_angle_x`, radians), `cx`, `cy`, `k1` … are
 at the top level or in an image's entry, which takes precedence. `applied_transform` (3×4, on the world) and
-`applied_scale` are undone, so the rig is in the coordinates that were calibrated. `mask_path` and `ply_file_path` are
-not read: the former marks pixels to ignore instead of the foreground, the latter is a point cloud.
+`applied_scale` are undone, so the rig is in the originally calibrated coordinates. `mask_path` and `ply_file_path` are
+not read: the former marks pixels to ignore instead of the foreground, and the latter is a point cloud.
 (docs.nerf.studio, "Data conventions"; `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`.)
 """
 
@@ -35,12 +35,14 @@ def read_transforms(path: Path) -> Calibration:
     """Reads the rig from a `transforms.json`.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names file, image, field and remedy.
+        CaptureError: a field is missing or invalid; the message names the file, image, field and remedy.
     """
     meta = read_json(path)
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise CaptureError(f"{path}: has no frames; give a list of file_path and transform_matrix, one a camera")
+        raise CaptureError(
+            f"{path}: has no frames; give a list of entries with file_path and transform_matrix, one per camera"
+        )
     undo = _undo_world(path, meta)
     views = []
     for number, frame in enumerate(frames):
@@ -78,7 +80,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     try:
         pose = FLIP @ np.linalg.inv(undo @ to_world)
     except np.linalg.LinAlgError as fault:
-        raise CaptureError(f"{where}: transform_matrix cannot be inverted; give camera to world, a rotation") from fault
+        raise CaptureError(f"{where}: transform_matrix cannot be inverted; give a camera-to-world pose") from fault
     camera = lens_camera(file, model, parameters, pose, size, source=where)
     path = PurePosixPath(file)
     time = _number(where, frame, "time") if frame.get("time") is not None else None
@@ -112,7 +114,7 @@ def _focal(where: str, given: Mapping[str, Any], axis: str, pixels: int) -> floa
         if not 0 < angle < math.pi:
             raise CaptureError(f"{where}: camera_angle_{axis} is {angle:g}; give radians between 0 and pi")
         return pixels / 2 / math.tan(angle / 2)
-    raise CaptureError(f"{where} has no fl_{axis}, nor is there one at the top; give the focal length in pixels")
+    raise CaptureError(f"{where} has no fl_{axis}, and neither has the top level; give the focal length in pixels")
 
 
 def _matrix(where: str, given: Mapping[str, Any], key: str) -> Float:
@@ -130,7 +132,7 @@ def _matrix(where: str, given: Mapping[str, Any], key: str) -> Float:
 def _number(where: str, given: Mapping[str, Any], key: str) -> float:
     value = given.get(key)
     if value is None:
-        raise CaptureError(f"{where} has no {key}, nor is there one at the top")
+        raise CaptureError(f"{where} has no {key}, and neither has the top level")
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise CaptureError(f"{where}: {key} is {value!r}; give a finite number")
     return float(value)
@@ -139,5 +141,5 @@ def _number(where: str, given: Mapping[str, Any], key: str) -> float:
 def _whole(where: str, given: Mapping[str, Any], key: str) -> int:
     value = _number(where, given, key)
     if value != round(value) or not 1 <= value <= 1 << 16:
-        raise CaptureError(f"{where}: {key} is {value:g}; give the picture's size in whole pixels")
+        raise CaptureError(f"{where}: {key} is {value:g}; give the image size in whole pixels")
     return int(value)

@@ -1,4 +1,4 @@
-"""Cameras in OpenCV's conventions, which most laboratory tools store in their own file formats. Needs only numpy.
+"""Cameras in OpenCV's conventions, which most lab tools store in their own file formats. Requires only numpy.
 
 `matrix` is [3, 3] with the centre of the first pixel at (0, 0), so half a pixel is added to principal points here.
 `distortions` are in OpenCV's order. World to camera is a rotation (matrix or Rodrigues vector) and a translation:
@@ -19,11 +19,11 @@ from scas4d_core.captures import CaptureError
 Float = NDArray[np.float64]
 
 HALF = 0.5
-"""Offset of the pixel grid: OpenCV's first pixel centre is (0, 0), this project's is (0.5, 0.5)."""
+"""Pixel grid offset: OpenCV's first pixel centre is at (0, 0), that of this project at (0.5, 0.5)."""
 COUNTS = (0, 4, 5, 8, 12, 14)
-"""Valid numbers of OpenCV coefficients. Those beyond the eighth (thin prism, tilted sensor) must be 0."""
+"""Valid numbers of OpenCV coefficients. Coefficients beyond the eighth (thin prism, tilted sensor) must be 0."""
 SKEW = 1e-6
-"""Largest skew, relative to the focal length, that counts as a rounding error."""
+"""Maximum skew, relative to the focal length, that is treated as a rounding error."""
 LARGEST_SIDE = 1 << 16
 
 
@@ -38,7 +38,7 @@ def opencv_camera(
     size: tuple[int, int],
     fisheye: bool = False,
 ) -> LensCamera:
-    """Creates and validates a camera from the values that a tool stored.
+    """Creates and validates a camera from the values stored by a calibration tool.
 
     Args:
         where: file and position in the file, for messages.
@@ -62,7 +62,7 @@ def opencv_camera(
     k = numbers(where, "the camera matrix", matrix, (9,)).reshape(3, 3)
     if np.abs(k[2, :2]).max() > 0 and not k[:2, 2].any():
         raise CaptureError(
-            f"{where}: the camera matrix has cx, cy in its last row: it is transposed (MATLAB's); give its transpose"
+            f"{where}: the camera matrix has cx, cy in its last row: it is transposed, as in MATLAB; give its transpose"
         )
     if not np.allclose([k[1, 0], *k[2]], [0, 0, 0, 1]) or abs(k[0, 1]) > SKEW * abs(k[0, 0]):
         raise CaptureError(
@@ -78,14 +78,14 @@ def opencv_camera(
 
 
 def _distortion(where: str, given: Any, fisheye: bool) -> tuple[str, dict[str, float]]:
-    """Returns the lens model and its coefficients by name."""
+    """Returns the lens model and its coefficients, keyed by name."""
     values = numbers(where, "distortions", [] if given is None else given, (4,) if fisheye else COUNTS)
     if fisheye:
         return "OPENCV_FISHEYE", dict(zip(FISHEYE, values, strict=True))
     if values[8:].any():
         raise CaptureError(
-            f"{where}: has distortions of thin prisms or a tilted sensor ({', '.join(f'{v:g}' for v in values[8:])}), "
-            "which are not read; calibrate with at most the rational model (8 coefficients)"
+            f"{where}: has thin prism or tilted sensor distortion ({', '.join(f'{v:g}' for v in values[8:])}), "
+            "which is not supported; calibrate with at most the rational model (8 coefficients)"
         )
     named = dict(zip(PERSPECTIVE, values[:8], strict=False))
     if not values.any():
@@ -131,7 +131,7 @@ def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
 
 
 def picture_size(where: str, given: Any) -> tuple[int, int]:
-    """Returns (width, height) as integers; some tools write them as 1088.0.
+    """Returns (width, height) as integers; some tools write them as floats, such as 1088.0.
 
     Raises:
         CaptureError: the size is invalid.

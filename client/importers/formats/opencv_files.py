@@ -1,9 +1,9 @@
 """Reads a folder with one OpenCV FileStorage file per camera, `<camera>.yml`, `.yaml` or `.xml`.
 
-OpenCV defines no layout for a rig; this one follows the field names in its samples. As in the calibration sample, each
+OpenCV defines no rig layout; this one follows the field names in its samples. As in the calibration sample, each
 file has `camera_matrix` [3, 3], `distortion_coefficients`, `image_width`, `image_height` and, if true, `fisheye_model`.
 As in the stereo sample, `R` ([3, 3] or a Rodrigues vector) and `T` [3] are world to camera. Other common names are
-accepted too. The sample's `extrinsic_parameters` are poses of the board, so they are not used.
+accepted too. The sample's `extrinsic_parameters` are board poses, so they are not used.
 (docs.opencv.org, "Camera calibration With OpenCV"; `samples/cpp/.../camera_calibration.cpp`.)
 """
 
@@ -50,11 +50,11 @@ def read_opencv_files(folder: Path, capture: Path) -> Calibration:
     """Reads the rig from a folder with one file per camera.
 
     Args:
-        folder: folder of the calibration files.
+        folder: folder that contains the calibration files.
         capture: folder with `images/` or `videos/`, from which missing image sizes are read.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names file, field and remedy.
+        CaptureError: a field is missing or invalid; the message names the file, field and remedy.
         MissingExtraError: OpenCV is not installed.
     """
     return calibration_of_cameras(folder, [_camera(path, capture) for path in camera_files(folder)])
@@ -65,8 +65,8 @@ def _camera(path: Path, capture: Path) -> LensCamera:
     rotation, translation = first_field(stored, ROTATION), first_field(stored, TRANSLATION)
     if rotation is None or translation is None:
         raise CaptureError(
-            f"{path}: has no pose; give R and T, world to camera (extrinsic_parameters of OpenCV's sample are poses of "
-            "its board)"
+            f"{path}: has no pose; give R and T, world to camera (extrinsic_parameters in OpenCV's sample are board "
+            "poses)"
         )
     size = [stored.get("image_width"), stored.get("image_height")]
     return opencv_camera(

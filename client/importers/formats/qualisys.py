@@ -1,4 +1,4 @@
-"""Reads Qualisys calibrations, exported from QTM as `*.qca.txt`: XML whose data is in attributes only.
+"""Reads Qualisys calibrations, exported from QTM as `*.qca.txt`: XML files that store all data in attributes.
 
 Per camera (`active`, `serial`, `model`):
 
@@ -8,7 +8,7 @@ Per camera (`active`, `serial`, `model`):
   pixel is `sensorMaxU` divided by the width of `fov_video_max`. `radialDistortion1` … and `tangentalDistortion1`, `2`
   are OpenCV's k1, k2, k3, p1, p2. Pose2Sim divides them by 64 as well, but on its demo rig they match a checkerboard
   calibration only if undivided (k1 −0.046 to −0.048 here; −0.031, −0.047, −0.052, −0.053 there).
-- `fov_video`: the recorded part of the sensor; the principal point is relative to its corner.
+- `fov_video`: the recorded region of the sensor; the principal point is relative to its corner.
 
 The centre of the first pixel is assumed to be (0, 0), as in Pose2Sim; Qualisys does not specify it. Cameras that
 record markers but no video are left out, with a remark.
@@ -55,13 +55,13 @@ def read_qualisys(path: Path) -> Calibration:
     """Reads the rig from a `*.qca.txt`.
 
     Raises:
-        CaptureError: the file is not XML, or a field is missing or invalid; the message names file, camera, field and
-            remedy.
+        CaptureError: the file is not XML, or a field is missing or invalid; the message names the file, camera,
+            field and remedy.
     """
     cameras = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
     video = [camera for camera in cameras if _films(camera)] or cameras
     markers = [camera.own.get("serial", "?") for camera in cameras if camera not in video]
-    why = f"{path.name}: left out, they record markers and no video"
+    why = f"{path.name}: left out cameras that record markers instead of video"
     return calibration_of_cameras(path, [_lens(path, camera) for camera in video], markers, why)
 
 
@@ -81,21 +81,21 @@ def _cameras(path: Path) -> list[_QualisysCamera]:
             cameras[-1].parts[name] = attributes
 
     def declared(*_: Any) -> None:
-        raise CaptureError(f"{path}: declares a document type, which no calibration of QTM does; export it again")
+        raise CaptureError(f"{path}: declares a document type, which QTM never does; export the calibration again")
 
     parser = expat.ParserCreate()
     parser.StartElementHandler = started
     parser.StartDoctypeDeclHandler = declared
     try:
         if path.stat().st_size > LARGEST_FILE:
-            raise CaptureError(f"{path}: has more than {LARGEST_FILE >> 20} MB, which no calibration has")
+            raise CaptureError(f"{path}: is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
         parser.Parse(path.read_bytes(), True)
     except (OSError, expat.ExpatError, LookupError) as fault:
         raise CaptureError(
             f"{path}: cannot be read as XML ({fault}); export the calibration from QTM as text (*.qca.txt)"
         ) from fault
     if not cameras:
-        raise CaptureError(f"{path}: lists no camera; export the calibration from QTM as text (*.qca.txt)")
+        raise CaptureError(f"{path}: contains no cameras; export the calibration from QTM as text (*.qca.txt)")
     return cameras
 
 
@@ -122,7 +122,7 @@ def _lens(path: Path, camera: _QualisysCamera) -> LensCamera:
         if round(ratio) < 2 or abs(ratio - round(ratio)) > WHOLE or round(ratio) != (unit or [round(ratio)])[0]:
             raise CaptureError(
                 f"{where}: sensorMax{axis} is {sensor:g} for the {pixels + 1:g} pixels of {window}: {ratio:.3g} "
-                "subpixels a pixel, where QTM has 64; export the calibration from QTM"
+                "subpixels per pixel instead of QTM's 64; export the calibration from QTM"
             )
         unit.append(float(round(ratio)))
     corner = np.array([number("fov_video", "left"), number("fov_video", "top")])

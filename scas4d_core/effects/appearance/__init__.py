@@ -1,1 +1,1 @@
-"""Effects on colour: light, shading, shadows, gloss and camera gains."""
+"""Effects that model colour: lighting, shading, shadows, gloss and camera gains."""

@@ -3,10 +3,11 @@
 A gain is applied to linear light, before the sRGB curve. On the power part of the curve, s = 1.055 L^(1/2.4) − 0.055, a
 gain γ turns a value s into a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. One
 number per channel is therefore estimated: the median over pixels of (image + 0.055) / (rendering + 0.055). Independent
-gains and offsets, as in frame 0, would compensate each other.
+gains and offsets, as in frame 0, would trade off against each other.
 
-The renderings are those of the update. Each pass over the cameras updates each gain once, by half of the difference.
-Later frames start from these gains. When the effect is switched off, the gains keep their last values.
+The estimate uses the renderings of the update. Each pass over the cameras updates each gain once, by half of the
+estimated difference. Later frames start from these gains. When the effect is switched off, the gains keep their last
+values.
 """
 
 from __future__ import annotations
@@ -25,19 +26,21 @@ from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, Update
 
 NAME = "camera_gain"
 POWER = 2.4
-"""Exponent of the sRGB curve: a gain in linear light is the gain of s + 0.055 to this power."""
-# Measured spreads for the thresholds: at most 0.011 on the five objects (cloth) and 0.002 on stage, whose cameras are
-# alike; 0.025 on basketball, whose gains frame 0 has found and which gains 0.03 dB with the effect; 0.078 to 0.094 on
-# lamps.
+"""Exponent of the sRGB curve: a gain in linear light is the gain of s + 0.055 raised to this power."""
+# Measured spreads behind the thresholds: at most 0.011 on the five objects (on cloth) and 0.002 on stage, whose cameras
+# are identical; 0.025 on basketball, whose gains are known from frame 0 and which improves by 0.03 dB with the effect;
+# 0.078 to 0.094 on lamps.
 
 
 def current_exposures(
     exposures: dict[str, Array], carried: Mapping[str, Arrays], names: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Returns the exposures of the cameras, [3, 2] gain and offset by name: as given, or from the latest gains.
+    """Returns the [3, 2] exposure (gain and offset) of each camera, from the latest gains if there are any.
 
     Args:
-        exposures: found in frame 0. carried: arrays of the effects. names: names of the rig's cameras.
+        exposures: exposure of each camera, as found in frame 0.
+        carried: arrays carried over by the effects, keyed by effect name.
+        names: camera names of the rig, in rig order.
     """
     if NAME not in carried:
         return exposures
@@ -73,10 +76,10 @@ def _centre(gains: Array) -> Array:
 
 
 def spread_of(seen: FrameObservation) -> float | None:
-    """Returns the standard deviation of the colour gains over the cameras, in linear light; None if there are too few.
+    """Returns the standard deviation of the colour gains over the cameras, in linear light; None with too few cameras.
 
-    It is estimated from the means of images and renderings. The common factor of a camera's channels is removed: an
-    object that is rendered slightly too small or glossy in front of black changes all channels alike.
+    The gains are estimated from the mean colours of images and renderings. The factor common to a camera's channels is
+    removed: an object in front of black that is glossy or rendered slightly too small changes all channels alike.
     """
     spreads = []
     for view in seen.views:
@@ -93,10 +96,10 @@ def spread_of(seen: FrameObservation) -> float | None:
 
 @dataclass(frozen=True)
 class CameraGain(Effect):
-    """A gain per camera and channel, estimated from the renderings of an update."""
+    """Estimates a gain per camera and channel from the renderings of an update."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns how much the gains differ between the cameras: known gains and remaining differences."""
+        """Returns how much the gains differ between cameras, including the gains that are already compensated."""
         spread = spread_of(seen)
         return (
             None
@@ -114,8 +117,8 @@ EFFECT = CameraGain(
     name=NAME,
     group=EffectGroup.APPEARANCE,
     description="Each camera has a gain per channel, which may drift.",
-    disambiguation="Per channel the product over the cameras is 1: what all cameras share is light, and goes into "
-    "the colours.",
+    disambiguation="For each channel, the product over the cameras is 1: a change that all cameras share is lighting "
+    "and goes into the colours.",
     cost="the median over about 4,000 pixels per iteration, 1 % of an update",
     auto=True,
     on_above=0.04,

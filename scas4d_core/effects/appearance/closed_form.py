@@ -2,9 +2,9 @@
 
 Each step changes a Gaussian's colour by the mean residual (image minus rendering) over the pixels of some views,
 weighted by the Gaussian's share of each pixel. This is SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
-1994). Steps of size 1 do not overshoot, because the shares of a pixel sum to at most 1. The kernels are those of the
-rasterizer. The last subset dominates where views disagree, for example at a new object that the state does not contain
-yet. Therefore each subset has views from all sides, and the residual of each pixel is clamped.
+1994). Steps of size 1 do not overshoot, because the shares of a pixel sum to at most 1. The kernels are shared
+with the rasterizer. The last subset dominates where views disagree, for example at a new object that the state does not
+contain yet. Therefore each subset has views from all sides, and the residual of each pixel is clamped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOST = 0.2
 """Limit on the residual of a pixel, RGB in 0…1; larger differences are not due to lighting. On `visit`, which a ball
 enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
 FEW = 1.0
-"""Blending weight, in pixels, that is added to each Gaussian's, so that barely visible Gaussians keep their colours."""
+"""Blending weight, in pixels, added to that of each Gaussian, so that barely visible Gaussians keep their colours."""
 
 
 def follow_pictures(
@@ -38,8 +38,10 @@ def follow_pictures(
     """Returns the state with the colours of some Gaussians updated to match the images.
 
     Args:
-        state: geometry that matches the images. views: views of the frame. renderer: renders them.
-        learnt: [N] 1 for the Gaussians whose colours are updated; the others keep theirs.
+        state: state whose geometry already matches the images.
+        views: training views of the frame.
+        renderer: renderer that computes the residuals.
+        learnt: [N] mask that is 1 for Gaussians whose colours are updated, and 0 for all others.
     """
     views = from_all_sides(views)
     for first in range(min(SUBSETS, len(views))):

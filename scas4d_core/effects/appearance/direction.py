@@ -2,8 +2,8 @@
 
 Each Gaussian has a normal and a strength, and all share one environment (``kernels.appearance.direction``). Spherical
 harmonics that turn with each Gaussian would be wrong after a few frames, because the highlight of a fixed lamp moves
-over a turning surface. The gloss is learnt with frame 0 (``first_frame.glossy``) and refined by updates. Turning moves
-highlights to new places, which determines normals and lamps better than a single frame.
+over a turning surface. The gloss is learnt with frame 0 (``first_frame.glossy``) and refined by updates. Rotation
+moves highlights to new places, which constrains normals and lamps better than a single frame.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ FEW = 4
 def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
     """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
 
-    Normals are rotated by it instead of by single Gaussians' rotations: a normal belongs to a surface, and positions do
-    not accumulate the errors of earlier frames. On `gloss`, both variants gave the same result.
+    Normals are rotated with their neighbourhood instead of with their own Gaussian. A normal belongs to a surface, and
+    positions do not accumulate the errors of earlier frames. On `gloss`, both variants gave the same result.
 
     Args:
-        before, after: [N, 3] metres. near: [M, k] rows of each neighbourhood.
+        before, after: [N, 3] positions of the Gaussians in the two states, in metres.
+        near: [M, k] rows of the Gaussians in each neighbourhood.
     """
     there, now = before[near].astype(np.float64), after[near].astype(np.float64)
     there -= there.mean(axis=1, keepdims=True)
     now -= now.mean(axis=1, keepdims=True)
     spread = np.einsum("nki,nkj->nij", now, there)
-    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # non-finite neighbourhoods are held back
+    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # non-finite neighbourhoods are not rotated
     left, _, right = np.linalg.svd(spread)
     left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
     turns: NDArray[np.float64] = left @ right
@@ -51,7 +52,7 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
 
 
 def neighbourhoods(means: Array) -> NDArray[np.int64]:
-    """Returns [N, k] rows of the nearest neighbours of each Gaussian, itself first."""
+    """Returns the [N, k] rows of the nearest neighbours of each Gaussian, starting with the Gaussian itself."""
     count = len(means)
     nearest: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
     return nearest.reshape(count, -1)
@@ -65,7 +66,7 @@ class DirectionPart(UpdatePart):
         self._near: NDArray[np.int64] | None = None
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Rotates the gloss of Θ_t with its neighbourhood, if the state moved."""
+        """Rotates the gloss of each Gaussian in Θ_t with its neighbourhood, if the state moved."""
         if state.gloss is None or state.environment is None or attempt.kept is Candidate.PREVIOUS:
             return state
         if self._near is None:
@@ -76,7 +77,7 @@ class DirectionPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Direction(Effect):
-    """View-dependent colour; off until frame 0 gives evidence."""
+    """View-dependent colour; off unless frame 0 gives evidence."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
         """Returns the share of the squared image error that the gloss removes, on a few views."""
@@ -104,10 +105,12 @@ class Direction(Effect):
 EFFECT = Direction(
     name="direction",
     group=EffectGroup.APPEARANCE,
-    description="Colour depends on direction: glossy objects mirror lights and surroundings, which stay as the "
-    "objects move.",
-    disambiguation="The environment sums to zero over the sphere: what is seen from everywhere is colour.",
-    cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes half as long again where on",
+    description="Colour depends on the viewing direction: glossy objects reflect lights and surroundings, which stay "
+    "fixed while the objects move.",
+    disambiguation="The environment sums to zero over the sphere: appearance that is the same from all directions is "
+    "colour.",
+    cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes 50 % longer if the effect "
+    "is on",
     auto=True,
-    on_above=0.1,  # the trial has 0.25 on `gloss`, at most 0.03 on the five objects
+    on_above=0.1,  # the trial measures 0.25 on `gloss` and at most 0.03 on the five objects
 )

@@ -1,8 +1,8 @@
 """Lighting that changes over time: colours adapt faster, those of moving Gaussians as fast as those of static ones.
 
-A lamp that moves or dims changes colours in few degrees of freedom: surfaces with similar orientation and position
-become brighter or darker together. This is the evidence. The colours themselves adapt individually. A relative change
-that is linear or quadratic in orientation and position, learnt in addition, did not improve the images.
+A lamp that moves or dims changes colours with few degrees of freedom: surfaces with similar orientation and position
+become brighter or darker together. This joint change is the evidence. The colours themselves adapt individually.
+Learning an additional relative change, linear or quadratic in orientation and position, did not improve the renderings.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.settings import Settings
 
-# Measured changes per frame for the thresholds: at most 0.032 on the five objects (robot, which turns fastest, so that
-# its shading changes under constant light), 0.012 on stage with its moving shadows, 0.023 to 0.061 on lamps while the
-# lamp moves.
+# Measured changes per frame behind the thresholds: at most 0.032 on the five objects (on robot, which turns fastest, so
+# that its shading changes under constant light), 0.012 on stage with its moving shadows, 0.023 to 0.061 on lamps while
+# the lamp moves.
 SAMPLE = 2000
-"""Maximum number of Gaussians used for the evidence; only seven values per channel are estimated."""
+"""Number of Gaussians used for the evidence, or up to twice as many; only seven values per channel are estimated."""
 OPAQUE = 0.3
 """Minimum opacity at which a Gaussian's colour counts as that of a surface."""
 
@@ -34,12 +34,13 @@ Double = NDArray[np.float64]
 
 
 def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Double) -> Double:
-    """Returns [R, 7] regressors of the relative light change: 1, the normal, and the position.
+    """Returns the [R, 7] regressors of the relative lighting change: 1, the normal, and the position.
 
     The normal is the shortest axis, oriented towards the cameras. The position is in metres relative to the mean.
 
     Args:
-        rows: [R] rows of the Gaussians. centre: centre of the cameras, in metres.
+        rows: [R] rows of the Gaussians.
+        centre: [3] centre of the cameras, in metres.
     """
     factors, means = state.factors[rows].astype(np.float64), state.means[rows].astype(np.float64)
     axes = np.linalg.eigh(factors @ factors.transpose(0, 2, 1)).eigenvectors
@@ -52,7 +53,7 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
     """Returns the RMS relative colour change between two states that orientation and position explain.
 
     Args:
-        centre: [3] of the cameras, in metres.
+        centre: [3] centre of the cameras, in metres.
     """
     rows = np.flatnonzero(before.opacities > OPAQUE)
     rows = rows[:: max(1, len(rows) // SAMPLE)]
@@ -73,10 +74,10 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
 
 @dataclass(frozen=True)
 class Light(Effect):
-    """Faster adaptation of colours while the lighting changes."""
+    """Adapts colours faster while the lighting changes."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the colours of moving Gaussians are not learnt."""
+        """Returns a refusal if the colours of moving Gaussians are not learnt."""
         return refusal_at_zero(settings, "rate_colour")
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
@@ -85,10 +86,10 @@ class Light(Effect):
             return None
         centre = np.mean([camera.centre for camera in seen.rig.cameras], axis=0)
         change = change_of_light(seen.before, seen.result.gaussians, centre)
-        return Evidence(min(1.0, change), f"the light changes by {change:.1%} a frame")
+        return Evidence(min(1.0, change), f"the lighting changes by {change:.1%} per frame")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Enables faster colours, and disables skipping of frames that the previous lighting already explains."""
+        """Enables faster colour adaptation, and disables skipping of frames that the previous state already fits."""
         builder.plan.learns_colours().changing_light = True
         builder.plan.disables_skip = True
 
@@ -97,8 +98,8 @@ EFFECT = Light(
     name="light",
     group=EffectGroup.APPEARANCE,
     description="While the light changes, all colours adapt faster, those of moving Gaussians as fast as static ones.",
-    disambiguation="Colours hold the light of their frame; differences between cameras, and flicker, are gains.",
-    cost="none that can be measured",
+    disambiguation="Colours include the lighting of their frame; differences between cameras and flicker are gains.",
+    cost="none measurable",
     auto=True,
     on_above=0.035,
     off_below=0.02,

@@ -1,4 +1,4 @@
-"""Colours of moving Gaussians: their RGB follows the images (Dynamic3DGaussians)."""
+"""Colours of moving Gaussians: their RGB is learnt from the images (Dynamic3DGaussians)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MovingColour(Effect):
-    """RGB of the moving Gaussians, learnt at the rate ``rate_colour``."""
+    """Learns the RGB of moving Gaussians at the rate ``rate_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the rate is 0."""
+        """Returns a refusal if the rate is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Makes their colours learnable."""
+        """Makes the colours of moving Gaussians learnable."""
         builder.plan.learns_colours().moving = True
 
 
 EFFECT = MovingColour(
     name="moving_colour",
     group=EffectGroup.APPEARANCE,
-    description="The colours of moving Gaussians follow the pictures slowly: shading changes as objects rotate.",
-    disambiguation="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
+    description="The colours of moving Gaussians follow the images slowly, because shading changes as objects rotate.",
+    disambiguation="The mean absolute colour change is a loss term, so colours do not absorb motion or gains.",
     cost="one Adam step over RGB per iteration, shared with the other colours",
 )

@@ -1,8 +1,8 @@
 """Shading of moving Gaussians: their colours follow the images once per frame, in closed form, as objects turn.
 
 Adam at a rate low enough not to absorb motion cannot follow the shading of turning objects: the error carries over to
-the next frame and grows. At the end of an update the motion is found, and the remaining residual is appearance
-(``closed_form``).
+the next frame and grows. At the end of an update the motion is known, so the remaining residual is a change of
+appearance (``closed_form``).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ShadingPart(UpdatePart):
         self._moves[builder.hierarchy.rows] = 1
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Updates them if a motion was kept and colours were learnt."""
+        """Updates the colours if the update kept its motion and learnt colours."""
         if attempt.kept is Candidate.PREVIOUS or attempt.rates.colour == 0 or not self._moves.any():
             return state
         return follow_pictures(state, attempt.views, attempt.renderer, self._moves)
@@ -38,10 +38,10 @@ class ShadingPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Shading(Effect):
-    """A closed-form colour update of moving Gaussians."""
+    """Updates the colours of moving Gaussians in closed form."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the rate is 0."""
+        """Returns a refusal if the rate is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:
@@ -52,7 +52,7 @@ class Shading(Effect):
 EFFECT = Shading(
     name="shading",
     group=EffectGroup.APPEARANCE,
-    description="The colours of moving Gaussians follow the pictures once per frame, as objects rotate in the light.",
-    disambiguation="Moving Gaussians only, once the motion of the frame is found; camera gains are removed before.",
-    cost="one render of each view, with its blending weights, per frame",
+    description="The colours of moving Gaussians follow the images once per frame, as objects rotate in the light.",
+    disambiguation="Changes only moving Gaussians, once the motion of the frame is known and camera gains are removed.",
+    cost="one rendering of each view per frame, with its blending weights",
 )

@@ -32,8 +32,8 @@ NAME = "shadows"
 CHANGED = 0.02
 """Difference of a mean colour, RGB in 0…1, above which a square looks different from frame 0."""
 HARDLY = 0.005
-"""Share of changed static squares up to which nothing is learnt from a frame. At a tenth of it, `basketball` gains 0.06
-dB on changed pixels, but noise is more likely to be learnt."""
+"""Share of changed static squares up to which nothing is learnt from a frame. With a tenth of this value, `basketball`
+gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""
 ENOUGH = 0.5
 """Minimum share of frame 0's cameras for learning from a frame: with few cameras, their noise would be learnt."""
 STANDS = 0.05
@@ -48,7 +48,7 @@ class ShadowsPart(UpdatePart):
         self._stands[builder.hierarchy.rows] = 0
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Updates them if the final state of the update is kept and the frame looks different from frame 0."""
+        """Updates the colours if the final state of the update is kept and the frame looks different from frame 0."""
         if attempt.kept is not Candidate.END or not self._stands.any() or attempt.rates.static_colour == 0:
             return state
         before: Arrays = attempt.carried.get(NAME, {})
@@ -63,14 +63,14 @@ class ShadowsPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Shadows(Effect):
-    """A closed-form colour update of static Gaussians."""
+    """Updates the colours of static Gaussians in closed form."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the rate is 0."""
+        """Returns a refusal if the rate is 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns [h, w, 4] float16 per view: mean colours of squares, and 1 if moving Gaussians reach the square."""
+        """Returns [h, w, 4] float16 per view: the mean colour of each square, and 1 where moving Gaussians reach it."""
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:
@@ -88,7 +88,7 @@ class Shadows(Effect):
         return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of static squares, seen in frame 0 and now, that have changed since frame 0."""
+        """Returns the share of squares, static in frame 0 and now, that have changed since frame 0."""
         before: Arrays = seen.result.carried.get(NAME, {})
         if seen.result.gaussians.moving.all():
             return None
@@ -103,7 +103,7 @@ class Shadows(Effect):
         if compared == 0:
             return None
         share = changed / compared
-        return Evidence(share, f"{100 * share:.0f} % of what stands looks other than in frame 0")
+        return Evidence(share, f"{100 * share:.0f} % of the static scene looks different from frame 0")
 
     def register(self, builder: PlanBuilder) -> None:
         """Adds the part to the update."""
@@ -111,7 +111,7 @@ class Shadows(Effect):
 
 
 def _means(view: TrainingView) -> Array:
-    """Returns the [h, w, 3] mean colours of the image's whole squares, without the camera's exposure."""
+    """Returns the [h, w, 3] mean colours of the complete squares of an image, with the camera's exposure removed."""
     gain, offset = view.exposure[:3, 0], view.exposure[:3, 1]
     return (view.squares - offset) / gain
 
@@ -119,13 +119,13 @@ def _means(view: TrainingView) -> Array:
 def _compared(
     before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns [h, w] squares that have changed, and squares that moving Gaussians reach neither then nor now."""
+    """Returns [h, w] masks of changed squares, and of squares that moving Gaussians reach neither then nor now."""
     changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
     return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
 
 
 def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray[np.bool_]:
-    """Returns [h, w] squares that moving Gaussians reach."""
+    """Returns the [h, w] mask of squares that moving Gaussians reach."""
     height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
     blocks = renderer.reached(state, np.flatnonzero(state.moving), view.camera)
     grid = blocks[: height * each, : width * each]
@@ -135,10 +135,11 @@ def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray
 EFFECT = Shadows(
     name=NAME,
     group=EffectGroup.APPEARANCE,
-    description="The colours of static Gaussians follow the pictures once per frame, as shadows and light move over "
+    description="The colours of static Gaussians follow the images once per frame, as shadows and light move over "
     "them.",
-    disambiguation="Static Gaussians only, where they look different from frame 0; camera gains are removed before.",
-    cost="one render of each view, with its blending weights, per frame",
+    disambiguation="Changes only static Gaussians, in frames that look different from frame 0 after camera gains are "
+    "removed.",
+    cost="one rendering of each view per frame, with its blending weights",
     auto=True,
     on_above=0.02,
     off_below=0.005,

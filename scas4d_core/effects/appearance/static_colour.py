@@ -1,4 +1,4 @@
-"""Colours of static Gaussians: their RGB follows the images (Dynamic3DGaussians)."""
+"""Colours of static Gaussians: their RGB is learnt from the images (Dynamic3DGaussians)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StaticColour(Effect):
-    """RGB of the static Gaussians, learnt at the rate ``rate_static_colour``."""
+    """Learns the RGB of static Gaussians at the rate ``rate_static_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the rate is 0."""
+        """Returns a refusal if the rate is 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Makes their colours learnable."""
+        """Makes the colours of static Gaussians learnable."""
         builder.plan.learns_colours().static = True
         builder.plan.full_images = True
 
@@ -29,8 +29,8 @@ class StaticColour(Effect):
 EFFECT = StaticColour(
     name="static_colour",
     group=EffectGroup.APPEARANCE,
-    description="The colours of static Gaussians follow the pictures in every iteration; only where it is pinned on.",
-    disambiguation="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
-    cost="full pictures are rendered, and one Adam step over RGB per iteration",
+    description="The colours of static Gaussians follow the images in every iteration; on only if pinned.",
+    disambiguation="The mean absolute colour change is a loss term, so colours do not absorb motion or gains.",
+    cost="full-image rendering and one Adam step over RGB per iteration",
     auto=True,
 )

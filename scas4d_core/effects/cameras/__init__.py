@@ -1,1 +1,1 @@
-"""Effects on camera poses."""
+"""Effects that correct camera poses."""

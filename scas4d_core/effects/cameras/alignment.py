@@ -45,9 +45,10 @@ class AlignedPixels(NamedTuple):
     """An image and its rendering at selected pixels.
 
     Attributes:
-        target, shown: [3, P] RGB in 0…1, with the camera's exposure. slopes: [3, 2, P] image gradients per pixel, along
-            x and y.
-        places: [2, P] pixel positions u, v. pixels: [P] flat pixel indices in the image.
+        target, shown: [3, P] RGB of the image and of the rendering in 0…1, with the camera's exposure.
+        slopes: [3, 2, P] image gradients per pixel, along x and y.
+        places: [2, P] pixel positions u, v.
+        pixels: [P] flat pixel indices in the image.
     """
 
     target: Array
@@ -61,9 +62,10 @@ class Equations(NamedTuple):
     """The normal equations of one image in K unknowns.
 
     Attributes:
-        matrix: [K, K], vector: [K]; a twist ξ leaves the weighted squared error ``energy − 2 vector·ξ + ξ·matrix·ξ``,
-            in units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``. energy: weighted squared error
-            without a twist.
+        matrix: [K, K] matrix. A twist ξ leaves the weighted squared error ``energy − 2 vector·ξ + ξ·matrix·ξ``, in
+            units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``.
+        vector: [K] right-hand side.
+        energy: weighted squared error without a twist.
         depth: depth of the image centre, in metres.
     """
 
@@ -74,11 +76,13 @@ class Equations(NamedTuple):
 
 
 def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels | None:
-    """Samples both images at the informative pixels; returns None if there are too few.
+    """Samples an image and its rendering at informative pixels; returns None if there are too few.
 
     Args:
-        target: [3, H, W]. shown: [3, H, W], or [3, h, w] if it has only every ``every``-th row and column; the
-            gradients are then those of the target only.
+        target: [3, H, W] image.
+        shown: [3, H, W] rendering, or [3, h, w] with only every ``every``-th row and column. In the latter case, only
+            the gradients of the image are used.
+        every: stride of the rows and columns in ``shown``.
     """
     _, height, width = target.shape
     step = every * max(1, round(float(np.sqrt(height * width / LOOKED_AT))) // every)
@@ -107,10 +111,12 @@ def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels |
 
 
 def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> Double:
-    """Returns the [2, 6, ...] first-order pixel displacement at some pixels per unit of each twist component.
+    """Returns the [2, 6, ...] first-order displacement of pixels per unit of each twist component.
 
     Args:
-        lens: fx, fy, cx, cy, … places: [2, ...] u, v. depth: [...] along z, in the unit of the twist's translations.
+        lens: camera parameters fx, fy, cx, cy, …
+        places: [2, ...] pixel positions u, v.
+        depth: [...] depth along z, in the unit of the twist's translations.
 
     >>> flow(np.array([100, 100, 8, 8]), np.array([8.0, 8.0]), 2.0)[0]  # horizontal, for a point on the optical axis
     array([ 50.,   0.,   0.,   0., 100.,   0.])
@@ -127,11 +133,13 @@ def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> D
 def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equations:
     """Returns the normal equations for given displacement fields.
 
-    They are weighted twice: weights from the initial residual alone would treat residuals that a shift explains as
-    outliers.
+    The weights are computed twice: weights from the initial residual alone would treat residuals that a shift explains
+    as outliers.
 
     Args:
-        moved: [2, K, P] pixel displacements per unit of each of the K unknowns. depth: see ``Equations``.
+        seen: image and rendering at the informative pixels.
+        moved: [2, K, P] pixel displacements per unit of each of the K unknowns.
+        depth: depth of the image centre, see ``Equations``.
     """
     residual = (seen.target - seen.shown).astype(np.float64).reshape(-1)
     terms = -np.einsum("cdp,dkp->kcp", seen.slopes.astype(np.float64), moved).reshape(moved.shape[1], -1)
@@ -154,7 +162,9 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
     """Returns the normal equations of a twist, in six unknowns.
 
     Args:
-        lens: lens of the camera. depth: [H, W] metres along z; NaN (nothing rendered) is replaced by the median depth.
+        lens: camera parameters, see ``flow``.
+        seen: image and rendering at the informative pixels.
+        depth: [H, W] depth along z, in metres; NaN (nothing rendered) is replaced by the median depth.
     """
     here = depth.reshape(-1)[seen.pixels].astype(np.float64)
     known = np.isfinite(here)
@@ -171,13 +181,13 @@ def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
 
 
 def turn_from_pixels(lens: Array) -> Double:
-    """Returns the [3, 3] rotation, in radians, per unit of the three unknowns of ``turn_equations``."""
+    """Returns the [3, 3] matrix from the three unknowns of ``turn_equations`` to a rotation in radians."""
     fx, fy, width = float(lens[0]), float(lens[1]), float(lens[4])
     return np.array([[0, -1 / fy, 0], [1 / fx, 0, 0], [0, 0, 4 / width]])
 
 
 def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
-    """Returns the [3] displacement (horizontal, vertical, roll) of the image centre by a twist, in pixels.
+    """Returns the [3] displacement (horizontal, vertical, roll) of the image centre under a twist, in pixels.
 
     Args:
         depth: depth of the image centre, in metres.
@@ -187,11 +197,13 @@ def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
 
 
 def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
-    """Returns the [6] increment of a twist (translation in metres); the prior keeps their sum small if little is
-    visible.
+    """Returns the [6] increment of a twist; a prior keeps the total twist small if the image constrains it weakly.
 
     Args:
-        twist: [6] current twist of the camera. vector: replaces the vector of the equations.
+        one: equations of the camera.
+        lens: camera parameters, see ``flow``.
+        twist: [6] current twist of the camera, with its translation in metres.
+        vector: [6] replacement for the vector of the equations, if given.
     """
     focal, units = float(lens[0] + lens[1]) / 2, np.array([one.depth] * 3 + [1.0] * 3)
     before = np.array([(focal / SHIFTED) ** 2] * 3 + [(focal / TURNED) ** 2] * 3)
@@ -204,7 +216,7 @@ def to_camera_twist(one: Equations, pose: Double) -> Double:
     """Returns the [6, 6] matrix from a twist in world axes to the unknowns of a camera's equations.
 
     Args:
-        pose: [4, 4] world to camera.
+        pose: [4, 4] world-to-camera matrix.
     """
     return np.diag([1 / one.depth] * 3 + [1.0] * 3) @ adjoint(pose)
 

@@ -7,10 +7,11 @@ the offset is at least ``LEAST`` pixels. Its pose then follows by half of the di
 other cameras stay bit-identical.
 
 Later frames use these poses for their training views: masks move with their camera, and probe views and new Gaussians
-use the current pose. Views that users request are rendered with the given camera, so "as camera 7" is as calibrated.
-Exclusion of cameras is decided earlier (``robust.outliers``). A camera that is off is still excluded but is also
-measured. It returns once its pose is found, and stays excluded beyond the limit. Camera gains are medians over pixels
-and are hardly affected by small shifts. ``shadows`` may learn in such frames, but from all cameras.
+use the current pose. Views requested by users are rendered with the given camera, so "as camera 7" means as calibrated.
+Exclusion of cameras is decided earlier (``robust.outliers``). A misaligned camera is still excluded, but it is
+measured. It is accepted again once its pose is found, and stays excluded if the correction exceeds the limit. Camera
+gains are medians over pixels and are hardly affected by small shifts. ``shadows`` may learn in such frames, but from
+all cameras.
 """
 
 from __future__ import annotations
@@ -50,18 +51,19 @@ if TYPE_CHECKING:
 
 NAME = "pose_drift"
 CAMERAS = 4
-"""Minimum number of cameras for finding one that is off; with fewer, moving Gaussians could explain the difference."""
+"""Minimum number of cameras for detecting a misaligned one; with fewer, moving Gaussians could explain the difference.
+"""
 ENOUGH = 0.5
-"""Minimum share of the rig's cameras in a frame for learning from it."""
+"""Minimum share of the rig's cameras that a frame must contain to be used."""
 LEAST = 0.25
-"""Minimum offset in pixels of a suspect camera. Fixed cameras have at most 0.15 on captures, 0.4 on shaken cloth."""
+"""Minimum offset of a suspect camera, in pixels. Fixed cameras have at most 0.15 on captures, 0.4 on shaken cloth."""
 TIMES = 4.0
-"""Minimum offset relative to the median over cameras: if many cameras appear to be off, tracking is delayed."""
-# For the threshold of the effect: captures with fixed cameras, at half size, have shares of at most 0.14 on cloth
-# played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
+"""Minimum ratio of its offset to the median over cameras: if many cameras appear to be off, the tracking lags."""
+# Measurements behind the effect's threshold: captures with fixed cameras, at half size, have shares of at most 0.14 on
+# cloth played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
 SHARE = 0.5
-"""Share of the difference that poses and recorded offsets follow per frame. A drift is tracked with a delay of one
-frame's change, and a frame with delayed tracking does half of the harm."""
+"""Share of the difference by which poses and recorded offsets are updated per frame. A drift is tracked with a lag of
+one frame's change, and a frame in which the tracking lags does half the harm."""
 STANDING = 6
 """Number of fixed cameras, different ones in each frame, that are rendered while the effect is on. They show which part
 of a twist is motion of the scene."""
@@ -69,16 +71,18 @@ LARGEST, TURN = 0.02, radians(1)
 """Maximum pose correction, as a share of the image width and as an angle. A camera that is off by more has been moved
 and stays excluded."""
 COVERED = 0.1
-"""Minimum alpha of a pixel with a depth."""
+"""Minimum alpha at which a pixel has a depth."""
 SMALLEST = 1e-3
-"""Added to the 3×3 equations of a rotation in pixels, equivalent to a weak prior: a plain wall shows no rotation."""
+"""Regularization of the 3×3 equations of a rotation in pixels. It acts as a weak prior: a plain wall shows no rotation.
+"""
 
 
 def rig_with_drift(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
     """Returns the rig with the current poses; the given rig if no camera has moved.
 
     Args:
-        rig: the cameras in the internal world, as calibrated. carried: arrays of the effects.
+        rig: calibrated cameras in the internal world.
+        carried: arrays carried over by the effects, keyed by effect name.
     """
     twists = carried.get(NAME, {}).get("twists")
     if twists is None or not twists.any():
@@ -95,10 +99,10 @@ class Poses:
     """Pose offsets of a rig's cameras, one row per camera.
 
     Attributes:
-        twists: [C, 6] float64 correction from the calibration: translation (metres) and rotation, in camera axes.
-        moved: [C, 3] the correction in pixels at the last measurement, see ``alignment.pixel_offset``.
-        offsets: [C, 3] measured offset from the calibration in pixels, as an exponential moving average.
-        shares: [C] 0…1 share of the residual explained by earlier offsets, as an exponential moving average.
+        twists: [C, 6] float64 corrections of the calibration: translation (metres) and rotation, in camera axes.
+        moved: [C, 3] corrections at the last measurement, in pixels, see ``alignment.pixel_offset``.
+        offsets: [C, 3] exponential moving average of the measured offsets from the calibration, in pixels.
+        shares: [C] exponential moving average of the share of the residual that earlier offsets explain, 0…1.
         observations: [C] number of frames in which the camera was measured.
     """
 
@@ -110,20 +114,23 @@ class Poses:
 
     @classmethod
     def of(cls, arrays: Arrays, count: int) -> Poses:
-        """Creates poses from ``arrays``; missing arrays are 0."""
+        """Creates poses from ``arrays``; missing arrays are filled with zeros."""
         shapes = {"twists": (count, 6), "moved": (count, 3), "offsets": (count, 3), "shares": (count,)}
         blank: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
         blank["observations"] = np.zeros(count, np.int64)
         return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in blank.items()})
 
     def arrays(self) -> Arrays:
-        """Returns the arrays for the next frame; without twists if no camera has moved."""
+        """Returns the arrays for the next frame, without the twists if no camera has moved."""
         arrays: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "observations")}
         return {**arrays, "twists": self.twists} if self.twists.any() else arrays
 
     def record_offset(self, row: int, turn: Equations) -> None:
-        """Records the offset that a camera's residual shows, in the unknowns of ``turn_equations``, relative to its
-        pose.
+        """Records the offset of a camera that its residual shows.
+
+        Args:
+            row: row of the camera.
+            turn: equations in the unknowns of ``turn_equations``, relative to the camera's current pose.
         """
         here = self.moved[row]
         now = here + np.linalg.solve(turn.matrix + SMALLEST * np.eye(3), turn.vector)
@@ -137,19 +144,19 @@ class Poses:
         self.observations[row] += 1
 
     def suspects(self) -> NDArray[np.bool_]:
-        """[C] cameras that may have moved; they are rendered and measured again."""
+        """Returns the [C] mask of cameras that may have moved; they are rendered and measured again."""
         sizes, looked = np.linalg.norm(self.offsets, axis=1), self.observations > 0
         usual = float(np.median(sizes[looked])) if looked.any() else 0.0
         off: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
         return off
 
     def drifted(self) -> NDArray[np.bool_]:
-        """[C] cameras that have moved."""
+        """Returns the [C] mask of cameras that have moved."""
         return self.twists.any(axis=1) | (self.suspects() & (self.shares >= EFFECT.on_above))
 
 
 def _left(turn: Equations, way: Double) -> float:
-    """Returns the weighted squared error that remains after a rotation."""
+    """Returns the weighted squared error that remains after a rotation by ``way``."""
     return float(turn.energy - 2 * turn.vector @ way + way @ turn.matrix @ way)
 
 
@@ -161,9 +168,9 @@ def step_twists(
     Scene motion that the other cameras see too is removed first.
 
     Args:
-        twists: before the frame. aligned: by row, a camera's equations, the camera with its current pose, and its lens.
-        follow: [C] cameras whose twists are updated.
-        follow: [C].
+        twists: [C, 6] twists before the frame.
+        aligned: maps the row of a camera to its equations, the camera with its current pose, and its lens.
+        follow: [C] mask of the cameras whose twists are updated.
     """
     matrix, vector = np.eye(6) * 1e-6, np.zeros(6)
     standing = [row for row in aligned if not follow[row]] or list(aligned)
@@ -182,19 +189,21 @@ def step_twists(
 
 
 def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
-    """Returns the twist, scaled down to the maximum correction."""
+    """Returns the twist, scaled down if it exceeds the maximum correction."""
     size = float(np.linalg.norm(pixel_offset(lens, twist, depth)[:2])) / (LARGEST * float(lens[4]))
     return twist / max(1.0, size, float(np.linalg.norm(twist[3:])) / TURN)
 
 
 def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
-    """Returns the [C, 6] twists without the component that most cameras share, which is motion of the scene.
+    """Returns the [C, 6] twists without the twist that most cameras share, which is motion of the scene.
 
-    It is the median of each component, in world axes, over the accepted cameras. With a mean, a camera that is off by 3
-    pixels would move the other cameras, and the world with them.
+    The shared twist is the median of each component, in world axes, over the accepted cameras. With a mean, a camera
+    that is off by 3 pixels would move the other cameras, and the world with them.
 
     Args:
-        rig: as calibrated or with current poses; both give the same result. believed: [C] accepted cameras.
+        twists: [C, 6] twists of all cameras.
+        rig: rig as calibrated or with current poses; both give the same result.
+        believed: [C] mask of the accepted cameras.
     """
     worlds = [
         np.linalg.solve(adjoint(rig.cameras[row].world_to_camera), twists[row]) for row in np.flatnonzero(believed)
@@ -210,7 +219,7 @@ def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) 
 
 @dataclass(frozen=True)
 class PoseDrift(Effect):
-    """Camera poses that follow the images, once per frame."""
+    """Updates camera poses from the images, once per frame."""
 
     def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
         """Returns the measured camera offsets and, while the effect is on, the poses for later frames."""
@@ -241,7 +250,7 @@ class PoseDrift(Effect):
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the largest residual share of a camera that offsets from earlier frames explain."""
+        """Returns the largest share of a camera's residual that its offsets from earlier frames explain."""
         arrays = seen.result.carried.get(NAME)
         if arrays is None or not _says(seen):
             return None
@@ -254,7 +263,7 @@ class PoseDrift(Effect):
         return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is off by {size:.1f} pixels")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds nothing: the update uses the poses through its views."""
+        """Does nothing: the update gets the poses through its views."""
 
 
 def _says(seen: FrameObservation) -> bool:
@@ -262,9 +271,7 @@ def _says(seen: FrameObservation) -> bool:
 
 
 def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
-    """Returns the views to align: of drifted or excluded cameras, and of some fixed ones that change from frame to
-    frame.
-    """
+    """Returns the views to align: all drifted or excluded cameras, and a few fixed ones that vary between frames."""
     off = poses.drifted()
     standing = [view for view in seen.views if not off[rows[view.name]]]
     count = len(standing)
@@ -274,7 +281,7 @@ def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) ->
 
 
 def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
-    """Returns each view's equations, camera and lens by row; views with too little texture are left out."""
+    """Returns the equations, camera and lens of each view with enough texture, keyed by camera row."""
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view in views:
         shown, depth = _rendered(seen, view)
@@ -296,7 +303,7 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
 
 
 def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]:
-    """Returns a view's rendering [3, H, W] without exposure, and depths [H, W] in metres along z; NaN if empty."""
+    """Returns a view's rendering [3, H, W] without exposure, and depths [H, W] in metres along z, NaN where empty."""
     state = seen.result.gaussians
     planes, rest = seen.renderer.render(state, view.camera, depth_channel=LABEL)
     alpha = 1 - rest
@@ -307,9 +314,9 @@ def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]
 EFFECT = PoseDrift(
     name=NAME,
     group=EffectGroup.CAMERAS,
-    description="Cameras drift, or are knocked by a few pixels: their poses follow the pictures once per frame.",
-    disambiguation="The median twist over the cameras is 0: what most cameras share is motion of the scene.",
-    cost="samples of eight renderings per frame; where on, one render of each camera that is off, and of six others",
+    description="Cameras drift, or are knocked by a few pixels: their poses follow the images once per frame.",
+    disambiguation="The median twist over the cameras is 0: motion that most cameras share is motion of the scene.",
+    cost="samples of eight renderings per frame; while on, one rendering of each misaligned camera and of six others",
     auto=True,
     on_above=0.2,
     off_below=0.08,

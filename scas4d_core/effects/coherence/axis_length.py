@@ -1,4 +1,4 @@
-"""Limit on the axis lengths (paper, scale loss).
+"""Limit on the axis lengths of Gaussians (paper, scale loss).
 
 Kernel: ``kernels.deltas``; reference: ``engines.torch.losses.scale_loss``.
 """
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AxisLength(Effect):
-    """The loss term ``weights.scale``."""
+    """The loss term weighted by ``weights.scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the weight is 0."""
+        """Returns a refusal if the weight is 0."""
         return refusal_at_zero(settings, "weights.scale")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term with its weight."""
+        """Adds the loss term with its weight."""
         builder.plan.axis_length = builder.update.weights.scale
 
 
 EFFECT = AxisLength(
     name="axis_length",
     group=EffectGroup.COHERENCE,
-    description="No Gaussian grows longer than in frame 0, or than 2 cm.",
-    disambiguation="Lengths of frame 0.",
-    cost="none measurable: a part of the cascade's backward pass",
+    description="No axis of a Gaussian grows beyond its length in frame 0 or 2 cm, whichever is longer.",
+    disambiguation="The limits come from frame 0.",
+    cost="none measurable: it is part of the cascade's backward pass",
 )

@@ -1,12 +1,12 @@
 """Bending: in objects that bend everywhere, such as cloth, neighbours rotate independently.
 
-The term ``rotation`` is a sum of norms of differences, so below a threshold it forces neighbours to the same rotation.
-It finds rigid parts, but removes nearly all rotation differences from swinging cloth. In bending scenes it is left out.
-Rigidity, which couples positions to these rotations, fades to zero during an update.
+The loss term ``rotation`` is a sum of norms of differences, so it removes rotation differences below a threshold. This
+finds rigid parts, but in swinging cloth it removes nearly all rotation differences. In bending scenes the term is
+therefore switched off. Rigidity, which couples positions to these rotations, fades to zero during an update.
 
-The evidence uses only positions, so it means the same with and without the terms. It measures patches of about a
-hundredth of the moving Gaussians. The evidence is the rotation of each patch relative to most of the patches around it.
-The part of the patch's motion that is not a rotation is subtracted. Joints affect few patches, and badly tracked
+The evidence uses only positions, so it is comparable with and without these terms. It measures patches that each
+contain about a hundredth of the moving Gaussians. The evidence is the median rotation of a patch relative to the
+surrounding patches, minus the part of its motion that is not a rotation. Joints affect few patches, and badly tracked
 patches do not move rigidly, so neither gives evidence.
 """
 
@@ -28,31 +28,32 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 SAMPLE = 4000
-"""Minimum number of sampled Gaussians, up to twice as many: a patch covers the same part of an object in all states."""
+"""Number of sampled Gaussians, or up to twice as many, so that a patch covers the same part of an object in all states.
+"""
 PATCH = 40
-"""Number of Gaussians in a patch in addition to its centre; fewer positions are too noisy to show a rotation."""
+"""Number of Gaussians in a patch in addition to its centre; with fewer, the rotation is too noisy."""
 PATCHES = 400
-"""Minimum number of patches, up to twice as many; the evidence is their median."""
+"""Number of patches, or up to twice as many; the evidence is their median."""
 AROUND = 19
-"""Number of nearest patches that a patch is compared with; together a twentieth of the moving Gaussians."""
+"""Number of nearest patches with which a patch is compared; together they cover a twentieth of the object."""
 REST = 1e-3
 """Minimum motion relative to the extent of the moving Gaussians; if 90 % move less, the frame gives no evidence."""
 
-# For the thresholds, in radians: at least 0.030 on swinging `cloth` while the effect is off, also backwards and with
-# half of the cameras, and at least 0.037 while it is on. All other captures have at most 0.004 while it is off, and
-# 0.014 with rotation pinned off.
+# Measurements behind the thresholds, in radians: at least 0.030 on swinging `cloth` while the effect is off, also
+# played backwards and with half of the cameras, and at least 0.037 while it is on. All other captures have at most
+# 0.004 while it is off, and 0.014 with rotation pinned off.
 
 Double = NDArray[np.float64]
 
 
 def patch_rotations(before: Double, after: Double) -> tuple[Double, Double]:
-    """Returns the best-fitting rotations of patch motions (Kabsch), and the residual that is not a rotation.
+    """Returns the rotation that best fits the motion of each patch (Kabsch), and the residual motion.
 
     Args:
         before, after: [P, n, 3] positions of each patch's Gaussians, in metres.
 
     Returns:
-        [P, 3, 3] rotations, and [P] RMS distance to the rotated patch relative to the patch size.
+        [P, 3, 3] rotations, and the [P] RMS distance to the rotated patch relative to the patch size.
     """
     old, new = (points - points.mean(axis=1, keepdims=True) for points in (before, after))
     left, lengths, right = np.linalg.svd(np.swapaxes(new, 1, 2) @ old)
@@ -65,7 +66,7 @@ def patch_rotations(before: Double, after: Double) -> tuple[Double, Double]:
 
 
 def measure_bending(before: Gaussians, after: Gaussians) -> float | None:
-    """Returns the median rotation of patches relative to those around them, in radians; None if too little moves.
+    """Returns the median rotation of patches relative to surrounding patches, in radians; None if too little moves.
 
     Args:
         before, after: Θ_{t−1} and Θ_t, with the same Gaussians.
@@ -91,13 +92,13 @@ def measure_bending(before: Gaussians, after: Gaussians) -> float | None:
 
 @dataclass(frozen=True)
 class Bending(Effect):
-    """Independent rotations of neighbours."""
+    """Lets neighbours rotate independently."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the rotation term, which this effect removes, is pinned or has weight 0."""
+        """Returns a refusal if the rotation term, which this effect removes, is pinned or has weight 0."""
         mode = settings.effects.get("rotation", "auto")
         if mode != "auto":
-            return f"effects.rotation is '{mode}'", "leave rotation 'auto'"
+            return f"effects.rotation is '{mode}'", "leave effects.rotation 'auto'"
         return refusal_at_zero(settings, "weights.rotation")
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
@@ -106,7 +107,7 @@ class Bending(Effect):
         if angle is None:
             return None
         angle = max(0.0, angle)
-        return Evidence(min(1.0, angle), f"neighbourhoods turn {np.degrees(angle):.1f}° a frame unlike each other")
+        return Evidence(min(1.0, angle), f"patches rotate {np.degrees(angle):.1f}° per frame relative to each other")
 
     def register(self, builder: PlanBuilder) -> None:
         """Removes the rotation term, and lets rigidity fade during an update."""
@@ -117,9 +118,9 @@ class Bending(Effect):
 EFFECT = Bending(
     name="bending",
     group=EffectGroup.COHERENCE,
-    description="Neighbours rotate each in their own way, as in cloth: rotation is off, and rigidity fades to 0.",
-    disambiguation="Rotations of patches beyond the rest of their motion; joints between rigid parts are too few to "
-    "count.",
+    description="Neighbours rotate independently, as in cloth: the rotation term is off, and rigidity fades to 0.",
+    disambiguation="Only patch rotations that exceed the rest of the patch's motion count; joints between rigid parts "
+    "affect too few patches.",
     cost="1 % of an update: the rotations of 400 patches per frame",
     auto=True,
     on_above=0.018,

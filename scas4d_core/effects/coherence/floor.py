@@ -1,6 +1,6 @@
-"""Floor term: moving Gaussians do not sink below the floor (floor loss of Dynamic3DGaussians, for any plane).
+"""Floor term: keeps moving Gaussians above the floor (floor loss of Dynamic3DGaussians, for any plane).
 
-Kernel: ``engines.cpu.floor``; reference: ``losses.floor_loss``. Only scenes with a floor plane have the term.
+Kernel: ``engines.cpu.floor``; reference: ``losses.floor_loss``. The term exists only in scenes with a floor plane.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 FLOOR_WEIGHT = 2.0
-"""Weight relative to 1 for the image loss (Dynamic3DGaussians). To disable the term, leave the floor unset."""
+"""Weight of the term; that of the image loss is 1 (Dynamic3DGaussians). To disable the term, leave the floor unset."""
 
 
 def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
     """Converts a plane (a, b, c, d) from the user's world to the internal world.
 
-    Positive values of a·x + b·y + c·z + d lie below the floor; in the internal world, they are metres.
+    Points with a·x + b·y + c·z + d > 0 are below the floor; in the internal world, the value is the depth in metres.
 
     Raises:
-        ValueError: (a, b, c) is not a direction.
+        ValueError: if (a, b, c) is not a direction.
     """
     normal = np.asarray(plane[:3], dtype=np.float64)
     length = float(np.linalg.norm(normal))
@@ -45,13 +45,13 @@ class Floor(Effect):
     """The loss term for the plane ``scene.floor``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if no plane is given."""
+        """Returns a refusal if the scene has no floor plane."""
         if settings.scene.floor is None:
-            return "the scene names no floor", "give scene.floor, a plane (a, b, c, d)"
+            return "the scene has no floor plane", "set scene.floor to a plane (a, b, c, d)"
         return None
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term."""
+        """Adds the loss term."""
         assert builder.scene.floor is not None
         builder.plan.floor, builder.plan.floor_weight = builder.scene.floor, FLOOR_WEIGHT
 
@@ -60,6 +60,6 @@ EFFECT = Floor(
     name="floor",
     group=EffectGroup.COHERENCE,
     description="Moving Gaussians stay above the floor plane of the scene.",
-    disambiguation="A plane in the user's world.",
+    disambiguation="The plane is given in the user's world.",
     cost="one dot product per moving Gaussian and iteration",
 )

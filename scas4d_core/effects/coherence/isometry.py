@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Isometry(Effect):
-    """The loss term ``weights.isometry``."""
+    """The loss term weighted by ``weights.isometry``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the weight is 0."""
+        """Returns a refusal if the weight is 0."""
         return refusal_at_zero(settings, "weights.isometry")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term with its weight."""
+        """Adds the loss term with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.isometry = builder.update.weights.isometry
 
@@ -32,7 +32,7 @@ class Isometry(Effect):
 EFFECT = Isometry(
     name="isometry",
     group=EffectGroup.COHERENCE,
-    description="Neighbours keep the distance that they had in frame 0: objects bend, but do not tear.",
-    disambiguation="Distances of frame 0; it ignores rotations.",
+    description="Neighbours keep the distances that they had in frame 0: objects bend but do not tear.",
+    disambiguation="It uses the distances of frame 0 and ignores rotations.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and rotation",
 )

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rigidity(Effect):
-    """The loss term ``weights.rigidity``."""
+    """The loss term weighted by ``weights.rigidity``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the weight is 0."""
+        """Returns a refusal if the weight is 0."""
         return refusal_at_zero(settings, "weights.rigidity")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term with its weight."""
+        """Adds the loss term with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.rigidity = builder.update.weights.rigidity
 
@@ -32,7 +32,7 @@ class Rigidity(Effect):
 EFFECT = Rigidity(
     name="rigidity",
     group=EffectGroup.COHERENCE,
-    description="Neighbours keep the offsets that they had in the previous frame.",
-    disambiguation="It constrains motion, not colour: nothing else explains it.",
+    description="Neighbours keep the relative positions that they had in the previous frame.",
+    disambiguation="It constrains motion, not colour, so no other effect competes with it.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with isometry and rotation",
 )

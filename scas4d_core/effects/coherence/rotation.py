@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rotation(Effect):
-    """The loss term ``weights.rotation``."""
+    """The loss term weighted by ``weights.rotation``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the weight is 0."""
+        """Returns a refusal if the weight is 0."""
         return refusal_at_zero(settings, "weights.rotation")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term with its weight."""
+        """Adds the loss term with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.rotation = builder.update.weights.rotation
 
@@ -32,7 +32,7 @@ class Rotation(Effect):
 EFFECT = Rotation(
     name="rotation",
     group=EffectGroup.COHERENCE,
-    description="Neighbours rotate alike.",
-    disambiguation="Rotations since the previous frame.",
+    description="Neighbours rotate by similar amounts.",
+    disambiguation="It compares rotations since the previous frame.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and isometry",
 )

@@ -1,1 +1,1 @@
-"""Effects that enable the deformation parameters, and the start from the previous motion."""
+"""Effects that enable deformation parameters, and the warm start from the previous motion."""

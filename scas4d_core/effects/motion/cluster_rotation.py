@@ -11,7 +11,8 @@ from scas4d_core.effects.motion.free_columns import ClusterColumns
 EFFECT = ClusterColumns(
     name="cluster_rotation",
     group=EffectGroup.MOTION,
-    description="Clusters rotate: the parts of an object, and the parts of these.",
-    disambiguation="About the cluster's centroid, beside a translation; coarse layers learn first.",
-    cost="none measurable: off saves three numbers per cluster in Adam's step, not the cascade",
+    description="Clusters rotate: the parts of an object, and smaller parts within them.",
+    disambiguation="The rotation is about the cluster's centroid, separate from the translation; coarse layers learn "
+    "first.",
+    cost="none measurable: turning it off saves three values per cluster in the Adam step, but not the cascade",
 )

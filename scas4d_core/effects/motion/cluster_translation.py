@@ -12,6 +12,6 @@ EFFECT = ClusterColumns(
     name="cluster_translation",
     group=EffectGroup.MOTION,
     description="Clusters translate: whole objects first, then their parts.",
-    disambiguation="Of the cluster's centroid, beside a rotation; coarse layers learn first.",
-    cost="none measurable: off saves three numbers per cluster in Adam's step, not the cascade",
+    disambiguation="It moves the cluster's centroid, separate from the rotation; coarse layers learn first.",
+    cost="none measurable: turning it off saves three values per cluster in the Adam step, but not the cascade",
 )

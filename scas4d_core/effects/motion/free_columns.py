@@ -19,7 +19,7 @@ MOVES = (
     "own_rotation",
     "own_scale",
 )
-"""Effects that can change position or shape; each name is also a field of ``Freedom``."""
+"""Effects that can change the position or shape of Gaussians; each name is also a field of ``Freedom``."""
 
 
 def may_be_on(name: str, settings: Settings) -> bool:
@@ -29,13 +29,13 @@ def may_be_on(name: str, settings: Settings) -> bool:
 
 @dataclass(frozen=True)
 class FreeColumns(Effect):
-    """An effect that enables the parameters with its name (``engines.freedom.Freedom``)."""
+    """An effect that enables the parameters of the same name (``engines.freedom.Freedom``)."""
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if nothing at all could move."""
+        """Returns a requirement if no effect could move anything otherwise."""
         if any(may_be_on(name, settings) for name in MOVES):
             return None
-        return "no motion of clusters and of Gaussians is left", f"leave one of {', '.join(MOVES)} 'auto'"
+        return "no effect could move clusters or Gaussians", f"leave one of {', '.join(MOVES)} 'auto'"
 
     def register(self, builder: PlanBuilder) -> None:
         """Enables the parameters."""
@@ -47,7 +47,7 @@ class ClusterColumns(FreeColumns):
     """An effect that enables parameters of the clusters."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if there are no clusters."""
+        """Returns a refusal if there are no clusters."""
         if settings.update.clusters:
             return None
-        return "update.clusters is empty", "give the numbers of clusters, as (64, 320, 1280)"
+        return "update.clusters is empty", "set the number of clusters per layer, such as (64, 320, 1280)"

@@ -11,7 +11,7 @@ from scas4d_core.effects.motion.free_columns import FreeColumns
 EFFECT = FreeColumns(
     name="own_position",
     group=EffectGroup.MOTION,
-    description="Each Gaussian may move away from the place that its clusters give it.",
-    disambiguation="It learns last and slowly, so it finds only what the clusters leave.",
+    description="Each Gaussian may move away from the position given by its clusters.",
+    disambiguation="It learns last and slowly, so it finds only motion that the clusters do not explain.",
     cost="1 % of an update, together with own_rotation and own_scale",
 )

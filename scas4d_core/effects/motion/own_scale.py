@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OwnScale(FreeColumns):
-    """Δs, learnt at the rate ``rate_scale``."""
+    """Log scale Δs, learnt at the rate ``rate_scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if the rate is 0."""
+        """Returns a refusal if the rate is 0."""
         return refusal_at_zero(settings, "rate_scale")
 
 
@@ -28,6 +28,6 @@ EFFECT = OwnScale(
     name="own_scale",
     group=EffectGroup.MOTION,
     description="Each Gaussian's axes may grow and shrink.",
-    disambiguation="The limit of the axes' lengths; it learns last and slowly.",
+    disambiguation="Axis lengths are limited, and it learns last and slowly.",
     cost="1 % of an update, together with own_position and own_rotation",
 )

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 CLUSTERS = ("cluster_rotation", "cluster_translation")
 OWN = ("own_position", "own_rotation")
-"""Effects whose parameters are extrapolated; those of single Gaussians by the share ``update.momentum``."""
+"""Effects whose parameters are extrapolated; those of individual Gaussians are scaled by ``update.momentum``."""
 
 
 @dataclass(frozen=True)
 class Prediction(Effect):
-    """The previous motion as the start of an update."""
+    """Starts an update from the previous motion."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if every effect that it extrapolates is pinned off."""
+        """Returns a refusal if every effect whose parameters it extrapolates is pinned off."""
         carried = CLUSTERS if settings.update.momentum == 0 else CLUSTERS + OWN
         if any(settings.effects.get(name) != "off" for name in carried):
             return None
@@ -38,7 +38,7 @@ class Prediction(Effect):
 EFFECT = Prediction(
     name="prediction",
     group=EffectGroup.MOTION,
-    description="An update starts from the motion of the previous frame, if that shows the frame better.",
-    disambiguation="It sets the start alone: the pictures decide where the update ends.",
-    cost="one comparison of half-size pictures of four views per update",
+    description="An update starts from the motion of the previous frame, if that fits the frame better.",
+    disambiguation="It sets only the start; the images decide where the update ends.",
+    cost="one comparison of half-size images of four views per update",
 )

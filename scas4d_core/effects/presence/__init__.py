@@ -1,1 +1,1 @@
-"""Effects on which Gaussians exist and which move: masks, labels, and objects that enter or leave."""
+"""Effects that decide which Gaussians exist and which move: masks, labels, and objects that enter or leave."""

@@ -1,7 +1,7 @@
-"""The hull of new objects: voxels that several cameras see as new and that few cameras see through.
+"""Hull of new objects: voxels that several cameras see as new and that few cameras see through.
 
-It is an octree, as for the visual hull of frame 0. In addition to silhouettes, each camera has pixels in which it is
-ignored: those in which a moving object of the state may hide the new one.
+The hull is carved from an octree, like the visual hull of frame 0. Each camera has a silhouette, and also pixels in
+which it is ignored because a moving object of the state may hide the new one.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ COARSE = 32
 VOXEL_PIXELS = 1.5
 """Maximum edge of the smallest voxel, in pixels at the centre of the scene."""
 MAX_CELLS = 1 << 24
-"""Maximum number of grid cells for separating new objects; a sparser cluster is not an object."""
+"""Maximum number of grid cells for separating new objects; voxels that need a larger grid are no object."""
 MAX_VOXELS = 1_000_000
-"""Maximum number of voxels in a level; refinement stops before it is exceeded."""
+"""Maximum number of voxels in a level; refinement stops before this limit is exceeded."""
 AT_ONCE = 1 << 16
 """Number of voxels that are tested at once; each needs 200 bytes of temporary memory."""
 SMALLEST = 27
@@ -46,8 +46,10 @@ class Hull:
     """Voxels of new objects.
 
     Attributes:
-        points: [V, 3] voxel centres in the internal world. surface: [V] true for voxels with an empty neighbour.
-            things: [V] number of the connected object of each voxel. voxel: edge length, in metres.
+        points: [V, 3] voxel centres in the internal world.
+        surface: [V] mask of voxels with an empty neighbour.
+        things: [V] object number of each voxel; connected voxels have the same number.
+        voxel: edge length of a voxel, in metres.
     """
 
     points: Float
@@ -64,7 +66,7 @@ def carve_new(seen: Sequence[Novelty]) -> Hull:
     """Carves new objects from a cube about the scene centre that contains all cameras.
 
     Args:
-        seen: novelty maps of the cameras.
+        seen: novelty map of each camera.
     """
     middle = look_at_point(seen)
     reach = max(float(np.linalg.norm(one.camera.centre - middle)) for one in seen)
@@ -89,7 +91,7 @@ def _depth_of(one: Novelty, point: Float) -> float:
 
 
 def _distance(pixels: Bool) -> Float:
-    """Returns the [H, W] distance in pixels to the nearest true pixel; infinity if there is none."""
+    """Returns the [H, W] distance of each pixel to the nearest true pixel, in pixels; infinity if there is none."""
     if not pixels.any():
         return np.full(pixels.shape, np.inf)
     result: Float = distance_transform_edt(~pixels)
@@ -125,7 +127,7 @@ def _kept(
 def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
     if len(cells) == 0:
         return Hull(np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.int64), voxel)
-    # Distant objects are moved together with an empty layer between them, so that the grid stays small.
+    # Gaps between distant objects are reduced to one empty layer, so that the grid stays small.
     close = np.stack([_without_gaps(column) for column in cells.T], axis=1)
     shape = close.max(axis=0) + 2
     if np.prod(shape) > MAX_CELLS:
@@ -156,7 +158,7 @@ def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
-    """Returns the [H, W] pixels of a camera that show voxels with centres [P, 3]."""
+    """Returns the [H, W] mask of a camera's pixels that show voxels with centres [P, 3]."""
     column, row, depth, inside = pixels_inside(one.camera, points)
     shown = np.zeros(one.new.shape, np.bool_)
     shown[row[inside], column[inside]] = True
@@ -168,10 +170,12 @@ def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
 
 
 def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Returns the median colour [P, 3] over the cameras that see a point as new, and their number [P]; NaN if none.
+    """Returns the median colour [P, 3] over the cameras that see a point as new, NaN if none do, and their number [P].
 
     Args:
-        points: [P, 3] on the hull's surface. hull: occludes the points.
+        seen: novelty map of each camera.
+        points: [P, 3] points on the hull's surface.
+        hull: hull that may occlude the points.
     """
     samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
     front = hull.points[hull.surface]

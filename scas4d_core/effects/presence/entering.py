@@ -1,4 +1,4 @@
-"""Objects that enter: Gaussians are added in places that several cameras see and the state cannot explain."""
+"""Entering objects: Gaussians are added where several cameras see something that the state does not explain."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ NAME = "entering"
 MIN_CAMERAS = 2
 """Minimum number of screened cameras that see something new before all cameras are checked."""
 SMALLEST = 0.003
-"""Minimum share of new pixels in an image for a camera to count: 200 of 256 x 256. Delayed tracking of moving objects
-leaves fewer."""
+"""Minimum share of new pixels in an image for a camera to count: 200 of 256 x 256. Moving objects that are tracked with
+a lag leave fewer."""
 SHARE = 0.05
 """Minimum share of the squared error of all images that an object explains, to switch the effect on."""
 WORTH = 0.01
-"""Minimum share for adding Gaussians while the effect is on."""
+"""Minimum share of the error for adding Gaussians while the effect is on."""
 SURPLUS = 0.5
 """Minimum surplus of new over stale pixels, relative to the object's pixels; otherwise the object has only moved."""
 BORDER, SUDDEN = 0.5, 0.2
 """New objects enter across the image border. The first value is the minimum share of cameras in which an object touches
-the border. The second is the minimum share of the error for an object that appears elsewhere. Delayed tracking of a
-limb can look like such an object: 0.07 in `stage`."""
+the border. The second is the minimum share of the error for an object that appears elsewhere. A limb that is tracked
+with a lag can look like such an object: 0.07 in `stage`."""
 TINY = 1e-12
-"""Lower bound of a sum of squared errors, against division by zero."""
+"""Lower bound of a sum of squared errors, to avoid division by zero."""
 SETTLED = 4
-"""Number of frames in which an added Gaussian is still fitted outside the update."""
+"""Number of frames in which an added Gaussian is still refined outside the update."""
 DENIED = 0.5
-"""Share of the cameras with an added Gaussian in view that must see something else there to retire it. It is checked
-once, when the Gaussian is settled."""
+"""An added Gaussian is retired if more than this share of the cameras that have it in view see something else there.
+This is checked once, when the Gaussian is settled."""
 NONE = np.zeros(0, np.int64)
 NO_NEWBORNS: Arrays = {
     "rows": NONE,
@@ -71,11 +71,13 @@ BUDGET = 0.1
 
 @dataclass(frozen=True, eq=False)
 class EnteredThings:
-    """The hull of objects that have entered.
+    """Objects that have entered, as a hull.
 
     Attributes:
-        seen: novelty maps of the cameras. hull: of the accepted objects. share: of the squared error that they explain.
-        cameras: number of cameras that see them.
+        seen: novelty map of each camera.
+        hull: hull of the accepted objects.
+        share: share of the squared error that the objects explain.
+        cameras: number of cameras that see the most widely seen object.
     """
 
     seen: Sequence[Novelty]
@@ -85,7 +87,7 @@ class EnteredThings:
 
 
 def find_entered(seen: FrameObservation) -> EnteredThings | None:
-    """Returns the objects in a frame that the state does not have; None if there are none."""
+    """Returns the objects in a frame that the state does not contain; None if there are none."""
     if sum(_says(one) for one in screen_novelty(seen, MIN_CAMERAS, new=SMALLEST)) < MIN_CAMERAS:
         return None
     everyone = novelty_of_views(seen, seen.views)
@@ -118,7 +120,7 @@ def _says(one: Novelty) -> bool:
 
 
 def _find_denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
-    """Returns [P] true for means at which most cameras see that the object does not exist."""
+    """Returns the [P] mask of means at which most cameras see that there is no object."""
     against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
     for one in seen:
         column, row, _, inside = pixels_inside(one.camera, means)
@@ -154,12 +156,10 @@ def _record_newborns(found: EnteredThings, state: Gaussians, rows: NDArray[np.in
 
 @dataclass(frozen=True)
 class Entering(Effect):
-    """Adds Gaussians in frames that show more than the state has."""
+    """Adds Gaussians in frames that show objects missing from the state."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the error share that new objects explain; later the recorded share, while added Gaussians are
-        present.
-        """
+        """Returns the error share that new objects explain, or the recorded one while added Gaussians are present."""
         if not seen.views:
             return None
         left = seen.result.carried.get(NAME)
@@ -169,7 +169,7 @@ class Entering(Effect):
         return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """Adds Gaussians for new objects, and refines those of recent frames."""
+        """Adds Gaussians for new objects, and refines those added in recent frames."""
         from scas4d_core.effects.presence.newborn_fit import fit_newborns, refine_newborns, sample_seeds
 
         result, things = seen.result, find_entered(seen)
@@ -210,20 +210,20 @@ class Entering(Effect):
         return replace(result, gaussians=state, parents=parents, carried={**result.carried, NAME: arrays})
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the search for the objects that were added in the previous frame."""
+        """Adds the part that tracks objects added in the previous frame."""
         builder.parts.append(NewbornTracking(builder, NAME))
 
 
 def _evidence(share: float, cameras: int) -> Evidence:
-    return Evidence(share, f"a thing entered: {cameras} cameras agree, it explains {100 * share:.0f} % of the error")
+    return Evidence(share, f"an object entered: {cameras} cameras agree, it explains {100 * share:.0f} % of the error")
 
 
 EFFECT = Entering(
     name=NAME,
     group=EffectGroup.PRESENCE,
-    description="Objects enter the scene: Gaussians are added where cameras agree that nothing explains the pictures.",
-    disambiguation="Only what no Gaussian covers, beyond what has moved away elsewhere.",
-    cost="a check of the last rendered pictures; where something enters, about an update more",
+    description="Objects enter the scene: Gaussians are added where several cameras see something unexplained.",
+    disambiguation="Only pixels that no moving Gaussian covers count, minus those that the state covers wrongly.",
+    cost="a check of the last renderings; when an object enters, about one more update",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

@@ -1,4 +1,4 @@
-"""Objects that leave: moving Gaussians that, with their neighbourhood, are in no image are retired.
+"""Leaving objects: moving Gaussians are retired when they and their neighbourhood are outside all images.
 
 They keep their rows and ids. They are neither rendered nor moved until something that they explain comes into view.
 """
@@ -24,21 +24,23 @@ if TYPE_CHECKING:
 
 NAME = "leaving"
 SHARE, IDLE_SHARE = 0.02, 0.002
-"""Shares of the moving Gaussians in no image at which the effect switches on, and below which it may switch off."""
+"""Shares of the moving Gaussians outside all images at which the effect switches on, and below which it may switch off.
+"""
 FRAMES = 2
-"""Number of consecutive frames in no image before a Gaussian is retired; at the border, objects come and go."""
+"""Number of consecutive frames outside all images before a Gaussian is retired; at the border, objects come and go."""
 ABOUT = 0.1
 """Distance, relative to the moving extent, within which a visible Gaussian keeps its neighbours from being retired. The
 visible half of an object still guides the other half."""
 WIDTHS = 3.0
-"""Number of standard deviations of a Gaussian that must also be outside the image."""
+"""Extent of a Gaussian in standard deviations, all of which must be outside the image."""
 
 
 def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
-    """Returns [N] true for the moving Gaussians that are in no image.
+    """Returns the [N] mask of moving Gaussians that are outside all images.
 
     Args:
-        state: Θ_t. rig: the cameras in the internal world, including excluded ones, which may return.
+        state: state Θ_t.
+        rig: cameras in the internal world, including excluded cameras, which may be accepted again.
     """
     rows = np.flatnonzero(state.moving)
     for camera in rig.cameras:  # usually the first cameras already show all moving Gaussians
@@ -60,7 +62,7 @@ class Leaving(Effect):
     """Retires Gaussians that have left all views."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of moving Gaussians in no image, or the recorded share while any are retired."""
+        """Returns the share of moving Gaussians outside all images, or the recorded share while any are retired."""
         if not seen.views:
             return None
         state = seen.result.gaussians
@@ -71,7 +73,7 @@ class Leaving(Effect):
         return _evidence(float(outside_all_views(state, seen.rig).sum()) / max(1, moving))
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """Retires the Gaussians that have been outside for long enough."""
+        """Retires the Gaussians that have been outside all images for long enough."""
         state = seen.result.gaussians
         out = outside_all_views(state, seen.rig)
         left: Arrays = dict(seen.result.carried.get(NAME, {}))
@@ -89,19 +91,19 @@ class Leaving(Effect):
         return replace(seen.result, gaussians=state.retire(gone) if gone.any() else state, carried=carried)
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds nothing: Gaussians are retired after the update of a frame."""
+        """Does nothing: Gaussians are retired after the update of a frame."""
 
 
 def _evidence(share: float) -> Evidence:
-    return Evidence(share, f"{100 * share:.0f} % of what moves has left all pictures" if share else "")
+    return Evidence(share, f"{100 * share:.0f} % of the moving Gaussians have left all images" if share else "")
 
 
 EFFECT = Leaving(
     name=NAME,
     group=EffectGroup.PRESENCE,
-    description="Objects leave the scene: Gaussians in no picture are retired, and may come back under their ids.",
-    disambiguation="None is needed: what is in no picture explains nothing.",
-    cost="one projection of the moving Gaussians per frame; an update costs less without what has left",
+    description="Objects leave the scene: Gaussians outside all images are retired, and may return with their ids.",
+    disambiguation="None needed: Gaussians outside all images explain no pixels.",
+    cost="one projection of the moving Gaussians per frame; updates are cheaper without the retired Gaussians",
     auto=True,
     on_above=SHARE,
     off_below=IDLE_SHARE,

@@ -1,4 +1,4 @@
-"""Mask term: rendered labels match the masks.
+"""Mask term: penalizes rendered labels that differ from the masks.
 
 Kernel: ``kernels.image_loss``; reference: ``engines.torch.losses.image_loss``.
 """
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaskTerm(Effect):
-    """The loss term ``weights.mask`` or ``weights.mask_alone``, in frames with masks."""
+    """The loss term weighted by ``weights.mask`` or ``weights.mask_alone``, in frames with masks."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused if masks are not used, or if both weights are 0."""
+        """Returns a refusal if masks are not used, or if both weights are 0."""
         update = settings.update
         if not update.use_masks:
-            return "update.use_masks is false", "give true"
+            return "update.use_masks is false", "set it to true"
         if update.weights.mask > 0 or update.weights.mask_alone > 0:
             return None
-        return "update.weights.mask and update.weights.mask_alone are 0", "give one of them a weight above 0"
+        return "update.weights.mask and update.weights.mask_alone are 0", "set one of them above 0"
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term with its weight."""
+        """Adds the loss term with its weight."""
         from scas4d_core.update.schedule import mask_weight  # deferred import, because it loads the kernels
 
         builder.plan.mask = mask_weight(builder.update, len(builder.hierarchy.rows), int(builder.first.present.sum()))
@@ -38,8 +38,8 @@ class MaskTerm(Effect):
 EFFECT = MaskTerm(
     name="mask_term",
     group=EffectGroup.PRESENCE,
-    description="With masks, moving and static Gaussians must cover the pixels that the masks give them.",
-    disambiguation="Labels come from frame 0 and are no parameter: the term moves Gaussians, and relabels none.",
-    cost="a fourth channel beside RGB, forward and backward; without masks nothing",
+    description="With masks, moving and static Gaussians must cover the pixels that the masks assign to them.",
+    disambiguation="Labels are fixed in frame 0 and are not parameters: the term moves Gaussians without relabelling.",
+    cost="a fourth channel in addition to RGB, forward and backward; nothing without masks",
     without_masks=False,
 )

@@ -1,6 +1,6 @@
-"""Labels of moving Gaussians, learnt from changed pixels if there are no masks; all others are static background.
+"""Labels of moving Gaussians, learnt from changed pixels if there are no masks; all other Gaussians are static.
 
-``motion_mask`` finds them between two updates.
+``motion_mask`` computes the labels between two updates.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from scas4d_core.update.parts import PlanBuilder
 
 @dataclass(frozen=True)
 class MotionLabels(Effect):
-    """Labels from motion, in scenes without masks."""
+    """Learns labels from motion, in scenes without masks."""
 
     def register(self, builder: PlanBuilder) -> None:
         """Enables learning of the labels."""
@@ -24,6 +24,6 @@ EFFECT = MotionLabels(
     name="motion_labels",
     group=EffectGroup.PRESENCE,
     description="Without masks, only Gaussians that most cameras have seen in changed pixels move.",
-    disambiguation="A Gaussian that has moved once may always move: labels are added and never removed.",
-    cost="a comparison of each view with the previous frame; static Gaussians save more than that",
+    disambiguation="A Gaussian that has moved once may always move: labels are only added, never removed.",
+    cost="a comparison of each view with the previous frame; static Gaussians save more time than that takes",
 )

@@ -1,7 +1,7 @@
 """Labels of moving Gaussians: from the masks of frame 0 or, without masks, learnt from the images of two frames.
 
-A static Gaussian inside the silhouettes of nearly all cameras lies within a moving object and moves with it. The label
-of an object is learnt only on its outside. A static Gaussian left inside becomes a ghost when the object moves away.
+A static Gaussian inside the silhouettes of nearly all cameras is inside a moving object and moves with it. The fit
+learns labels only on the outside of an object. A static Gaussian left inside becomes a ghost when the object leaves.
 
 Without masks, a pixel counts as changed if it differs from the previous frame. A Gaussian moves if most cameras that
 see it have it in changed pixels. Background behind the new position of an object changes for some cameras but not for
@@ -27,9 +27,9 @@ Array = NDArray[np.float32]
 CHANGE = 0.04
 """Difference of a colour channel, 0…1, above which a pixel has changed; it is above sensor and JPEG noise."""
 REACH_PIXELS = 5
-"""Side of the square that a changed pixel marks, because the inside of a plain surface moves without changing."""
+"""Side of the square marked around a changed pixel, because the inside of a plain surface moves without changing."""
 SEEN_PIXELS = 0.02
-"""Blending weight, in pixels, above which a camera has a vote."""
+"""Blending weight of a Gaussian, in pixels, above which a camera has a vote on it."""
 IN_CHANGE = 0.5
 """Share of a Gaussian's weight in changed pixels above which a camera votes that it moves."""
 MAJORITY = 0.5
@@ -39,27 +39,29 @@ STANDING_SHARE = 0.1
 """Minimum share of static Gaussians in a scene with a static part; below it, static labels are noise."""
 
 INSIDE_SHARE = 0.8
-"""Minimum share of cameras with a mask and a Gaussian in view whose masks must contain its mean, for it to lie within a
-moving object. Automatic masks are ragged; with 0.7 to 0.9 the ghosts of `basketball` fade equally well."""
+"""Minimum share of the cameras with a mask and with a Gaussian in view whose masks must contain its mean, for it to
+count as inside a moving object. Automatic masks are ragged; 0.7 to 0.9 fades the ghosts of `basketball` equally well.
+"""
 INSIDE_CAMERAS = 3
-"""Minimum number of such cameras; the intersection of two silhouettes contains much empty space."""
+"""Minimum number of such cameras; the intersection of only two silhouettes contains much empty space."""
 
 FIRST_LABELS = 32
 """Minimum number of moving Gaussians for learning the first labels: a mouse in a room is a few hundredths of a percent
-of it. Before that, frames that the state already explains are skipped (``robust.solve_frame``); in other frames all
-Gaussians may move."""
+of the scene. Before that, frames that the state already explains are skipped (``robust.solve_frame``); in other frames
+all Gaussians may move."""
 NEW_LABELS = 0.01
 """Share of all Gaussians that must be newly found moving before the hierarchy is rebuilt."""
 MORE_LABELS = 0.2
-"""Share of the moving Gaussians with the same effect; the smaller of the two numbers is sufficient."""
+"""The same as a share of the moving Gaussians; the smaller of the two numbers is sufficient."""
 
 
 def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
     """Returns the Gaussians of frame 0 with the initial labels of the scene.
 
     Args:
-        gaussians: as fitted. rig: rig in the internal world, at the size of the masks.
-        masks: of frame 0, [H, W] by camera, non-zero on the foreground; empty if there are none.
+        gaussians: Gaussians as fitted to frame 0.
+        rig: rig in the internal world, at the size of the masks.
+        masks: [H, W] mask of each camera in frame 0, non-zero on the foreground; empty if there are no masks.
     """
     return with_reliable_labels(with_mask_hull_labels(gaussians, rig, masks))
 
@@ -70,7 +72,7 @@ def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, ND
     If no Gaussian is static, or none moves, the labels cannot be extended and are unchanged.
 
     Args:
-        gaussians, rig, masks: see ``first_labels``.
+        gaussians, rig, masks: as in ``first_labels``.
     """
     static = ~gaussians.moving
     if not masks or not static.any() or static.all():
@@ -95,8 +97,8 @@ def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, ND
 def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
     """Returns the Gaussians of frame 0, all labelled as moving if only a few are static.
 
-    These few belong to an object, but no mask determined their label. They would stay behind when the object moves, and
-    hide it. If all Gaussians move, a static background forms clusters that do not move.
+    These few belong to an object, but no mask determined their label. They would stay behind and hide the object when
+    it moves. If all Gaussians may move, a static background forms clusters that do not move.
 
     >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
     >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
@@ -110,7 +112,7 @@ def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
 
 
 def changed_pixels(before: Array, now: Array) -> Array:
-    """Returns [H, W] 1 in and around pixels that differ between planes [3, H, W] of two frames; 0 elsewhere.
+    """Returns an [H, W] map: 1 in and around pixels that differ between two images [3, H, W], 0 elsewhere.
 
     >>> before = np.zeros((3, 7, 7), np.float32)
     >>> now = before.copy()
@@ -126,11 +128,12 @@ def changed_pixels(before: Array, now: Array) -> Array:
 def find_moving(
     gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], renderer: Renderer
 ) -> NDArray[np.bool_]:
-    """Returns [N] bool: true for Gaussians that move according to the images of two frames.
+    """Returns the [N] mask of Gaussians that move according to the images of two frames.
 
     Args:
-        gaussians: Θ_{t−1}. before, now: the views of both frames; cameras in only one of them are ignored.
-        renderer: accumulates pixels onto Gaussians.
+        gaussians: state Θ_{t−1}.
+        before, now: views of the two frames; cameras in only one of them are ignored.
+        renderer: renderer that accumulates pixel values onto Gaussians.
     """
     earlier = {view.name: view for view in before}
     says = np.zeros(len(gaussians), np.int64)
@@ -155,11 +158,13 @@ def learn_labels_from_motion(
     now: Sequence[TrainingView],
     renderer: Renderer,
 ) -> NDArray[np.bool_] | None:
-    """Returns [N] true for Gaussians seen to move so far; None if too few are new or too few ever moved.
+    """Returns the [N] mask of Gaussians that have moved so far; None if too few are new or too few have moved at all.
 
     Args:
-        gaussians: Θ_{t−1}. known: [N] true for Gaussians seen to move earlier, or None.
-        before, now: see ``find_moving``.
+        gaussians: state Θ_{t−1}.
+        known: [N] mask of Gaussians that moved in earlier frames, or None.
+        before, now: views of the two frames, see ``find_moving``.
+        renderer: renderer that accumulates pixel values onto Gaussians.
     """
     moving = find_moving(gaussians, before, now, renderer)
     if known is None:

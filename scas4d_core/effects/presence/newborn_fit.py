@@ -1,7 +1,7 @@
 """Creates Gaussians on the hull of new objects and fits only these to the images.
 
 Only the part of each image that shows the hull is rendered, with the Gaussians that reach into it. An iteration
-therefore costs a small fraction of one of the update.
+therefore costs a small fraction of an update iteration.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 ITERATIONS = 400
-"""Iterations of a fit; on image crops they take less time than an update of 100 iterations."""
+"""Number of iterations of a fit; on image crops they take less time than an update of 100 iterations."""
 SETTLING = 150
-"""Iterations for refining the Gaussians added in recent frames, after each update."""
+"""Number of iterations for refining recently added Gaussians after each update."""
 FEWEST = 0.25
-"""Minimum share of a fit's iterations for which there must be time. Half-fitted Gaussians would affect all later
-frames, and the next frame detects the object again anyway."""
+"""Minimum share of a fit's iterations for which there must be time. Half-fitted Gaussians would harm all later frames,
+and the next frame detects the object again anyway."""
 SHORTEST = 1e-6
 """Minimum length of an axis, in metres."""
 FIRST_OPACITY = 0.6
@@ -49,16 +49,16 @@ FIRST_OPACITY = 0.6
 CONFIRMED = 2
 """Minimum number of cameras that must see the colour of a point."""
 MARGIN = 8
-"""Margin around the rendered region, in pixels: the SSIM window and the widths of the Gaussians."""
+"""Margin around the rendered region, in pixels, for the SSIM window and the extent of the Gaussians."""
 WIDTHS = 3.5
-"""Number of standard deviations that a Gaussian extends."""
+"""Extent of a Gaussian, in standard deviations."""
 RATE_POSITION, RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION = 3.2e-4, 1e-2, 5e-2, 1e-2, 4e-3
 """Adam learning rates of means (per metre of the rig's radius), RGB, opacity logits, log scales and quaternions. They
 are one to four times those of frame 0, which has eight times as many iterations."""
 END = 0.05
-"""Share of the rates that remains at the end of the half-cosine schedule."""
+"""Fraction to which the rates decay by the end of the half-cosine schedule."""
 BETA1, BETA2 = np.float32(0.8), np.float32(0.95)
-"""Adam's decays, as in the update, which has similarly few iterations."""
+"""Decay rates of Adam, as in the update, which has similarly few iterations."""
 
 
 def sample_seeds(seen: Sequence[Novelty], hull: Hull, limit: int, rng: np.random.Generator) -> tuple[Float, Array]:
@@ -86,17 +86,22 @@ def fit_newborns(
     """Returns Gaussians at points, fitted to the views together with the fixed state; None if there is no time.
 
     Args:
-        state: Θ_t; its Gaussians are not changed. points: [P, 3] in the internal world. colours: [P, 3].
-        views: of the frame. rig: the cameras in the internal world. renderer: has the background and limits of the
-            scene.
-        rng: for the order of views. moves: whether the new Gaussians are moving or static. time: for the fit.
+        state: state Θ_t; its Gaussians are not changed.
+        points: [P, 3] initial means in the internal world.
+        colours: [P, 3] initial RGB.
+        views: training views of the frame.
+        rig: cameras in the internal world.
+        renderer: renderer with the background and limits of the scene.
+        rng: random generator for the order of views.
+        moves: whether the new Gaussians are labelled as moving.
+        time: time limit of the fit.
     """
     parameters = initial_parameters(points, colours, None, len(points), rng)
     parameters[:, OPACITY] = logit(np.array(FIRST_OPACITY))
     parameters[:, LABEL] = logit(np.array(float(moves)))
     born = _fit_crops(state, parameters, views, rig, renderer, rng, time, iterations=ITERATIONS)
     if born is None:
-        time.postponed.append(f"{len(points)} Gaussians that {'move' if moves else 'stand'} were not born")
+        time.postponed.append(f"{len(points)} {'moving' if moves else 'static'} Gaussians were not added")
     return born
 
 
@@ -112,9 +117,14 @@ def refine_newborns(
     """Returns the state with means, factors and colours of some rows fitted to the views; opacities are fixed.
 
     Args:
-        rows: of recently added Gaussians, whose hull and first update were coarse. Revived glossy Gaussians are
-            skipped, because only colours are fitted and they show gloss as well.
-        time: for the fit; if it is not sufficient, the state is unchanged.
+        state: state Θ_t.
+        rows: rows of recently added Gaussians, whose hull and first update were coarse. Revived glossy Gaussians are
+            skipped, because the fit has only colours and no gloss.
+        views: training views of the frame.
+        rig: cameras in the internal world.
+        renderer: renderer with the background and limits of the scene.
+        rng: random generator for the order of views.
+        time: time limit of the fit; the state is unchanged if there is too little time.
     """
     if state.gloss is not None:  # Gaussians added later have no gloss
         rows = rows[rows >= len(state.gloss)]
@@ -135,7 +145,7 @@ def refine_newborns(
     given = views, rig, renderer, rng, time
     fitted = _fit_crops(others, parameters, *given, iterations=SETTLING, opacities=False)
     if fitted is None:
-        time.postponed.append(f"{len(rows)} newborn Gaussians were not settled")
+        time.postponed.append(f"{len(rows)} recently added Gaussians were not refined")
         return state
     means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
     means[rows], colours[rows] = fitted.means, fitted.colours
@@ -144,7 +154,7 @@ def refine_newborns(
 
 
 class _Schedule:
-    """The schedule of a fit: as many iterations as planned or as time allows; rates follow a half-cosine.
+    """Schedule of a fit: as many iterations as planned, or as time allows; rates follow a half-cosine.
 
     Attributes:
         whole: false if there was time for too few steps; the result is then discarded.
@@ -156,7 +166,7 @@ class _Schedule:
         self.whole = True
 
     def begin(self, done: int) -> FitStep | None:
-        """Returns the step of an iteration, or None to end the fit; see ``GaussianFit.run``."""
+        """Returns the step of the next iteration, or None to end the fit; see ``GaussianFit.run``."""
         if done == 0 and self._end is not None and perf_counter() >= self._end:
             self.whole = False
             return None
@@ -166,7 +176,7 @@ class _Schedule:
         return each_once(done) if self.whole and done < self._planned else None
 
     def scalars(self, now: FitStep) -> FitScalars:
-        """See ``GaussianFit.run``."""
+        """Returns the scalars of an iteration; see ``GaussianFit.run``."""
         left = END + (1 - END) * 0.5 * (1 + np.cos(np.pi * min(1.0, now.begun / max(1, self._planned - 1))))
         return FitScalars((left * self._rates).astype(np.float32))
 
@@ -206,7 +216,7 @@ def _fit_crops(
 def _beside(
     state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, renderer: Renderer
 ) -> GaussianFit:
-    """Returns a fit on the crops that show the parameters, with the state's Gaussians that reach into the crops."""
+    """Returns a fit on crops that show the new Gaussians, with the state's Gaussians that reach into the crops."""
     factory, crops, fixed = ViewFactory(rig), [], []
     for view in views:
         camera = rig[view.name]

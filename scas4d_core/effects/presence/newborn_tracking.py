@@ -1,7 +1,7 @@
 """Tracks objects that were added in the previous frame: their motion is unknown and may exceed their width.
 
-The object's hull is carved again from the images of the frame, without the object itself. The displacement between the
-two hulls is the start for its clusters.
+The object is removed from the state, and its hull is carved again from the images of the frame. The displacement
+between the two hulls initializes the translation of its clusters.
 """
 
 from __future__ import annotations
@@ -24,16 +24,19 @@ Float = NDArray[np.float64]
 SAME = 2.5
 """Maximum ratio between the volumes of two hulls of the same object, which may enter gradually."""
 OWN = 0.5
-"""Minimum share of a cluster's Gaussians in an object for the cluster to start with its displacement."""
+"""Minimum share of a cluster's Gaussians that must belong to an object for the cluster to start with its displacement.
+"""
 
 
 class NewbornTracking(UpdatePart):
     """Sets the initial translation of the coarsest clusters of objects added in the previous frame.
 
     Args:
-        name: of the effect, whose arrays have the rows ("newborn") and object number of each added Gaussian ("thing").
-            For each object they have its hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres),
-            and the mean of its Gaussians ("places", [T, 3] metres).
+        builder: builder of the update plan.
+        name: name of the effect whose arrays describe the added objects: the row ("newborn") and the object number
+            ("thing") of each added Gaussian. For each of the T objects, they contain the centre of its hull
+            ("centres", [T, 3], metres), its volume ("volumes", [T], cubic metres), and the mean position of its
+            Gaussians ("places", [T, 3], metres).
     """
 
     def __init__(self, builder: PlanBuilder, name: str) -> None:
@@ -57,7 +60,7 @@ class NewbornTracking(UpdatePart):
 
 
 def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
-    """Returns the [3] displacement of an object since its frame; retries may start from the end of another attempt."""
+    """Returns the [3] displacement of an object since it was added; retries may start where another attempt ended."""
     rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):
         return np.zeros(3)
@@ -66,7 +69,7 @@ def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
 
 
 def _displacements(hull: Hull, arrays: Arrays) -> dict[int, Float]:
-    """Returns the [3] displacement in metres of each added object to the nearest hull of similar size."""
+    """Returns the [3] displacement of each added object to the nearest hull of similar volume, in metres."""
     displacements: dict[int, Float] = {}
     numbers = np.unique(hull.things)
     centres = np.array([hull.points[hull.things == number].mean(axis=0) for number in numbers]).reshape(-1, 3)

@@ -1,8 +1,8 @@
-"""Novelty maps: pixels that show what the state lacks, and pixels in which the state shows what does not exist.
+"""Novelty maps: pixels with objects missing from the state, and pixels in which the state shows absent objects.
 
 With masks, a pixel is new if the mask has foreground and the rendered label has none. Without masks, a pixel is new if
-the image differs from the rendering of the static scene. Motion that was not tracked gives new and stale pixels in
-about equal numbers. Therefore only the surplus of new over stale pixels indicates a new object.
+the image differs from the rendering of the static scene. Motion that was not tracked causes new and stale pixels in
+about equal numbers. Therefore, only a surplus of new over stale pixels indicates a new object.
 """
 
 from __future__ import annotations
@@ -37,22 +37,24 @@ RIM = 3
 BARE = 0.5
 """Transmittance above which the state is empty at a pixel."""
 DIFFERENT, TIMES_USUAL = 0.1, 3.0
-"""Minimum difference without masks: the mean channel difference, 0…1, in a square of ``RIM`` pixels, and its multiple
-of the median over the image."""
+"""Minimum mean channel difference, 0…1, in a square of ``RIM`` pixels; without masks, also its minimum ratio to the
+median over the image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Novelty:
-    """The novelty map of a camera.
+    """Novelty map of a camera.
 
     Attributes:
-        view: of the frame. camera: in the internal world. image: [H, W, 3] its image in 0…1, without the camera's
-            exposure.
-        new: [H, W] the image shows what the state lacks. stale: [H, W] the state shows what does not exist.
-        covered: [H, W] the state shows a moving object, which may hide something new.
-        bare: [H, W] the state is empty where the image shows static background. behind: [H, W] both show static
-            Gaussians, as far as measurable.
-        error: [H, W] squared difference between image and rendering, mean over channels.
+        view: training view of the frame.
+        camera: camera in the internal world.
+        image: [H, W, 3] image in 0…1, with the camera's exposure removed.
+        new: [H, W] mask of pixels in which the image shows something missing from the state.
+        stale: [H, W] mask of pixels in which the state shows something that is not there.
+        covered: [H, W] mask of pixels in which the state shows a moving object, which may hide something new.
+        bare: [H, W] mask of pixels in which the state is empty but the image shows static background.
+        behind: [H, W] mask of pixels in which image and state show no moving object, as far as measurable.
+        error: [H, W] squared difference between image and rendering, averaged over channels.
     """
 
     view: TrainingView
@@ -72,10 +74,11 @@ class Novelty:
 
 
 class CoarseNovelty(NamedTuple):
-    """A coarse novelty estimate from a subsampled rendering of the update, without rendering again.
+    """Coarse novelty estimate from a subsampled rendering of the update, without rendering again.
 
     Attributes:
-        view: of the frame. new, bare: shares of the pixels, see ``Novelty``; regions appear smaller by their outlines.
+        view: training view of the frame.
+        new, bare: shares of new and of bare pixels, see ``Novelty``; regions appear smaller, without their outlines.
     """
 
     view: TrainingView
@@ -85,22 +88,24 @@ class CoarseNovelty(NamedTuple):
 
 SCREENED_CAMERAS = 6
 """Maximum number of cameras that are screened in each frame before all are checked. If the update has left no
-rendering, they change from frame to frame."""
+renderings, different cameras are screened in each frame."""
 COARSE_SHARE = 0.5
-"""Share of the required pixels that a coarse estimate must find. On the captures it finds 0.6 to 0.9 of relevant
+"""Share of the required pixels that a coarse estimate must find. On the captures, estimates find 0.6 to 0.9 of relevant
 regions, and 0.2 to 0.6 of irrelevant outlines."""
 
 _novelty_cache: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
-"""Novelty maps by state, because several effects use the same ones."""
+"""Novelty maps of each state, because several effects use the same ones."""
 _coarse_cache: WeakKeyDictionary[UpdateTrace, list[CoarseNovelty]] = WeakKeyDictionary()
-"""Coarse estimates by update."""
+"""Coarse estimates of each update."""
 
 
 def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
     """Returns novelty maps of some cameras; empty if too few of them may see something new or bare.
 
     Args:
-        least: minimum number of such cameras. new, bare: minimum shares of each camera's pixels.
+        seen: the learnt frame.
+        least: minimum number of such cameras.
+        new, bare: minimum shares of new and of bare pixels in each camera's image.
     """
     glimpses = _coarse_novelties(seen) if seen.result.trace.kept is Candidate.END else []
     if len(glimpses) >= min(SCREENED_CAMERAS, len(seen.views)) > 0:  # with fewer, the update ended earlier than planned
@@ -152,7 +157,7 @@ def _all_corners(plane: Bool) -> Bool:
 
 
 def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
-    """Returns novelty maps in the colours of the previous frame, as static colours may have absorbed the new object."""
+    """Returns novelty maps with the previous frame's colours, as static colours may have absorbed the new object."""
     state = seen.result.gaussians
     known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
@@ -173,8 +178,11 @@ def measure_novelty(
     """Returns the novelty map of each view relative to a state.
 
     Args:
-        state: Θ_t, updated to the frame. colours: [N, 3] RGB to render; those of the previous frame have not absorbed
-            new objects. views: of the frame.
+        state: state Θ_t, updated to the frame.
+        colours: [N, 3] RGB to render; the colours of the previous frame have not absorbed new objects.
+        views: training views of the frame.
+        rig: cameras in the internal world.
+        renderer: renderer for the state.
     """
     shown = state.replace(colours=colours)
     return [_novelty(shown, view, rig[view.name], renderer) for view in views]
@@ -202,7 +210,7 @@ def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Ren
 
 
 def _wide(pixels: Bool) -> Bool:
-    """Returns the regions that are at least ``RIM`` pixels wide somewhere."""
+    """Returns the mask of regions that are at least ``RIM`` pixels wide somewhere."""
     cores: Any = binary_opening(pixels, np.ones((RIM, RIM), np.bool_))
     grown: Bool = binary_propagation(cores, mask=pixels)
     return grown

@@ -1,4 +1,4 @@
-"""Objects that return: retired Gaussians are revived with their ids if they explain a new object."""
+"""Returning objects: retired Gaussians are revived with their ids if they explain a new object."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ ALIKE = 1.5
 """Maximum ratio between the RMS sizes of a hull and of the retired Gaussians."""
 EXPLAINS = 0.8
 """Minimum share of the squared error at an object that the revived Gaussians must remove. In a synthetic room, the same
-ball removes 0.85 to 1, up to a small rotation, and one with another pattern 0.6. When in doubt, new Gaussians are added
-instead, because a wrong id would be permanent."""
+ball removes 0.85 to 1 if it has hardly rotated, and a ball with another pattern 0.6. When in doubt, new Gaussians are
+added instead, because a wrong id would be permanent."""
 APART = 0.25
 """Distance, relative to the size of a hull, up to which retired Gaussians belong to the same object."""
 
@@ -33,8 +33,9 @@ class ReturnedThing(NamedTuple):
     """Retired Gaussians that explain a new object.
 
     Attributes:
-        thing: object number in the hull. rows: of the state. shift: [3] displacement from where they were retired, in
-            metres.
+        thing: object number in the hull.
+        rows: rows of the Gaussians in the state.
+        shift: [3] displacement from the position at which they were retired, in metres.
     """
 
     thing: int
@@ -43,10 +44,13 @@ class ReturnedThing(NamedTuple):
 
 
 def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[ReturnedThing]:
-    """Returns the retired Gaussians that explain new objects, if shown unchanged at the hull's centre.
+    """Returns the retired Gaussians that explain new objects when moved to the hull's centre, otherwise unchanged.
 
     Args:
-        seen: novelty maps. hull: hull of the new objects. state: Θ_t. renderer: renders views.
+        seen: novelty map of each camera.
+        hull: hull of the new objects.
+        state: state Θ_t.
+        renderer: renderer for the state.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
     revivals: list[ReturnedThing] = []
@@ -80,12 +84,12 @@ def revive_returned(state: Gaussians, found: Sequence[ReturnedThing]) -> Gaussia
 
 
 def _size(points: Float) -> float:
-    """Returns the RMS distance from the centre, in metres."""
+    """Returns the RMS distance of points from their centre, in metres."""
     return max(float(np.sqrt(np.square(points - points.mean(axis=0)).sum(axis=1).mean())), 1e-6)
 
 
 def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
-    """Groups means [R, 3] by object: those whose cells of ``apart`` metres touch. Returns their indices."""
+    """Returns the indices of each group of means [R, 3], an object, whose cells of ``apart`` metres touch."""
     if not len(means):
         return []
     cells = np.floor((means - means.min(axis=0)) / apart).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Uncovered background: static Gaussians are added where moving objects uncover regions that the state lacks."""
+"""Uncovered background: static Gaussians are added where moving objects uncover regions missing from the state."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ it is on. Continued motion keeps uncovering background, and at first few cameras
 SMALLEST = 0.0004
 """Minimum share of bare pixels in an image for a camera to count: 26 of 256 x 256, five by five."""
 SHARE = 0.03
-"""Minimum share of the squared error of all images in the bare regions, to switch the effect on."""
+"""Minimum share of the squared error of all images that is in bare regions, to switch the effect on."""
 WORTH = 0.005
-"""Minimum share for adding Gaussians while the effect is on."""
+"""Minimum share of the error for adding Gaussians while the effect is on."""
 BUDGET = 0.05
 """Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
 
 Found = tuple[UncoveredPoints, float]
 _points_cache: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
-"""Results by state and minimum number of screened cameras, shared by evidence and births."""
+"""Results for each state and minimum number of screened cameras, used for evidence and for adding Gaussians."""
 
 
 def _find_points(seen: FrameObservation, glanced: int) -> Found | None:
@@ -68,7 +68,7 @@ class UncoveredEffect(Effect):
     """Adds static Gaussians behind moving objects."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the error share of bare regions; after the first births, fewer cameras must see them."""
+        """Returns the error share of bare regions; once Gaussians have been added, fewer cameras must see them."""
         if not seen.views:
             return None
         points = _find_points(seen, MIN_CAMERAS_WHILE_ON if NAME in seen.result.carried else MIN_CAMERAS)
@@ -104,19 +104,19 @@ class UncoveredEffect(Effect):
         )
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds nothing: Gaussians are added after the update of a frame."""
+        """Does nothing: Gaussians are added after the update of a frame."""
 
 
 def _evidence(share: float) -> Evidence:
-    return Evidence(share, f"what moves has uncovered regions that hold {100 * share:.0f} % of the error")
+    return Evidence(share, f"moving objects have uncovered regions with {100 * share:.0f} % of the error")
 
 
 EFFECT = UncoveredEffect(
     name=NAME,
     group=EffectGroup.PRESENCE,
-    description="Motion uncovers what was hidden: static Gaussians are added where nothing was known.",
-    disambiguation="Only pixels in which the state has nothing.",
-    cost="a check of the last rendered pictures; where something is uncovered, about half an update more",
+    description="Motion uncovers hidden background: static Gaussians are added where the state has none.",
+    disambiguation="Only pixels in which the state is empty count.",
+    cost="a check of the last renderings; when background is uncovered, about half an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

@@ -1,4 +1,4 @@
-"""Points on uncovered surfaces: the surface around a bare region is continued through it.
+"""Points on uncovered surfaces: the surface around a bare region is extended across it.
 
 In an image, the inverse depth of a plane is linear in pixel coordinates. It is fitted to the static scene around the
 region. The resulting points are accepted if the cameras agree on their colour.
@@ -30,11 +30,11 @@ AROUND = 6
 FEWEST = 24
 """Minimum number of ring pixels for a fit."""
 OPAQUE = 0.1
-"""Maximum transmittance of a pixel with a depth."""
+"""Maximum transmittance at which a pixel has a depth."""
 ROUNDS = 5
 """Iterations of reweighted least squares; pixels of other surfaces around the region are outliers."""
 NEAR = 0.02
-"""Approximate relative difference of inverse depth of an inlier."""
+"""Approximate relative deviation of an inlier from the plane, in inverse depth."""
 CAMERAS, SPREAD = 3, 0.08
 """Minimum number of cameras that see a point, and maximum mean absolute colour deviation, 0…1, for agreement."""
 APART = 1.3
@@ -46,8 +46,9 @@ class UncoveredPoints:
     """Points on uncovered surfaces.
 
     Attributes:
-        points: [P, 3] in the internal world. colours: [P, 3] in 0…1. spacing: approximate distance of neighbours, in
-            metres.
+        points: [P, 3] positions in the internal world.
+        colours: [P, 3] RGB in 0…1.
+        spacing: approximate distance between neighbouring points, in metres.
     """
 
     points: Float
@@ -59,7 +60,9 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
     """Returns points in the bare regions of all cameras.
 
     Args:
-        seen: novelty maps. state: Θ_t. renderer: renders views.
+        seen: novelty map of each camera.
+        state: state Θ_t.
+        renderer: renderer for the state.
     """
     standing = state.retire(state.moving)
     clouds = [_points(one, standing, renderer) for one in seen if one.bare.any()]

@@ -1,4 +1,4 @@
-"""Adam over the parameters of an update: one whole table, or the free columns of a table."""
+"""Adam optimizers for the parameter tables of an update."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ Array = NDArray[np.float32]
 
 
 class Adam:
-    """Adam over one parameter table, with a learning rate per column and an optional factor per row.
+    """Adam optimizer for one parameter table, with a learning rate per column and an optional factor per row.
 
     Args:
-        parameters: [n, columns] float32; updated in place. columns: learning rate of each column.
-        betas: decay rates of the two moments, which start at zero. by_row: [n] factor on the rates of each row.
+        parameters: [n, columns] float32 parameters, updated in place.
+        columns: learning rate of each column.
+        betas: decay rates of the first and second moments, which are initialized to zero.
+        by_row: [n] learning rate factor of each row.
 
     Attributes:
         guards: number of times that each guard was triggered.
@@ -39,7 +41,8 @@ class Adam:
         """Performs one optimization step.
 
         Args:
-            gradients: [n, columns]. factor: factor on all rates; 0 skips the step and leaves the moments unchanged.
+            gradients: [n, columns] gradients of the parameters.
+            factor: factor that scales all learning rates. If 0, the step is skipped and the moments are unchanged.
         """
         if factor == 0:
             return
@@ -52,17 +55,18 @@ class Adam:
 
 
 class AdamColumns:
-    """Adam over the columns of a table whose learning rate is positive; the other columns are not updated.
+    """Adam optimizer for the columns of a table with a positive learning rate; other columns are not updated.
 
     Args:
-        table: [n, columns]; updated in place, and only by this object. columns: learning rate of each column; at least
-            one is positive. betas: see ``Adam``.
+        table: [n, columns] parameters, updated in place. No other code may modify them.
+        columns: learning rate of each column; at least one must be positive.
+        betas: see ``Adam``.
     """
 
     def __init__(self, table: Array, columns: Sequence[float], betas: tuple[float, float]) -> None:
         self._table = table
         self._free = np.flatnonzero(columns)
-        # The kernel is compiled for contiguous rows, so a subset of the columns is updated in a copy.
+        # The kernel requires contiguous rows, so a subset of the columns is updated in a copy.
         self._values = table if len(self._free) == len(columns) else np.take(table, self._free, axis=1)
         self._adam = Adam(self._values, [rate for rate in columns if rate], betas)
         self.guards: GuardCounts = self._adam.guards

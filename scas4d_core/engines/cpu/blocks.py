@@ -1,4 +1,4 @@
-"""Conversions between the bitmask and the grid representation of a picture's 4×4-pixel blocks."""
+"""Conversions between bitmasks and grids of an image's 4×4-pixel blocks."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scas4d_core.kernels.projection import TILE
 
 
 def tile_grid(camera: CameraArrays) -> tuple[int, int]:
-    """Returns the number of tile columns and rows of a camera's picture."""
+    """Returns the number of tile columns and tile rows of a camera's image."""
     return -(-camera.width // TILE), -(-camera.height // TILE)
 
 
 def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
-    """Converts the block bits 8 x + y of each tile to a [rows, columns] grid of blocks."""
+    """Converts per-tile bitmasks, with bit 8 x + y for block (x, y), to a [rows, columns] grid of blocks."""
     tiles_x, tiles_y = tile_grid(camera)
     side = TILE // BLOCK
     bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
@@ -25,13 +25,13 @@ def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool
 
 
 def pixels_of(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
-    """Returns the [H, W] mask of the pixels in the given blocks."""
+    """Returns the mask [H, W] of all pixels in the given blocks."""
     grid = as_grid(blocks, camera)
     return np.repeat(np.repeat(grid, BLOCK, 0), BLOCK, 1)[: camera.height, : camera.width]
 
 
 def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
-    """Converts a grid of blocks to one bitmask per tile, [tiles]."""
+    """Converts a grid of blocks to per-tile bitmasks [tiles]."""
     tiles_x, tiles_y = tile_grid(camera)
     side = TILE // BLOCK
     bits = grid.reshape(tiles_y, side, tiles_x, side).transpose(0, 2, 3, 1).reshape(-1, side * side)

@@ -1,13 +1,13 @@
-"""Picture loss on the pixels that moving Gaussians reach, for updates in which static Gaussians do not learn.
+"""Incremental rendering and loss of the pixels covered by moving Gaussians, for updates with fixed static Gaussians.
 
-Moving Gaussians only change the blocks (4×4 pixels) that their supports intersect. In these blocks, the moving and
-the intersecting static Gaussians are rendered in the same order as in the full picture, so that pixels and gradients
-are bit-identical to a full rendering. All other pixels show static Gaussians only and are rendered once, when the
-static Gaussians last changed.
+Moving Gaussians only change the blocks (4×4 pixels) that their supports intersect. In these blocks, moving Gaussians
+and intersecting static Gaussians are rendered in the same order as in the full image. Pixels and gradients are
+therefore bit-identical to a full rendering. All other pixels only show static Gaussians, and are rendered again only
+when the static Gaussians change.
 
-The candidate static Gaussians are determined once per frame and view, around the current moving Gaussians; the
-rendered blocks are determined in every iteration. The image loss is evaluated near all candidate blocks. The loss of
-the rest of the picture is constant during a frame.
+Candidate blocks and their static Gaussians are determined once per frame and view, around the current moving Gaussians.
+The blocks to render are determined in every iteration. The image loss is evaluated near all candidate blocks; the loss
+of the rest of the image is constant during a frame.
 """
 
 from __future__ import annotations
@@ -32,27 +32,30 @@ Array = NDArray[np.float32]
 State = tuple[Array, Array, Array, Array]
 
 MARGIN = 2
-"""Blocks by which the region exceeds the initial extent of the moving Gaussians, which will move further."""
+"""Margin, in blocks, that is added around the initial extent of the moving Gaussians to allow for further motion."""
 REACH = 2 * image_loss.REACH
-"""Distance in pixels within which the gradient depends on the picture: SSIM windows of pixels in an SSIM window."""
+"""Distance in pixels within which the gradient depends on the image: twice the radius of the SSIM window."""
 MOST = 0.6
-"""Share of moving Gaussians above which full pictures are cheaper, because few Gaussians are static."""
+"""Fraction of moving Gaussians above which full images are cheaper, because few Gaussians are static."""
 
 
 @dataclass(eq=False)
 class Region:
-    """The part of one camera's pictures that may be rendered in a frame.
+    """The part of one camera's image that may be rendered in a frame.
 
     Attributes:
-        blocks: [tiles] uint64 candidate blocks; each rendering draws those that moving Gaussians reach.
-        rows: [R] int64 ascending rows of the rendered Gaussians. learnt: [R] uint8, 1 for the moving ones.
+        blocks: [tiles] uint64 bitmask of the candidate blocks; each rendering only includes those that moving
+            Gaussians cover.
+        rows: [R] int64 rows of the rendered Gaussians, in ascending order.
+        learnt: [R] uint8 mask of the moving Gaussians in ``rows``.
         moving: [M] int64 indices of the moving Gaussians in ``rows``.
-        box: rows and columns of the picture that contain the blocks and a margin of ``REACH``.
-        near: [h, columns] uint8 flags of the losses in the box that can change, see ``image_loss.near``; all other
-            losses are part of ``outside_losses``.
-        view: view to which the following fields belong; None: not loaded yet.
-        target: [C, h, w] crop of the view's target. moments: crops of the target's two SSIM moments, same shape.
-        outside_losses: image loss, mask loss and squared error of the constant part of the picture.
+        box: image rows and columns that contain the blocks and a margin of ``REACH``.
+        near: [h, columns] uint8 flags of the losses in the box that can change; see ``image_loss.near``. All other
+            losses are included in ``outside_losses``.
+        view: view to which the following fields belong, or None if no view is loaded yet.
+        target: [C, h, w] crop of the view's target.
+        moments: crops of the target's two SSIM moments, with the same shape.
+        outside_losses: image loss, mask loss and squared error of the constant part of the image.
     """
 
     blocks: NDArray[np.uint64]
@@ -68,12 +71,14 @@ class Region:
 
 
 class ChangedPixels(CpuRenderer):
-    """A ``CpuRenderer`` for states in which only the moving Gaussians change between two calls of ``load_state``.
+    """A ``CpuRenderer`` for states in which only the moving Gaussians change between calls of ``load_state``.
 
     The gradients of static Gaussians are 0.
 
     Args:
-        moving: [M] int64 rows of the moving Gaussians. count: N. See ``CpuRenderer`` for the others.
+        background, image_weight, mask_weight, limits: see ``CpuRenderer``.
+        moving: [M] int64 rows of the moving Gaussians.
+        count: number of Gaussians, N.
     """
 
     def __init__(
@@ -101,7 +106,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = np.zeros(3)
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame; the static background is rendered again if static Gaussians changed."""
+        """Loads the initial state of a frame. If static Gaussians have changed, they will be rendered again."""
         features = previous.features(previous.colours)
         state = take_rows((previous.means, previous.factors, previous.opacities, features), self._static_rows)
         if self._static_state is None or not all(map(np.array_equal, state, self._static_state)):
@@ -118,7 +123,7 @@ class ChangedPixels(CpuRenderer):
         view: TrainingView,
         lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
-        """Renders the changed pixels; sets losses and ``psnr`` of the full picture; see ``CpuRenderer``."""
+        """Renders the changed pixels and sets the losses and ``psnr`` of the full image; see ``CpuRenderer``."""
         region = self._render_region((means, factors, opacities, features), view)
         lap("render")
         self._compare_box(region, view)
@@ -133,14 +138,14 @@ class ChangedPixels(CpuRenderer):
         return self._gradients
 
     def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """Same as ``forward_backward``, without gradients."""
+        """Same as ``forward_backward``, but without gradients."""
         region = self._render_region((means, factors, opacities, features), view)
         self._compare_box(region, view)
 
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``; for moving Gaussians, only the pixels that they reach are summed."""
+        """See ``Renderer.residuals``. If exactly the moving Gaussians are requested, only their pixels are rendered."""
         if not np.array_equal(learnt, self._is_moving):
             return super().residuals(state, view, learnt, most)
         count, shown = len(state), features_seen(state, view.camera)
@@ -151,7 +156,7 @@ class ChangedPixels(CpuRenderer):
         return sums, weights
 
     def shown(self, view: TrainingView) -> Picture:
-        """See ``CpuRenderer``."""
+        """See ``CpuRenderer.shown``."""
         drawn, shown = self.rasterizer.picture, pixels_of(self.rasterizer.drawn, view.camera)
         whole = Picture(self._static_background(view).copy(), self._static_transmittances[_key(view)].copy())
         for plane, new in zip(
@@ -161,17 +166,17 @@ class ChangedPixels(CpuRenderer):
         return whole
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        """See ``CpuRenderer``."""
+        """See ``CpuRenderer.colour_shift``."""
         shown = view.exposure[:3, 0] * self._shown_mean + view.exposure[:3, 1]
         red, green, blue = (view.mean - shown).tolist()
         return red, green, blue
 
     def _render_region(self, state: State, view: TrainingView) -> Region:
-        """Renders the region of a view, and enlarges it until it contains all moving Gaussians."""
+        """Renders the region of a view, enlarging it until it contains all moving Gaussians."""
         key = _key(view)
         region = self._regions.get(key)
         if region is None or region.view is not view:
-            # Rebuilt in every frame: a replay lacks the earlier frames, and rounding errors depend on the box.
+            # Rebuilt in every frame: rounding errors depend on the box, and a replay does not see the earlier frames.
             region = self._regions[key] = self._make_region(self._moving_blocks(state, view.camera), view)
         while True:
             part = take_rows(state, region.rows)
@@ -187,7 +192,7 @@ class ChangedPixels(CpuRenderer):
         return blocks_of(self.rasterizer, *take_rows(state, self._moving), camera)
 
     def _make_region(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
-        """Builds a region around marked blocks that includes the intersecting static Gaussians."""
+        """Builds a region around the marked blocks, including the static Gaussians that intersect it."""
         assert self._static_state is not None
         blocks, camera = widened(marks, view.camera, MARGIN), view.camera
         splats, rects, _ = self.rasterizer.project(*self._static_state, camera)
@@ -201,7 +206,7 @@ class ChangedPixels(CpuRenderer):
         return region
 
     def _load_view(self, region: Region, view: TrainingView) -> None:
-        """Loads the crops of a view's pictures, and computes the losses of the rest of the picture."""
+        """Loads the crops of a view's target into a region, and computes the losses of the rest of the image."""
         base = self._static_background(view)
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
@@ -209,10 +214,10 @@ class ChangedPixels(CpuRenderer):
         region.moments = np.ascontiguousarray(whole[0][where]), np.ascontiguousarray(whole[1][where])
         wanted = _outside_region(region.box, region.near, view.camera.height, view.camera.width)
         region.outside_losses = self._losses(base, view, view.target, whole, wanted, base)
-        forget_moments(view)  # the region keeps its own crop of them
+        forget_moments(view)  # the region has its own crop
 
     def _static_background(self, view: TrainingView) -> Array:
-        """Returns the rendering [4, H, W] of the static Gaussians alone."""
+        """Returns a rendering [4, H, W] of only the static Gaussians."""
         key = _key(view)
         if key not in self._static_planes or not np.array_equal(self._poses[key], view.camera.pose):
             assert self._static_state is not None
@@ -226,7 +231,7 @@ class ChangedPixels(CpuRenderer):
         return self._static_planes[key]
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
-        """Sets the losses of the rendering, and fills the gradient of the rendered blocks."""
+        """Computes the losses of the rendering, and fills the gradient of the rendered blocks."""
         base, (rows, columns) = self._static_background(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
@@ -242,7 +247,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = self._static_means[_key(view)] + shifts[:3] / pixels
 
     def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
-        """Returns two [C, h, w] buffers for a box: one for its rendering, one for the gradient."""
+        """Returns two [C, h, w] buffers for a box, one for its rendering and one for the gradient."""
         shape = (2, channels, box[1] - box[0], box[3] - box[2])
         if self._planes.size < (size := int(np.prod(shape))):
             self._planes = np.empty(size + size // 4, np.float32)
@@ -258,9 +263,10 @@ class ChangedPixels(CpuRenderer):
         near: NDArray[np.uint8],
         gradient: Array,
     ) -> NDArray[np.float64]:
-        """Returns image loss, mask loss and squared error of a part of a picture, and fills the requested gradients.
+        """Returns image loss, mask loss and squared error of part of an image, and fills the requested gradients.
 
-        Without ``image_loss.GRADIENT``, ``gradient`` may be ``planes`` itself, which is not changed.
+        If ``near`` does not request gradients (``image_loss.GRADIENT``), ``gradient`` may be ``planes`` itself, which
+        then stays unchanged.
         """
         channels, height, width = target.shape
         rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
@@ -274,7 +280,7 @@ class ChangedPixels(CpuRenderer):
         return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
 
     def _cleared(self, channels: int, height: int, width: int) -> Array:
-        """Returns the scratch buffer of the image loss for a box, with zeros in its border rows."""
+        """Returns the scratch buffer of the image loss for a box, with its border rows set to zero."""
         shape = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
         size = int(np.prod(shape))
         if self._box_scratch.size < size:
@@ -286,20 +292,21 @@ class ChangedPixels(CpuRenderer):
 
 
 def take_rows(state: State, rows: NDArray[np.int64]) -> State:
-    """Returns the given rows of a state's arrays."""
+    """Returns the given rows of all arrays of a state."""
     one, two, three, four = (np.take(array, rows, axis=0) for array in state)
     return one, two, three, four
 
 
 def _key(view: TrainingView) -> tuple[str, int, int]:
-    """Returns camera name and picture size, since probe views use the same cameras at lower resolution."""
+    """Returns camera name and image size, because probe views use the same cameras at a lower resolution."""
     return view.name, view.camera.width, view.camera.height
 
 
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Returns the box around some pixels with the windows of all losses they affect, or one pixel if there are none.
+    """Returns a box around the given pixels that contains the windows of all losses that the pixels affect.
 
-    The first column is a multiple of sixteen, so that the flags of ``image_loss.near`` align with those of the picture.
+    If there are no such pixels, it is a single pixel. The first column is a multiple of sixteen, so that the flags of
+    ``image_loss.near`` align with the flags of the full image.
     """
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if len(rows) == 0:
@@ -316,10 +323,11 @@ def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _outside_region(box: tuple[slice, slice], near: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """Returns [height, columns] uint8 flags of the losses that lie outside a region, see ``image_loss.image_loss``.
+    """Returns [height, columns] uint8 flags of the losses outside a region; see ``image_loss.image_loss``.
 
     Args:
-        box, near: fields of the ``Region``.
+        box, near: the corresponding fields of ``Region``.
+        height, width: image size in pixels.
     """
     wanted = np.full((height, image_loss.stride(width) // lanes.COUNT), image_loss.LOSSES)
     rows, first = box[0], box[1].start // lanes.COUNT

@@ -1,4 +1,4 @@
-"""Colours as parameters of an update: an RGB table with a learning rate per Gaussian, and the soft-colour loss."""
+"""Optimization of colours during an update, with a learning rate per Gaussian and the soft-colour loss."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ from scas4d_core.engines.engine import AttemptStart
 Array = NDArray[np.float32]
 
 MOST = 0.6
-"""Share of moving Gaussians above which the table has a row for every Gaussian, since indexing costs too much."""
+"""Fraction of moving Gaussians above which the table contains all Gaussians, because indexing would cost more."""
 
 
 class Colours:
-    """The colours learned in an attempt.
+    """Colours that are learned during an attempt.
 
     Args:
-        colours: [N, 3] RGB, updated in place. before: [N, 3] colours of Θ_{t−1}. rows: [M] the moving Gaussians.
-        static: whether static Gaussians learn too. weight: weight of the mean absolute change (Dynamic3DGaussians).
-        start: learning rates and decay rates.
+        colours: [N, 3] RGB colours, updated in place.
+        before: [N, 3] colours of Θ_{t−1}.
+        rows: [M] rows of the moving Gaussians.
+        static: whether to learn the colours of static Gaussians too.
+        weight: weight of the soft-colour loss, the mean absolute change (Dynamic3DGaussians).
+        start: settings of the attempt, with learning rates and Adam decay rates.
     """
 
     def __init__(
@@ -48,19 +51,19 @@ class Colours:
         self._change: Array
 
     def loss(self, curve: bool) -> float:
-        """Returns the weighted mean absolute change, or 0 if it is not needed (``curve``)."""
+        """Returns the weighted soft-colour loss, or 0 if ``curve`` is false. Call before ``gradient`` or ``step``."""
         self._change = self._table - self._before
         return float(self._weight * np.abs(self._change).sum(dtype=np.float64)) if curve else 0.0
 
     def gradient(self, g_features: Array) -> Array:
-        """Returns the gradient [rows of the table, 3] of the rendering losses (``g_features`` [N, 4]) and the term."""
+        """Returns the gradient [rows of the table, 3] of rendering losses (``g_features``) and soft-colour loss."""
         pull: Array = self._weight * np.sign(self._change)
         chosen = g_features if self._whole else g_features[self._rows]
         total: Array = chosen[:, :3] + pull
         return total
 
     def all_gradients(self, g_features: Array) -> Array:
-        """Returns the gradient of the last iteration as [N, 3], with 0 for Gaussians that are not in the table."""
+        """Returns the gradient of the last iteration [N, 3]; it is 0 for Gaussians that are not in the table."""
         if self._whole:
             return self.gradient(g_features)
         total = np.zeros_like(self._colours)
@@ -68,7 +71,7 @@ class Colours:
         return total
 
     def step(self, g_features: Array, factor: float) -> None:
-        """Performs one optimization step; ``factor`` scales all learning rates."""
+        """Performs one optimization step, with all learning rates scaled by ``factor``."""
         self._adam.step(self.gradient(g_features), factor)
         if not self._whole:
             self._colours[self._rows] = self._table

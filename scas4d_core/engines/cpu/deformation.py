@@ -1,9 +1,9 @@
-"""Deformation D_t on the CPU: the parameters of one frame, and fused kernels for its forward and backward pass.
+"""Deformation D_t on the CPU: the parameters of one frame, with fused kernels for the forward and backward pass.
 
-Reference: ``engines.torch.deformation``. Buffers are allocated once per hierarchy.
+Reference implementation: ``engines.torch.deformation``. Buffers are allocated once per hierarchy.
 
-A Gaussian that is not finite when an update starts is held back: it stays unchanged, has no weight in cluster pivots
-and neighbour terms, and is counted.
+Gaussians with non-finite values at the start of an update are held back. They stay unchanged and have no weight in
+cluster pivots and neighbour terms. Their number is recorded.
 """
 
 from __future__ import annotations
@@ -27,20 +27,24 @@ Array = NDArray[np.float32]
 
 
 class CpuDeformation:
-    """The cluster cascade of a hierarchy, the per-Gaussian deltas, and the neighbour terms.
+    """Cluster cascade, per-Gaussian deltas and neighbour terms for one hierarchy.
 
     Args:
-        bounds: [M, 3] metres, see ``Structure.length_bounds``.
-        cluster_map, covariance: see ``engines.torch.deformation``.
+        hierarchy: cluster hierarchy of the moving Gaussians.
+        neighbours: neighbour graph, or None if no term needs it.
+        bounds: [M, 3] axis lengths in metres; see ``Structure.length_bounds``.
+        cluster_map, covariance: variants of the deformation; see ``engines.torch.deformation``.
 
     Attributes:
-        clusters: [K, 10] per layer, columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
-        cluster_gradients, delta_gradients: gradients of the same shapes, filled by ``backward``.
-        means [N, 3], factors [N, 3, 3]: all Gaussians, filled by ``forward``.
+        clusters: [K, 10] parameters of each layer, with columns r, t, c, s.
+        deltas: [M, 9] per-Gaussian deltas, with columns Δp, Δr, Δs.
+        cluster_gradients, delta_gradients: gradients of ``clusters`` and ``deltas``, filled by ``backward``.
+        means: [N, 3] means of all Gaussians, filled by ``forward``.
+        factors: [N, 3, 3] covariance factors of all Gaussians, filled by ``forward``.
         turns: [M, 4] rotations since the previous frame, filled by ``forward``.
-        held_back: [held] int64 rows of Θ_{t−1} that are not finite, found by ``start``.
-        guards: number of times that each guard was triggered since the last ``reset``. ``forward`` counts those of
-            ``cascade.COUNTED_GUARDS`` in layers that are not frozen; ``start`` counts the others.
+        held_back: [held] int64 rows with non-finite values in Θ_{t−1}, found by ``start``.
+        guards: number of times that each guard was triggered since the last ``reset``. ``forward`` counts the guards
+            in ``cascade.COUNTED_GUARDS``, excluding frozen layers; ``start`` counts all others.
     """
 
     def __init__(
@@ -93,7 +97,7 @@ class CpuDeformation:
         self._held: tuple[Array, Array] = self.means, self.factors
 
     def start(self, previous: Gaussians) -> None:
-        """Loads the state Θ_{t−1} to deform; its static Gaussians stay unchanged."""
+        """Loads the state Θ_{t−1} to deform. Its static Gaussians stay unchanged."""
         moving = self.hierarchy.rows
         held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)
@@ -115,7 +119,7 @@ class CpuDeformation:
         self.factors = previous.factors.copy()
 
     def _hold_back(self, sound: NDArray[np.bool_]) -> None:
-        """Excludes entries [M] that are not sound from pivots and neighbour terms, and counts them."""
+        """Excludes Gaussians whose entry in ``sound`` [M] is false from pivots and neighbour terms; counts them."""
         self._present, self._ranges = self._all_present, self._all_ranges
         if self.neighbours is not None:
             self._weights = self.neighbours.weights
@@ -132,15 +136,16 @@ class CpuDeformation:
         self.guards.add(("held_back", "empty_cluster"), np.array([len(self.held_back), empty]))
 
     def freeze_layers(self, layers: int) -> None:
-        """Freezes the first ``layers`` layers with their current parameters: they are applied once and get no gradient.
+        """Freezes the first ``layers`` layers at their current parameters.
 
-        ``forward`` gives bit-identical results. Call ``freeze_layers(0)`` before changing the parameters.
+        Frozen layers are applied once and get no gradient; the results of ``forward`` stay bit-identical. Call
+        ``freeze_layers(0)`` before changing the parameters.
 
         Raises:
-            ValueError: if the last layer would be frozen.
+            ValueError: if this would freeze the last layer.
         """
         if layers and layers >= len(self.clusters):
-            raise ValueError(f"{layers} of {len(self.clusters)} layers cannot be frozen: the last one always continues")
+            raise ValueError(f"cannot freeze {layers} of {len(self.clusters)} layers; the last layer must stay free")
         if layers < self._frozen:
             self._unfreeze_layers()
         for layer in range(self._frozen, layers):
@@ -154,7 +159,7 @@ class CpuDeformation:
         self._entering[:], self._frozen = self._before, 0
 
     def forward(self) -> None:
-        """Evaluates equations (5) to (7); fills ``means``, ``factors`` and ``turns``."""
+        """Evaluates equations (5) to (7) and fills ``means``, ``factors`` and ``turns``."""
         deform(
             self._frozen, self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows,
             self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._sums,
@@ -164,10 +169,13 @@ class CpuDeformation:
         self.guards.add(COUNTED_GUARDS, self._guard_counts)
 
     def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
-        """Returns the mean rigidity, isometry and rotation losses of the sampled pairs; ``backward`` adds gradients.
+        """Returns the mean rigidity, isometry and rotation losses over the sampled pairs.
+
+        The next call of ``backward`` includes their gradients.
 
         Args:
-            sample: [S] entries of the hierarchy's order. weights: weights of the three terms.
+            sample: [S] sampled Gaussians, as indices in hierarchy order.
+            weights: weights of the three terms.
         """
         if self.neighbours is None or len(sample) == 0:
             self._tied[:] = 0
@@ -181,12 +189,15 @@ class CpuDeformation:
         return means
 
     def backward(self, g_means: Array, g_factors: Array, scale_weight: float) -> float:
-        """Fills ``delta_gradients``, and ``cluster_gradients`` of the layers that are not frozen.
-
-        Returns the scale loss (metres, mean over axes).
+        """Fills ``delta_gradients``, and ``cluster_gradients`` of all layers that are not frozen.
 
         Args:
-            g_means [N, 3], g_factors [N, 3, 3]: gradients of the outputs of ``forward``.
+            g_means: [N, 3] gradients of ``means``.
+            g_factors: [N, 3, 3] gradients of ``factors``.
+            scale_weight: weight of the scale loss.
+
+        Returns:
+            Unweighted scale loss in metres, averaged over axes.
         """
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
@@ -199,21 +210,21 @@ class CpuDeformation:
 
 
 def cache_lines(count: int) -> Array:
-    """Returns zeros [count, 16], one 64-byte cache line per row."""
+    """Returns an array of zeros [count, 16] whose rows are aligned to 64-byte cache lines."""
     flat = np.zeros((count + 1) * STATE, np.float32)
     first = -(flat.ctypes.data // 4) % STATE
     return flat[first : first + count * STATE].reshape(count, STATE)
 
 
 class Blocks(NamedTuple):
-    """The Gaussians of a hierarchy in B blocks of sixteen; in every layer, a block belongs to a single cluster.
+    """The Gaussians of a hierarchy, grouped into B blocks of sixteen that each belong to one cluster in every layer.
 
     Attributes:
-        entries: [B, 16] int64 entries of the hierarchy's order; an incomplete block repeats its last entry.
-        present: [B, 16] float32, 0 for repeated entries, else 1.
+        entries: [B, 16] int64 indices of the Gaussians in hierarchy order; partial blocks repeat their last index.
+        present: [B, 16] float32 mask: 0 for repeated entries, otherwise 1.
         clusters: [B, L] int64 cluster of each block in each layer, numbered across all layers.
-        offsets: [L + 1] int64 number of the first cluster of each layer.
-        ranges: [clusters of all layers, 3] int64: first block, last block + 1, and number of entries of each cluster.
+        offsets: [L + 1] int64 number of the first cluster in each layer.
+        ranges: [clusters of all layers, 3] int64 first block, last block + 1, and number of entries of each cluster.
     """
 
     entries: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""CPU engine: one iteration of an update, in the order of algorithm 1."""
+"""CPU engine for updates, which runs each iteration in the order of algorithm 1."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.engines.cpu.floor import floor_term
 from scas4d_core.engines.cpu.gloss import LearntGloss, features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
-from scas4d_core.engines.engine import REPORT, AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
+from scas4d_core.engines.engine import (
+    GAINS_MISSING,
+    REPORT,
+    AttemptStart,
+    IterationLog,
+    StepScalars,
+    Tables,
+    Thinned,
+    ViewRecord,
+)
 from scas4d_core.engines.gains import GainEstimator
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import Gradients
@@ -27,17 +36,18 @@ Array = NDArray[np.float32]
 
 
 class CpuEngine:
-    """The ``UpdateEngine`` of the CPU. Buffers are allocated once per hierarchy and reused for every frame.
+    """The CPU implementation of ``UpdateEngine``. Buffers are allocated once per hierarchy and reused for every frame.
 
     Attributes:
-        renderer: renderer of states with the background, limits and weights of the plan.
+        name: name of the engine, used in messages.
+        renderer: renderer for states, with the background, limits and weights of the plan.
     """
 
     name = "cpu"
     renderer: CpuRenderer
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """See ``UpdateEngine.bind``; this engine supports all options of a plan."""
+        """See ``UpdateEngine.bind``. This engine supports all plans."""
         hierarchy, count = structure.hierarchy, len(structure.roots)
         self._plan, self._structure, self._rows = plan, structure, hierarchy.rows
         given = (plan.background, plan.image, plan.mask)
@@ -53,9 +63,9 @@ class CpuEngine:
         self._probes: list[TrainingView] = []
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
-        """See ``UpdateEngine.load_views``; if gains are estimated, the views get their own copies of the exposures."""
+        """See ``UpdateEngine.load_views``. If gains are estimated, exposures are copied before they are modified."""
         self._views, self._probes = list(views), list(probes)
-        if self._plan.camera_gains:  # another attempt must start from the original exposures
+        if self._plan.camera_gains:  # later attempts must start from the original exposures
             exposures = {view.name: view.exposure.copy() for view in views}
             self._views = [replace(view, exposure=exposures[view.name]) for view in views]
             self._probes = [replace(view, exposure=exposures[view.name]) for view in probes]
@@ -128,7 +138,7 @@ class CpuEngine:
         lap(REPORT)
 
     def _pictures(self, views: Sequence[int], step: StepScalars) -> tuple[float, Gradients]:
-        """Returns the mean image and mask loss over the views, with gradients (the renderer's buffers for one view)."""
+        """Returns the mean image and mask loss over views, and the gradients (renderer buffers if only one view)."""
         loss, total = 0.0, None
         for index in views:
             view_loss, gradients = self._picture(index, step)
@@ -147,7 +157,7 @@ class CpuEngine:
         return loss / len(views), total
 
     def _picture(self, index: int, step: StepScalars) -> tuple[float, Gradients]:
-        """Renders a view, compares it with its picture and backpropagates the loss; logs the result."""
+        """Renders a view, computes and backpropagates its loss, and logs the result."""
         view, deformation, renderer, lap = self._views[index], self._deformation, self.renderer, self._start.lap
         if self._gloss is not None:
             self._gloss.shade(deformation.means, deformation.turns, self._colours, view.camera, self._features)
@@ -167,7 +177,7 @@ class CpuEngine:
         return loss, gradients
 
     def _terms(self, gradients: Gradients, step: StepScalars) -> float:
-        """Computes the weighted terms other than picture losses; adds their gradients or keeps them for the cascade."""
+        """Returns the weighted sum of all other loss terms, and adds or stores their gradients."""
         plan, deformation, loss = self._plan, self._deformation, 0.0
         if plan.neighbour_terms:
             weights = (step.rigidity, plan.isometry, plan.rotation)
@@ -180,7 +190,7 @@ class CpuEngine:
         return loss
 
     def _step(self, gradients: Gradients, step: StepScalars) -> None:
-        """Steps Adam for all free parameters."""
+        """Takes an Adam step for all free parameters."""
         deformation = self._deformation
         for columns, gradient, factor in zip(
             self._layer_columns, deformation.cluster_gradients, step.layers, strict=True
@@ -200,7 +210,7 @@ class CpuEngine:
             self._gains.leave_out([self._views[index] for index in views])
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``; does nothing, because the host does the work itself."""
+        """See ``UpdateEngine.wait``. This method does nothing, because the host itself is the device."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """See ``UpdateEngine.probe``."""
@@ -255,12 +265,12 @@ class CpuEngine:
     def gains(self) -> Array:
         """See ``UpdateEngine.gains``."""
         if self._gains is None:
-            raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
+            raise ValueError(GAINS_MISSING)
         self._gains.finish_round()
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
-        """See ``UpdateEngine.gradients``; those of frozen layers are not up to date."""
+        """See ``UpdateEngine.gradients``. The gradients of frozen layers are outdated."""
         deformation = self._deformation
         tables = {f"cluster {layer}": g.copy() for layer, g in enumerate(deformation.cluster_gradients)}
         tables["deltas"] = deformation.delta_gradients.copy()
@@ -271,13 +281,13 @@ class CpuEngine:
         return tables
 
     def _forward(self) -> None:
-        """Updates the deformed Gaussians from the tables."""
+        """Recomputes the deformed Gaussians if the tables have changed."""
         if not self._deformed:
             self._deformation.forward()
             self._deformed = True
 
     def _with_looks(self, state: Gaussians) -> Gaussians:
-        """Returns a state with the colours, gloss and environment learned so far."""
+        """Returns a copy of a state with the colours, gloss and environment learned so far."""
         if self._gloss is None:
             return state.replace(colours=self._colours)
         return state.replace(colours=self._colours, gloss=self._gloss.gloss, environment=self._gloss.environment)

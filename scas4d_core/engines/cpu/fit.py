@@ -1,4 +1,4 @@
-"""CPU engine for fits: one iteration of 3D Gaussian Splatting."""
+"""CPU engine for fits, which runs single iterations of 3D Gaussian Splatting."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float32]
 
 
 class _Shapes(NamedTuple):
-    """Arrays that are rendered for a view: the fixed Gaussians, followed by the fitted ones."""
+    """Arrays to render for a view, with the fixed Gaussians followed by the fitted ones."""
 
     means: Array
     factors: Array
@@ -36,22 +36,22 @@ class _Shapes(NamedTuple):
 
     @classmethod
     def beside(cls, fixed: Gaussians, camera: CameraArrays, count: int) -> _Shapes:
-        """Returns arrays of the fixed Gaussians, as the camera sees them, with space for ``count`` fitted ones."""
+        """Returns arrays with the fixed Gaussians as seen by a camera, and space for ``count`` fitted Gaussians."""
         made, rows = cls.empty(len(fixed) + count), len(fixed)
         made.means[:rows], made.factors[:rows] = fixed.means, fixed.factors
         made.opacities[:rows], made.features[:rows] = fixed.opacities, features_seen(fixed, camera)
         return made
 
     def since(self, row: int) -> _Shapes:
-        """Returns views of the rows from ``row`` onwards."""
+        """Returns array views of all rows from ``row`` onwards."""
         return _Shapes(*[array[row:] for array in self])
 
 
 class CpuFitEngine:
-    """The ``FitEngine`` of the CPU; it updates the arrays of the loaded table in place.
+    """The CPU implementation of ``FitEngine``. It updates the arrays of the loaded table in place.
 
     Args:
-        renderer: renderer that also defines the weights of the losses.
+        renderer: renderer, which also defines the loss weights.
     """
 
     def __init__(self, renderer: CpuRenderer) -> None:
@@ -66,7 +66,7 @@ class CpuFitEngine:
     def load_table(self, table: FitTable) -> None:
         """See ``FitEngine.load_table``."""
         if not isinstance(table.gloss, GlossShading | None):
-            raise EngineError("cpu", ["a gloss of another engine"])
+            raise EngineError("cpu", ["gloss from another engine"])
         self._table, self._gloss, count = table, table.gloss, len(table.parameters)
         self._gradients = np.zeros_like(table.parameters)
         if self._fixed:
@@ -109,7 +109,7 @@ class CpuFitEngine:
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 
     def _backward(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
-        """Returns the gradients of all rendered arrays (None if only colours learn) and those of the features."""
+        """Returns the gradients of all rendered arrays, or None if only colours are learned, and of the features."""
         if rates[: COLOUR.start].any() or rates[COLOUR.stop :].any():
             gradients = self.renderer.forward_backward(*drawn, view)
             return gradients, gradients.features
@@ -118,7 +118,7 @@ class CpuFitEngine:
         return None, rasterizer.feature_gradients(rasterizer.gradient_buffers()[0])
 
     def _record_rendering(self, factors: Array, g_screen: Array, camera: CameraArrays, fixed: int) -> None:
-        """Adds a rendering to the statistics, if they are collected."""
+        """Updates the statistics with the last rendering, if they are collected."""
         statistics = self._table.statistics
         if statistics is not None:
             half = np.array([camera.width / 2, camera.height / 2], np.float32)

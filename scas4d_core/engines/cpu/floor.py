@@ -1,4 +1,4 @@
-"""Floor loss: keeps moving Gaussians above a plane (Dynamic3DGaussians' floor loss, for arbitrary planes)."""
+"""Floor loss, which keeps moving Gaussians above a plane (from Dynamic3DGaussians, extended to arbitrary planes)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,16 @@ def floor_term(plane: Plane, means: Array, rows: NDArray[np.int64], weight: floa
     """Returns the weighted mean depth below the floor, and adds its gradient to ``g_means``.
 
     Args:
-        plane: see ``UpdatePlan.floor``. means: [N, 3] metres. rows: [M] moving Gaussians. g_means: [N, 3], added to.
+        plane: floor plane; see ``UpdatePlan.floor``.
+        means: [N, 3] means, in metres.
+        rows: [M] rows of the moving Gaussians.
+        weight: weight of the loss.
+        g_means: [N, 3] gradients of the means, to which the gradient of this loss is added.
     """
     if len(rows) == 0:
         return 0.0
     normal = np.array(plane[:3], np.float32)
     depth = means[rows] @ normal + np.float32(plane[3])
-    below = depth > 0  # False for Gaussians that are not finite
+    below = depth > 0  # NaN compares as False
     g_means[rows[below]] += np.float32(weight / len(rows)) * normal
     return float(weight * depth[below].sum(dtype=np.float64) / len(rows))

@@ -1,6 +1,6 @@
-"""View-dependent colours, and learning of the gloss and environment that produce them.
+"""View-dependent colours, and optimization of the gloss and environment that produce them.
 
-``kernels.appearance.direction`` has the formula; it is only imported if a Gaussian is glossy.
+The formula is in ``kernels.appearance.direction``, which is only imported if a scene is glossy.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from scas4d_core.gaussians import Gaussians
 Array = NDArray[np.float32]
 
 GLOSS = np.float32(0.5)
-"""Initial gloss strength of a Gaussian. Only its product with the environment is visible, so equally glossy Gaussians
-stay near this value and the environment absorbs the rest."""
+"""Initial gloss strength of a Gaussian. Only the product of strength and environment is visible, so the strengths of
+equally glossy Gaussians stay near this value and the environment absorbs the rest."""
 RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 1e-3, 2e-2, 5e-3
-"""Adam learning rates in frame 0; the gloss rate applies at a strength of ``GLOSS`` (``gloss_rate``). With higher
-gloss rates, single Gaussians fit the highlight of one camera: on the `gloss` scene, test views lost 0.6 dB at 5e-3
+"""Adam learning rates in frame 0. The gloss rate applies at a strength of ``GLOSS``; see ``gloss_rate``. With higher
+gloss rates, single Gaussians overfit the highlight of one camera. On the `gloss` scene, test views lost 0.6 dB at 5e-3
 for strengths and 3e-3 for normals."""
 UPDATE_RATE_GLOSS, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS = 2e-3, 1e-2, 1e-3
-"""Adam learning rates in an update, during which they decay to a tenth."""
+"""Initial Adam learning rates of an update, during which they decay to a tenth."""
 NEARNESS = 0.3
-"""Initial nearness of the environment in 1/m, typical of lamps in a room."""
+"""Initial nearness (inverse distance) of the environment in 1/m, typical of lamps in a room."""
 NEIGHBOURS = 16
-"""Number of neighbours over which changes of normals and strengths are averaged: surfaces bend slowly."""
+"""Number of neighbours over which changes of normals and strengths are averaged, since surfaces bend slowly."""
 SAME_SIDE = 0.5
-"""Cosine between normals above which neighbours count as the same surface."""
+"""Cosine between normals above which neighbours are considered part of the same surface."""
 
 
 def without_turn(count: int) -> Array:
@@ -41,15 +41,18 @@ def without_turn(count: int) -> Array:
 
 
 def features_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """Returns the features [N, 4] of a state as a camera sees them: RGB and label. See ``colours_seen``."""
+    """Returns the features [N, 4] of a state, RGB and label, as seen by a camera; see ``colours_seen``."""
     return gaussians.features(colours_seen(gaussians, camera, turns))
 
 
 def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """Returns the colours [N, 3] of a state as a camera sees them; the state's own array if nothing is glossy.
+    """Returns the colours [N, 3] of a state as seen by a camera. If the state has no gloss, returns its colour array.
 
     Args:
-        turns: [N, 4] unit quaternions, rotations of the Gaussians since their gloss was stored; None: no rotation.
+        gaussians: state to shade.
+        camera: camera in kernel format.
+        turns: [N, 4] unit quaternions, the rotations of the Gaussians since their gloss was stored. If None, they have
+            not rotated.
     """
     if gaussians.gloss is None or gaussians.environment is None:
         return gaussians.colours
@@ -64,11 +67,15 @@ def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None
 
 
 def gloss_rate(rate: float, gloss: Array) -> float:
-    """Returns the gloss learning rate at which normals [M, 3] rotate as fast as at strength ``GLOSS`` with ``rate``.
+    """Scales a gloss learning rate so that normals rotate as fast as they would at strength ``GLOSS`` with ``rate``.
 
-    Adam's step length does not depend on the strength, so at a fifth of the strength normals rotate five times as fast.
-    On the `gloss` scene, this cost 0.6 dB in frame 0. The strength is a mean weighted by itself, because Gaussians
-    without gloss have no normals.
+    Adam's step length does not depend on the strength, so at a fifth of the strength, normals rotate five times as
+    fast. On the `gloss` scene, this cost 0.6 dB in frame 0. The typical strength is the mean strength weighted by
+    strength, because Gaussians without gloss have no normal.
+
+    Args:
+        rate: learning rate at strength ``GLOSS``.
+        gloss: [M, 3] normal of each Gaussian, scaled by its strength.
 
     >>> gloss_rate(1e-3, np.array([[0.1, 0, 0], [0, 0, 0.1], [0, 0, 0]], np.float32))
     0.0002
@@ -79,11 +86,19 @@ def gloss_rate(rate: float, gloss: Array) -> float:
 
 
 class GlossShading:
-    """Gloss and environment as parameters, with their gradients and optimization steps.
+    """Gloss and environment parameters, with their gradients and optimizer state.
 
     Args:
-        gloss: [M, 3] normals times strengths; updated in place. environment: [ROWS, 3]; updated in place.
+        gloss: [M, 3] normal of each Gaussian, scaled by its gloss strength; updated in place.
+        environment: [ROWS, 3] environment, updated in place.
         rates: learning rates of the gloss, the environment and its nearness.
+
+    Attributes:
+        gloss, environment, rates: as given.
+        moments: Adam moments of gloss and environment, [2, …] each.
+        steps: number of Adam steps so far.
+        changed_from: gloss from which changes are smoothed.
+        gradients: gradients of gloss and environment since the last step.
     """
 
     def __init__(self, gloss: Array, environment: Array, rates: tuple[float, float, float]) -> None:
@@ -91,20 +106,20 @@ class GlossShading:
 
         self._kernel = direction
         self.gloss, self.environment = gloss, environment
-        self.changed_from, self._rates = gloss.copy(), rates
+        self.changed_from, self.rates = gloss.copy(), rates
         self._turned = np.empty_like(gloss)
         self.gradients = np.zeros_like(gloss), np.zeros_like(environment)
         self.moments = [np.zeros((2, *table.shape), np.float32) for table in (gloss, environment)]
         self._columns = np.array([rates[0]] * 3, np.float32)
         self._by_row = np.full(len(environment), rates[1], np.float32)
         self._by_row[direction.MIDDLE], self._by_row[direction.NEARNESS] = 0, rates[2]
-        self._cells = _cell_areas(direction.SIDE)
-        self._seen = self._steps = 0
+        self._cells = cell_areas(direction.SIDE)
+        self._seen = self.steps = 0
         self._near: tuple[Any, Any] | None = None
 
     @classmethod
     def fresh(cls, gloss: Array, means: Array, environment: Array | None = None) -> GlossShading:
-        """Creates the parameters with the given or a zero environment, centred on the mean of ``means``."""
+        """Creates the parameters. If ``environment`` is None, it starts at zero, centred on the median of ``means``."""
         from scas4d_core.kernels.appearance import direction
 
         if environment is None:
@@ -114,13 +129,13 @@ class GlossShading:
         return cls(gloss, environment, (gloss_rate(RATE_GLOSS, gloss), RATE_ENVIRONMENT, RATE_NEARNESS))
 
     def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
-        """Fills the RGB channels of ``features`` [N, 4] as a camera sees them."""
+        """Fills the RGB channels of ``features`` [N, 4] with the colours that a camera sees."""
         self._kernel.shade(means, self.gloss, turns, colours, self.environment, camera.centre, features)
 
     def shade_backward(
         self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array
     ) -> None:
-        """Converts the gradient of the features to that of the colours, and stores those of gloss and environment."""
+        """Converts feature to colour gradients in place, and accumulates the gloss and environment gradients."""
         g_environment = self._kernel.shade_backward(
             means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
         )
@@ -132,10 +147,10 @@ class GlossShading:
         self._seen += 1
 
     def step(self, factor: float = 1.0) -> None:
-        """Steps Adam with the mean gradient since the last step; then makes the environment sum to zero."""
+        """Takes an Adam step with the mean gradient since the last step, then makes the environment sum to zero."""
         from scas4d_core.kernels.adam import EVERY_ROW, adam
 
-        self._steps += 1
+        self.steps += 1
         beta1, beta2 = np.float32(0.9), np.float32(0.999)
         ones = np.full(3, factor, np.float32)
         for table, gradient, moments, columns, by_row in (
@@ -143,7 +158,7 @@ class GlossShading:
             (self.environment, self.gradients[1], self.moments[1], ones, self._by_row),
         ):
             gradient /= np.float32(max(self._seen, 1))
-            adam(table, gradient, moments[0], moments[1], columns, by_row, beta1, beta2, self._steps)
+            adam(table, gradient, moments[0], moments[1], columns, by_row, beta1, beta2, self.steps)
         self._seen = 0
         cells = self.environment[: self._kernel.CELLS]
         cells -= (self._cells[:, None] * cells).sum(axis=0)
@@ -151,20 +166,20 @@ class GlossShading:
         np.clip(nearness, 0, None, out=nearness)
 
     def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> GlossShading:
-        """Returns the gloss of some rows with their moments, then copies of the parents' rows with zero moments."""
+        """Returns the gloss of ``rows`` with their moments, followed by copies of ``parents`` with zero moments."""
         every = np.concatenate([rows, parents])
-        chosen = GlossShading(self.gloss[every], self.environment, self._rates)
+        chosen = GlossShading(self.gloss[every], self.environment, self.rates)
         moments = self.moments[0][:, every]
         moments[:, len(rows) :] = 0
         chosen.moments = [np.ascontiguousarray(moments), self.moments[1]]
-        chosen.changed_from, chosen._steps = self.changed_from[every], self._steps
+        chosen.changed_from, chosen.steps = self.changed_from[every], self.steps
         return chosen
 
     def smooth(self, means: Array) -> None:
         """Averages the changes since ``changed_from`` over neighbours on the same side of a surface.
 
         Args:
-            means: [N, 3] positions from which the neighbours are determined on the first call.
+            means: [N, 3] positions, from which the neighbours are determined on the first call.
         """
         count = len(self.gloss)
         if self._near is None:
@@ -178,11 +193,11 @@ class GlossShading:
         self.gloss[:] = self.changed_from + np.einsum("nkc,nk->nc", change, weights)
 
 
-def _cell_areas(side: int) -> Array:
-    """Returns the share of the sphere that each cell of an octahedral map covers, [side²]; sums to 1."""
+def cell_areas(side: int) -> Array:
+    """Returns the fraction of the sphere that each cell of an octahedral map covers, [side²]; they sum to 1."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, side)] * 2)
     x, y, z = u, v, 1 - abs(u) - abs(v)
-    # The solid angle of a map element is proportional to 1/|p|³; rows at the rim represent half a cell.
+    # The solid angle of a map element is proportional to 1/|p|³; cells on the border are cut in half.
     fold = z < 0
     x, y = np.where(fold, (1 - abs(v)) * np.sign(u), u), np.where(fold, (1 - abs(u)) * np.sign(v), v)
     area = (x * x + y * y + z * z) ** -1.5
@@ -193,11 +208,14 @@ def _cell_areas(side: int) -> Array:
 
 
 class LearntGloss:
-    """Gloss and environment as parameters of an attempt, with the rotations that make normals follow the deformation.
+    """Gloss and environment parameters of an attempt. The normals rotate with the deformation.
 
     Args:
-        gloss, environment: those of Θ_{t−1}; the gloss is relative to the orientation in Θ_{t−1}. count: N.
-        rows: [M] the moving Gaussians. roots: [N, 3] metres, positions in frame 0, used for finding neighbours.
+        gloss: gloss of Θ_{t−1}, relative to the orientation in Θ_{t−1}.
+        environment: environment of Θ_{t−1}.
+        count: number of Gaussians, N.
+        rows: [M] rows of the moving Gaussians.
+        roots: [N, 3] positions in frame 0, in metres, used to find neighbours.
     """
 
     def __init__(self, gloss: Array, environment: Array, count: int, rows: NDArray[np.int64], roots: Array) -> None:
@@ -216,21 +234,21 @@ class LearntGloss:
         return self._shading.environment
 
     def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
-        """Fills RGB of ``features`` [N, 4] as a camera sees them; ``turns`` [M, 4]: rotations of moving Gaussians."""
+        """Fills the RGB channels of ``features`` [N, 4]; ``turns`` [M, 4] are the rotations of moving Gaussians."""
         self._turns[self._rows] = turns
         self._shading.shade(means, self._turns, colours, camera, features)
 
     def shade_backward(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
-        """Converts gradients of features to those of colours in place, and stores those of gloss and environment."""
+        """Converts feature to colour gradients in place, and accumulates the gloss and environment gradients."""
         self._shading.shade_backward(means, self._turns, colours, camera, g_features)
 
     @property
     def gradients(self) -> tuple[Array, Array]:
-        """Returns the gradients of gloss and environment in the last step."""
+        """Gradients of gloss and environment in the last step."""
         return self._shading.gradients
 
     def step(self, factor: float, smooth: bool) -> None:
-        """Steps gloss and environment; if ``smooth``, the changes of the gloss are then averaged over neighbours."""
+        """Takes an optimization step. If ``smooth``, changes of the gloss are then averaged over neighbours."""
         self._shading.step(factor)
         if smooth:
             self._shading.smooth(self._roots)

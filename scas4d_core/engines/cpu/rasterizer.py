@@ -1,10 +1,10 @@
-"""CPU rasterizer: projection, depth sorting, tile lists, blending, and the backward pass of all stages.
+"""CPU rasterizer: projection, depth sorting, tile lists and blending, with the backward pass of all stages.
 
-Buffers are reused and only grow; forward and backward pass of a view share them. Results do not depend on the number
-of threads. Reference: ``engines.torch.rasterizer``.
+Buffers are shared between the forward and backward pass of a view; they are reused and never shrink. Results do not
+depend on the number of threads. Reference implementation: ``engines.torch.rasterizer``.
 
-A Gaussian that is not finite, or whose footprint overflows, is not rendered and gets zero gradients. Gradients that
-overflow are set to 0 as well. ``CpuRasterizer.guards`` counts these events.
+Gaussians with non-finite values or an overflowing footprint are not rendered and get zero gradients. Overflowing
+gradients are also set to 0. ``CpuRasterizer.guards`` counts these events.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ Array = NDArray[np.float32]
 
 
 class Drawing(NamedTuple):
-    """Selects the blocks of a picture to render; other blocks are neither read nor written.
+    """Selects the blocks of an image to render. All other blocks are neither read nor written.
 
     Attributes:
-        blocks: [tiles] uint64, bits as in ``tiles.cover``. learnt: [N] uint8, 1 for Gaussians that get gradients. They
-            must stay within the blocks; otherwise ``CpuRasterizer.outside_region`` is set.
-        mask_to_region: whether to render only those blocks that these Gaussians reach (``CpuRasterizer.drawn``).
+        blocks: [tiles] uint64 bitmask of the blocks in each tile; see ``tiles.cover`` for the bit order.
+        learnt: [N] uint8 mask of the Gaussians that get gradients. If such a Gaussian extends beyond ``blocks``,
+            ``CpuRasterizer.outside_region`` is set.
+        mask_to_region: whether to render only the blocks covered by these Gaussians; see ``CpuRasterizer.drawn``.
     """
 
     blocks: NDArray[np.uint64]
@@ -43,7 +44,7 @@ class Drawing(NamedTuple):
 
 
 class ForwardPass(NamedTuple):
-    """Inputs and buffers of a forward pass that ``backward`` needs; valid until the next forward pass."""
+    """Inputs and buffers of a forward pass that the backward pass needs; valid until the next forward pass."""
 
     means: Array
     factors: Array
@@ -69,8 +70,9 @@ class CpuRasterizer:
 
     Attributes:
         guards: number of times that each guard was triggered since the last ``reset``.
-        outside_region: whether a learned Gaussian reached a block that the last forward pass did not render.
-        drawn: [tiles] uint64, the blocks that the last forward pass rendered.
+        limits: [6] float32 rasterizer constants, in the order of the ``Limits`` fields.
+        outside_region: whether a learned Gaussian covered a block that the last forward pass did not render.
+        drawn: [tiles] uint64 bitmask of the blocks that the last forward pass rendered.
 
     >>> from scas4d_core.cameras import Camera
     >>> from scas4d_core.gaussians import Gaussians
@@ -101,7 +103,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """Returns a contiguous scratch array; it grows by a quarter, so that drifting sizes rarely reallocate."""
+        """Returns a contiguous scratch array. A quarter more is allocated to avoid reallocation as sizes drift."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view
@@ -116,15 +118,16 @@ class CpuRasterizer:
     def project(
         self, means: Array, factors: Array, opacities: Array, features: Array, camera: CameraArrays
     ) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
-        """Projects the Gaussians without rendering; see ``projection.project``.
-
-        Returns splats [N, 16], rects [N, 4] and counts [N], which are buffers.
+        """Projects Gaussians without rendering them; see ``projection.project``.
 
         Args:
             means, factors, opacities, features, camera: see ``forward``.
+
+        Returns:
+            Buffers with the splats [N, 16], rects [N, 4] and counts [N] of ``projection.project``.
         """
         count = len(means)
-        # The projection kernel writes complete groups of sixteen.
+        # The projection kernel writes full groups of sixteen rows.
         splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
         rects = self._buffer("rects", (count, 4), np.int32)
         counts = self._buffer("counts", (count,), np.int32)
@@ -159,15 +162,17 @@ class CpuRasterizer:
         depth_channel: int = -1,
         drawing: Drawing | None = None,
     ) -> Picture:
-        """Renders features and transmittance of one view.
+        """Renders features and transmittance of one view. All arrays are float32 and C-contiguous.
 
         Args:
-            means: [N, 3] metres; factors: [N, 3, 3]; opacities: [N]; features: [N, C], C a multiple of 4; float32 and
-                C-contiguous.
-            camera: camera in the internal world.
-            background: [C] float32.
-            depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres), or −1.
-            drawing: blocks to render; None: the full picture.
+            means: [N, 3] means, in metres.
+            factors: [N, 3, 3] covariance factors.
+            opacities: [N] opacities.
+            features: [N, C] features; C must be a multiple of 4.
+            camera: camera in internal world coordinates.
+            background: [C] background features.
+            depth_channel: channel of ``features`` to overwrite with the depth of each mean (in metres), or −1.
+            drawing: blocks to render, or None for the full image.
         """
         count, channels = features.shape
         width, height, (tiles_x, tiles_y) = camera.width, camera.height, tile_grid(camera)
@@ -189,7 +194,7 @@ class CpuRasterizer:
         )  # fmt: skip
         tasks = threads()
         begins, ends = self._buffer("begins", (2, tasks), np.int64)
-        # One extra element: a pair that is not reached is written and then overwritten.
+        # One extra element, because pairs that do not intersect are written too, before being overwritten.
         most = tiles.share_pairs(order, visible, counts, begins) + 1
         firsts = self._buffer("firsts", (count,), np.int64)
         pairs = self._buffer("pairs", (most, 2), np.int32)
@@ -207,7 +212,7 @@ class CpuRasterizer:
         slots = self._buffer("slots", (entries,), np.int32)
         covers = self._buffer("covers", (entries,), np.uint64)
         tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
-        # Heavy tiles are distributed first and round-robin, so that all tasks finish at about the same time.
+        # Tiles are distributed round-robin, longest lists first, so that all tasks finish at about the same time.
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
         tile_order = tile_order[self.drawn[tile_order] != 0]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
@@ -223,21 +228,21 @@ class CpuRasterizer:
         return self.picture
 
     def _whole(self, tile_count: int, count: int) -> Drawing:
-        """Returns a ``Drawing`` of all blocks in which every Gaussian gets gradients."""
+        """Returns a ``Drawing`` that selects all blocks and gives every Gaussian gradients."""
         blocks, learnt = self._buffer("blocks", (tile_count,), np.uint64), self._buffer("learnt", (count,), np.uint8)
         blocks[:], learnt[:] = np.uint64(2**64 - 1), 1
         return Drawing(blocks, learnt)
 
     def gradient_buffers(self) -> tuple[Array, Array]:
-        """Returns the buffers for dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] that ``backward`` reads.
+        """Returns the buffers for dL/dimage [C, rows, stride] and dL/dalpha [rows, stride] that ``backward`` reads.
 
-        They are padded to whole tiles like the forward buffers, and are zero when first returned for a picture
-        size. The padding must stay zero.
+        Like the forward buffers, they are padded to whole tiles. They are set to zero whenever the image size changes.
+        The padding must stay zero.
         """
         camera, image, transmittance = self._last.camera, self._last.image, self._last.transmittance
         g_image = self._buffer("g_image", image.shape)
         g_alpha = self._buffer("g_alpha", transmittance.shape)
-        # Pictures of a different size can have the same number of tiles; their gradients would remain in the padding.
+        # Images of different sizes can have the same number of tiles, so old gradients would remain in the padding.
         shape = (len(image), camera.height, camera.width)
         if self._gradient_shape != shape:
             g_image[:] = 0
@@ -250,13 +255,13 @@ class CpuRasterizer:
 
         Args:
             g_image, g_alpha: filled buffers from ``gradient_buffers``.
-            detached: channel whose gradient reaches the features but not the geometry, or −1. Its plane of the forward
-                picture is set to zero.
+            detached: channel whose gradient propagates to the features but not to the geometry, or −1. This channel of
+                the rendered image is set to zero.
         """
         last = self._last
         features, image = last.features, last.image
         if detached >= 0:
-            # A channel of zeros contributes nothing to the geometry, and the gradient of its features does not read it.
+            # A zero channel contributes nothing to the geometry, and its feature gradient does not depend on its value.
             features = features.copy()
             features[:, detached] = 0
             image[detached] = 0
@@ -284,7 +289,7 @@ class CpuRasterizer:
         return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
-        """Returns only the feature gradients [N, 4] that ``backward`` computes; for pictures of four channels."""
+        """Returns only the feature gradients [N, 4] of ``backward``; for images with four channels."""
         last, count = self._last, len(self._last.features)
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
         feature_gradients.blend_features(
@@ -300,7 +305,7 @@ class CpuRasterizer:
 
     @property
     def planes(self) -> Array:
-        """[C, rows, stride] planes of the last forward pass, padded to whole tiles."""
+        """[C, rows, stride] image of the last forward pass, padded to whole tiles."""
         return self._last.image
 
     @property
@@ -311,10 +316,10 @@ class CpuRasterizer:
 
     @property
     def splats(self) -> Array:
-        """[N, 16] splats of the last forward pass, columns as in ``kernels.projection``."""
+        """[N, 16] splats of the last forward pass; see ``kernels.projection`` for the columns."""
         return self._last.splats
 
     @property
     def counts(self) -> NDArray[np.int32]:
-        """[N] number of tiles that each Gaussian reached in the last forward pass, 0 if culled."""
+        """[N] number of tiles that each Gaussian covered in the last forward pass; 0 if culled."""
         return self._last.counts

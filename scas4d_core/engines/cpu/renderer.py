@@ -1,4 +1,4 @@
-"""CPU renderer: renders states, compares them with pictures and backpropagates the image and mask loss."""
+"""CPU renderer, which renders states, compares them with training images and backpropagates image and mask losses."""
 
 from __future__ import annotations
 
@@ -21,26 +21,28 @@ Array = NDArray[np.float32]
 Moments = tuple[Array, Array]
 
 _moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
-"""SSIM moments (windowed means of the target and of its square) per view, computed once and shared by renderers."""
+"""SSIM moments of each view (windowed means of the target and of its square), computed once for all renderers."""
 
 
 def no_lap(stage: str) -> None:
-    """Ignores the end of a stage."""
+    """Does nothing at the end of a stage; used as the default ``lap`` callback."""
 
 
 class CpuRenderer:
-    """Renders states of a scene (the ``Renderer`` of the CPU) and computes the picture loss of the iterations.
+    """The CPU implementation of ``Renderer``, which also computes the image and mask losses of iterations.
 
     Args:
-        background: RGB behind all Gaussians.
-        image_weight, mask_weight: weights of the two loss terms.
-        mask_moves: whether the mask loss affects positions and shapes, or only the labels. Masks have hard edges, so a
-            silhouette fitted to them differs from the one that fits the pictures.
-        limits: constants of the rasterizer.
+        background: background colour, RGB in 0…1.
+        image_weight, mask_weight: weights of the image and mask losses.
+        mask_moves: whether the mask loss affects positions and shapes, or only the labels. Masks have hard edges, so
+            silhouettes fitted to masks differ from silhouettes fitted to images.
+        limits: rasterizer constants.
 
     Attributes:
-        image_part, mask_part, psnr: weighted losses and PSNR (dB) of the last comparison.
-        exposure_gradient: [C, 2] gradient of its loss with respect to the camera's gain and offset.
+        rasterizer: rasterizer, with the results of the last rendering.
+        image_part, mask_part: weighted image and mask losses of the last comparison.
+        psnr: PSNR of the last comparison, in dB.
+        exposure_gradient: [C, 2] gradient of the last loss with respect to the camera's gain and offset.
     """
 
     def __init__(
@@ -62,12 +64,12 @@ class CpuRenderer:
         self.psnr = 0.0
 
     def with_new_buffers(self, mask_weight: float) -> CpuRenderer:
-        """Returns a full-picture renderer with the same background and limits; its mask loss affects only labels."""
+        """Returns a full-image renderer with the same background and limits, whose mask loss only affects labels."""
         red, green, blue, _ = self._background.tolist()
         limits = Limits(*self.rasterizer.limits.tolist())
         return CpuRenderer((red, green, blue), 1.0, mask_weight, mask_weight == 0, limits)
 
-    # The ``Renderer`` interface, for states.
+    # Implementation of ``Renderer``, for rendering states.
 
     def render(
         self,
@@ -121,10 +123,10 @@ class CpuRenderer:
         )
         return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
 
-    # The loss of an iteration, for arrays that change in place.
+    # Losses of iterations, for arrays that are updated in place.
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame; this class does not need it."""
+        """Loads the initial state of a frame. This base class does nothing; subclasses may use the state."""
 
     def forward_backward(
         self,
@@ -135,13 +137,17 @@ class CpuRenderer:
         view: TrainingView,
         lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
-        """Renders the view, sets ``image_part``, ``mask_part`` and ``psnr`` (dB), and returns the gradients.
+        """Renders a view, sets ``image_part``, ``mask_part`` and ``psnr``, and returns the gradients.
 
         The gradients are buffers that stay valid until the next call.
 
         Args:
-            means, factors, opacities, features: [N, 3], [N, 3, 3], [N], [N, 4] (RGB, label), float32.
-            lap: callback at the end of each stage.
+            means: [N, 3] float32 means, in metres.
+            factors: [N, 3, 3] float32 covariance factors.
+            opacities: [N] float32 opacities.
+            features: [N, 4] float32 features (RGB, label).
+            view: view to render and compare.
+            lap: callback that is called with the name of each stage when it ends.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         lap("render")
@@ -153,20 +159,20 @@ class CpuRenderer:
         return gradients
 
     def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """Renders the view and sets ``image_part``, ``mask_part`` and ``psnr``, without gradients.
+        """Renders a view and sets ``image_part``, ``mask_part`` and ``psnr``, without computing gradients.
 
-        See ``forward_backward``.
+        See ``forward_backward`` for the arguments.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         g_image, _ = self.rasterizer.gradient_buffers()
         self._compare(view, g_image)
 
     def shown(self, view: TrainingView) -> Picture:
-        """Returns the view's full picture as last rendered by ``forward_backward``; valid until the next rendering."""
+        """Returns the full image of the view last passed to ``forward_backward``; valid until the next rendering."""
         return self.rasterizer.picture
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        """Returns the mean of the view's picture minus that of its last rendering, with exposure, RGB in 0…1."""
+        """Returns the mean of the view's image minus that of its last rendering with exposure, RGB in 0…1."""
         height, width = view.camera.height, view.camera.width
         rendered = means(self.rasterizer.planes[:3, :height, :width])
         shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
@@ -174,7 +180,7 @@ class CpuRenderer:
         return red, green, blue
 
     def _compare(self, view: TrainingView, g_image: Array) -> None:
-        """Sets the losses of the last rendering and fills its gradient."""
+        """Computes the losses of the last rendering, and fills ``g_image`` with their gradient."""
         channels, height, width = view.target.shape
         rows = np.empty((channels, height, 2), np.float32)
         g_exposure = np.empty((channels, height, 2), np.float32)
@@ -190,7 +196,7 @@ class CpuRenderer:
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
 
     def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
-        """Returns the sums of ``residuals`` over the last rendering."""
+        """Computes the sums of ``residuals`` for the last rendering."""
         height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
@@ -201,7 +207,7 @@ class CpuRenderer:
         return sums[:, :3].copy(), sums[:, LABEL].copy()
 
     def _moments(self, view: TrainingView) -> Moments:
-        """Returns the two SSIM moments [C, H, W] of a view: windowed means of the target and of its square."""
+        """Returns the SSIM moments of a view: windowed means of the target and of its square, [C, H, W] each."""
         moments = _moments.get(view)
         if moments is None:
             moments = np.empty_like(view.target), np.empty_like(view.target)
@@ -210,7 +216,7 @@ class CpuRenderer:
         return moments
 
     def _scratch_of(self, channels: int, height: int, width: int) -> Array:
-        """Returns the zero-bordered scratch buffer of the image loss, one per picture size."""
+        """Returns the zero-padded scratch buffer of the image loss for an image size."""
         key = (channels, height, width)
         if key not in self._scratch:
             padded = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
@@ -219,14 +225,14 @@ class CpuRenderer:
 
 
 def forget_moments(view: TrainingView) -> None:
-    """Drops the cached moments of a view, when its renderer has copied the part that it needs."""
+    """Drops the cached moments of a view, once its renderer has copied the part that it needs."""
     _moments.pop(view, None)
 
 
 def blocks_of(
     rasterizer: CpuRasterizer, means: Array, factors: Array, opacities: Array, features: Array, camera: CameraArrays
 ) -> NDArray[np.uint64]:
-    """Returns the [tiles] block masks of a picture that the supports of Gaussians intersect."""
+    """Returns the bitmask [tiles] of the image blocks that the supports of the Gaussians intersect."""
     splats, rects, _ = rasterizer.project(means, factors, opacities, features, camera)
     tiles_x, tiles_y = tile_grid(camera)
     marks = np.zeros(tiles_x * tiles_y, np.uint64)

@@ -1,8 +1,8 @@
-"""Deformation of one frame in plain PyTorch: cluster map, its Jacobian, cascade, and per-Gaussian deltas.
+"""Deformation of one frame in plain PyTorch: cluster map with Jacobian, cascade, and per-Gaussian deltas.
 
 Equation numbers refer to the SCas4D paper: (5) transport of a Gaussian, (6) cluster map, (7) cascade. All functions
-are vectorized and differentiable, and keep dtype and device of their inputs. In float64 they are the reference for
-the kernels of other engines. Quaternions are (w, x, y, z). Lengths are in metres in the internal world.
+are vectorized and differentiable, and preserve the dtype and device of their inputs. In float64, they are the reference
+for the kernels of other engines. Quaternions are (w, x, y, z). Lengths are in metres in internal world coordinates.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from torch import Tensor
 from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
 
 LARGEST = EXPONENT / log2(e)
-"""Upper bound of an exponential's argument."""
+"""Bound on the magnitude of exponents."""
 
 ClusterMap = Literal["centred", "published"]
-"""Variant of equation (6): scaling about the cluster's pivot, or about the world origin as published."""
+"""Variant of equation (6): scaling about the cluster's pivot ("centred"), or about the world origin ("published")."""
 
 Covariance = Literal["entangled", "separate"]
-"""How a Gaussian's covariance is deformed, besides its own ΔR and Δs.
+"""How a Gaussian's covariance is deformed, apart from its own ΔR and Δs.
 
-"entangled", equation (5): by the Jacobian of the map that moves its mean. "separate": not at all, as in the paper's
-ablation, which learns the covariance independently of the positions. The Gaussians of a rotating wheel then keep
+"entangled" uses the Jacobian of the map that moves the mean, as in equation (5). "separate" does not deform it, as in
+the paper's ablation, which learns covariances independently of positions. The Gaussians of a rotating wheel then keep
 their orientation, unless ΔR rotates them. Means and rotations are the same in both variants.
 """
 
 
 class ClusterParams(NamedTuple):
-    """Learned parameters of the K clusters of one layer, in the paper's symbols; all zeros is the centred identity.
+    """Learned parameters of the K clusters of one layer, in the paper's notation. All zeros is the centred identity.
 
     Attributes:
         r: [K, 3] rotation, as the quaternion (1, r)/|(1, r)|.
-        t: [K, 3] metres, displacement relative to the pivot (the paper's t_j is pivot + t).
-        c: [K, 3] per metre, gradient of the scaling argument.
+        t: [K, 3] translation of the pivot in metres (t_j in the paper is pivot + t).
+        c: [K, 3] gradient of the scaling argument, per metre.
         s: [K] scaling argument at the pivot.
     """
 
@@ -50,25 +50,30 @@ class ClusterParams(NamedTuple):
     def identity(
         cls, count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ClusterParams:
-        """Returns zeros for ``count`` clusters."""
+        """Returns all-zero parameters for ``count`` clusters."""
         zeros = torch.zeros(count, 10, dtype=dtype, device=device)
         return cls(zeros[:, :3].clone(), zeros[:, 3:6].clone(), zeros[:, 6:9].clone(), zeros[:, 9].clone())
 
 
 class Layer(NamedTuple):
-    """One layer of the hierarchy: the cluster of each of the M points ([M] int64), and the cluster parameters."""
+    """One layer of the hierarchy.
+
+    Attributes:
+        labels: [M] int64 cluster of each point.
+        params: parameters of the clusters.
+    """
 
     labels: Tensor
     params: ClusterParams
 
 
 class Deltas(NamedTuple):
-    """Per-Gaussian deltas applied after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
+    """Per-Gaussian deltas applied after the cascade (Δp, ΔR, Δs in the paper). All zeros is the identity.
 
     Attributes:
-        dp: [M, 3] metres, added to the mean.
+        dp: [M, 3] offset added to the mean, in metres.
         dr: [M, 3] rotation, as the quaternion (1, dr)/|(1, dr)|.
-        ds: [M, 3] natural logarithm of the scaling of each transported axis.
+        ds: [M, 3] natural logarithm of the scale factor of each transported axis.
     """
 
     dp: Tensor
@@ -77,18 +82,18 @@ class Deltas(NamedTuple):
 
     @classmethod
     def identity(cls, count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Deltas:
-        """Returns zeros for ``count`` Gaussians."""
+        """Returns all-zero deltas for ``count`` Gaussians."""
         zeros = torch.zeros(3, count, 3, dtype=dtype, device=device)
         return cls(zeros[0].clone(), zeros[1].clone(), zeros[2].clone())
 
 
 class Transported(NamedTuple):
-    """Points after a map, with the map's Jacobian and rotation at each point.
+    """Points transformed by a map, with the map's Jacobian and rotation at each point.
 
     Attributes:
-        points: [M, 3] metres.
-        jacobians: [M, 3, 3] of the map at each point.
-        rotations: [M, 4] unit quaternions: polar rotations of the Jacobians; for several layers, their product.
+        points: [M, 3] transformed points, in metres.
+        jacobians: [M, 3, 3] Jacobian of the map at each point.
+        rotations: [M, 4] polar rotations of the Jacobians as unit quaternions, multiplied over layers.
     """
 
     points: Tensor
@@ -97,12 +102,12 @@ class Transported(NamedTuple):
 
 
 class Deformed(NamedTuple):
-    """Gaussians after one frame's deformation.
+    """Gaussians after the deformation of one frame.
 
     Attributes:
-        means: [M, 3] metres.
-        factors: [M, 3, 3]; Σ = F Fᵀ.
-        turns: [M, 4] unit quaternions with w ≥ 0: rotation of this frame relative to the previous one.
+        means: [M, 3] means, in metres.
+        factors: [M, 3, 3] covariance factors F, with Σ = F Fᵀ.
+        turns: [M, 4] rotations since the previous frame, as unit quaternions with w ≥ 0.
     """
 
     means: Tensor
@@ -143,7 +148,7 @@ def quaternion_matrices(q: Tensor) -> Tensor:
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the Hamilton product [..., 4] of quaternions, i.e. rotation b followed by rotation a.
+    """Returns the Hamilton product a∘b [..., 4] of quaternions, i.e. rotation b followed by rotation a.
 
     >>> about_x, about_z = torch.tensor([0.0, 1, 0, 0]), torch.tensor([0.0, 0, 0, 1])  # half turns
     >>> quaternion_product(about_z, about_x)  # a half turn about y
@@ -159,7 +164,7 @@ def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
 def scaling_factor(z: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the factor f of equation (6) and its derivative df/dz, for z of any shape.
 
-    f = 2σ(2z) equals the paper's tanh(z) + 1 without cancellation, which makes the latter 0 below about −9 in float32.
+    f = 2σ(2z) equals tanh(z) + 1 in the paper, but avoids cancellation: in float32, tanh(z) + 1 is 0 below about −9.
 
     >>> scaling_factor(torch.zeros(1))
     (tensor([1.]), tensor([1.]))
@@ -171,14 +176,14 @@ def scaling_factor(z: Tensor) -> tuple[Tensor, Tensor]:
 def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
     """Returns the polar rotation of f·I + f(2−f)·y·cᵀ as unit quaternions [M, 4], in closed form.
 
-    The matrix acts in the plane of y and c, so its rotation is the two-dimensional polar rotation in that plane. With C
-    the trace and S the skew part in the plane, the quaternion is proportional to (|(C, S)| + C, S). The common factor f
-    is omitted, so the result stays accurate for f near 0.
+    Orthogonal to y and c, the matrix only scales by f, so its polar rotation is a 2D rotation in the plane of y and c.
+    With C the trace and S the skew part in the plane, the quaternion is proportional to (|(C, S)| + C, S). The common
+    factor f is omitted, so the result stays accurate for f near 0.
 
     Args:
         f: [M] scaling factors in (0, 2).
-        y: [M, 3] metres.
-        c: [M, 3] per metre.
+        y: [M, 3] vectors y, in metres.
+        c: [M, 3] gradients of the scaling argument, per metre.
 
     >>> one = torch.ones(1)
     >>> polar_rotation(one, torch.tensor([[1.0, 0, 0]]), torch.tensor([[2.0, 0, 0]]))  # a stretch turns nothing
@@ -188,12 +193,12 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
     cosine = 2 + g * (c * y).sum(-1, keepdim=True)
     sine = g * torch.linalg.cross(c, y)
     radius: Tensor = torch.linalg.vector_norm(torch.cat([cosine, sine], dim=-1), dim=-1, keepdim=True)
-    # A half turn (cosine < 0, sine = 0) requires a map that folds space; it is treated as no rotation to avoid NaN.
+    # A half turn (cosine < 0, sine = 0) only occurs if the map folds space; it is treated as no rotation to avoid NaN.
     return _normalized(torch.cat([(radius + cosine).clamp_min(HALF_TURN), sine], dim=-1))
 
 
 def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Returns the mean position [count, 3] of each cluster, without gradient; 0 for empty clusters.
+    """Returns the mean position [count, 3] of each cluster, detached from the graph; 0 for empty clusters.
 
     >>> cluster_pivots(torch.tensor([[0.0, 0, 0], [2, 0, 0], [5, 5, 5]]), torch.tensor([0, 0, 1]), 2)
     tensor([[1., 0., 0.],
@@ -208,17 +213,17 @@ def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
 def cluster_map(
     points: Tensor, pivots: Tensor, labels: Tensor, params: ClusterParams, kind: ClusterMap = "centred"
 ) -> Transported:
-    """Applies equation (6) to every point, with the map's Jacobian and its polar rotation.
+    """Applies equation (6) to every point, and computes the map's Jacobian and its polar rotation.
 
     With d = x − p, z = c·d + s, f = 2σ(2z), f' = f(2−f):
     centred x' = p + t + f·R d; published x' = (R d + p + t)·f. Both have J = R (f·I + f'·y·cᵀ), with y = d when centred
     and y = Rᵀ(R d + p + t) as published. The published map scales about the world origin and is therefore not
-    translation-equivariant. Both agree for c = s = 0. If all parameters are 0, points keep their exact bits.
+    translation-equivariant. Both agree for c = s = 0. If all parameters are 0, points are preserved bit for bit.
 
     Args:
-        points: [M, 3] metres.
-        pivots: [K, 3] metres.
-        labels: [M] int64 in 0…K−1.
+        points: [M, 3] points, in metres.
+        pivots: [K, 3] pivot of each cluster, in metres.
+        labels: [M] int64 cluster of each point, in 0…K−1.
         params: parameters of the K clusters.
         kind: variant of the map.
 
@@ -237,7 +242,7 @@ def cluster_map(
     rotation = quaternion_matrices(q)[labels]
     offset = points - pivot
     f, df = scaling_factor((c * offset).sum(-1) + params.s[labels])
-    # Points are updated by their displacement, which is exactly 0 if all parameters are 0.
+    # Points are updated by adding a displacement, which is exactly 0 if all parameters are 0.
     unit = torch.eye(3, dtype=points.dtype, device=points.device)
     step = ((rotation - unit) @ offset[..., None])[..., 0]
     placed = points + (t + step)
@@ -248,24 +253,24 @@ def cluster_map(
         moved = placed + (f - 1)[:, None] * placed
         y = (rotation.mT @ placed[..., None])[..., 0]
     else:
-        raise ValueError(f"cluster map {kind!r} is unknown; give 'centred' or 'published'")
+        raise ValueError(f"unknown cluster map {kind!r}; choose 'centred' or 'published'")
     inner = f[:, None, None] * unit
     inner = inner + df[:, None, None] * y[:, :, None] * c[:, None, :]
     return Transported(moved, rotation @ inner, quaternion_product(q[labels], polar_rotation(f, y, c)))
 
 
 def cascade(points: Tensor, layers: Sequence[Layer], kind: ClusterMap = "centred") -> Transported:
-    """Evaluates equation (7), the nested maps x → φ_K(… φ_2(φ_1(x))), coarsest layer first.
+    """Evaluates equation (7), the nested maps x → φ_K(… φ_2(φ_1(x))), starting with the coarsest layer.
 
-    A layer's pivots are the means of its clusters' points after the coarser layers, without gradient.
+    The pivot of a cluster is the mean of its points after the coarser layers, detached from the graph.
 
     Args:
-        points: [M, 3] metres.
-        layers: coarse to fine; an empty sequence is the identity.
+        points: [M, 3] points, in metres.
+        layers: layers, coarse to fine. An empty sequence is the identity.
         kind: variant of the cluster map.
 
     Returns:
-        The moved points, Jacobians J_K … J_2 J_1, and rotations Q_K ∘ … ∘ Q_1.
+        Transformed points, Jacobians J_K … J_2 J_1, and rotations Q_K ∘ … ∘ Q_1.
 
     >>> points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
     >>> coarse, fine = ClusterParams.identity(1, torch.float32), ClusterParams.identity(2, torch.float32)
@@ -295,20 +300,21 @@ def deform(
     kind: ClusterMap = "centred",
     covariance: Covariance = "entangled",
 ) -> Deformed:
-    """Applies equation (5) to factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
+    """Deforms Gaussians by equation (5), applied to factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
 
     mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. If the deltas are 0,
     Σ = F Fᵀ is J Σ_previous Jᵀ. With separate covariance, J is omitted.
 
     Args:
-        means: [M, 3] metres, in the previous frame.
-        factors: [M, 3, 3] in the previous frame.
-        layers: coarse to fine.
+        means: [M, 3] means in the previous frame, in metres.
+        factors: [M, 3, 3] covariance factors in the previous frame.
+        layers: layers, coarse to fine.
         deltas: per-Gaussian deltas.
-        kind: variant of the cluster map. covariance: "separate" omits J from the factors.
+        kind: variant of the cluster map.
+        covariance: variant of the covariance; "separate" omits J from the factors.
 
     Raises:
-        ValueError: if the variant is unknown.
+        ValueError: if a variant is unknown.
 
     >>> means, factors = torch.zeros(1, 3), 0.1 * torch.eye(3)[None]
     >>> deltas = Deltas.identity(1, torch.float32)
@@ -319,7 +325,7 @@ def deform(
     """
     points, jacobians, rotations = cascade(means, layers, kind)
     if covariance not in ("entangled", "separate"):
-        raise ValueError(f"covariance {covariance!r} is unknown; give 'entangled' or 'separate'")
+        raise ValueError(f"unknown covariance {covariance!r}; choose 'entangled' or 'separate'")
     dq = rotation_quaternions(deltas.dr)
     carried = quaternion_matrices(dq)
     if covariance == "entangled":
@@ -331,7 +337,7 @@ def deform(
 
 
 def material_rotations(turns: Tensor, previous: Tensor) -> Tensor:
-    """Returns rotations since frame 0, [M, 4] unit quaternions: previous rotations followed by this frame's turns.
+    """Returns the rotations since frame 0 [M, 4], i.e. previous rotations followed by the rotations of this frame.
 
     >>> quarter = torch.tensor([[0.5, 0, 0, 0.5]]) * 2**0.5
     >>> material_rotations(quarter, previous=quarter)

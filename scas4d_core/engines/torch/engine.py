@@ -1,4 +1,4 @@
-"""Reference engine: one iteration of an update in PyTorch, in the order of algorithm 1."""
+"""Reference engine for updates in PyTorch, which runs each iteration in the order of algorithm 1."""
 
 from __future__ import annotations
 
@@ -19,7 +19,15 @@ from scas4d_core.engines.cpu.gloss import (
     UPDATE_RATE_NEARNESS,
     gloss_rate,
 )
-from scas4d_core.engines.engine import AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
+from scas4d_core.engines.engine import (
+    GAINS_MISSING,
+    AttemptStart,
+    IterationLog,
+    StepScalars,
+    Tables,
+    Thinned,
+    ViewRecord,
+)
 from scas4d_core.engines.gains import GainEstimator
 from scas4d_core.engines.plan import MAX_SCALE, Structure, UpdatePlan
 from scas4d_core.engines.torch import losses
@@ -36,17 +44,18 @@ Array = NDArray[np.float32]
 
 
 class TorchEngine:
-    """The ``UpdateEngine`` used as reference in tests; it supports every effect, in float64 with autograd.
+    """The reference ``UpdateEngine`` for tests. It supports every effect and uses autograd in float64.
 
     Attributes:
-        renderer: renderer of states with the background and limits of the plan.
+        name: name of the engine, used in messages.
+        renderer: renderer for states, with the background and limits of the plan.
     """
 
     name = "torch"
     renderer: TorchRenderer
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """See ``UpdateEngine.bind``; this engine supports all options of a plan."""
+        """See ``UpdateEngine.bind``. This engine supports all plans."""
         self._plan, self._structure = plan, structure
         self.renderer = TorchRenderer(plan.background, plan.limits)
         self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
@@ -103,7 +112,7 @@ class TorchEngine:
         self._log.losses.append(float(loss.detach()))
 
     def _picture(self, index: int, moved: Moved, colours: Tensor, step: StepScalars) -> Tensor:
-        """Returns the image and mask loss of a view, and logs the result."""
+        """Renders a view, logs the result, and returns the sum of image and mask loss."""
         view, plan, learnt = self._views[index], self._plan, self._parameters.gloss
         gloss, environment = (None, None) if learnt is None else (learnt.gloss, learnt.environment)
         features = self._scene.seen(moved, colours, gloss, environment, view.camera)
@@ -126,7 +135,7 @@ class TorchEngine:
         return loss
 
     def _rendered(self, view: TrainingView, moved: Moved, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the rendering [H, W, 4] of a view without exposure, and its alpha [H, W]."""
+        """Returns the rendering [H, W, 4] of a view before exposure, and its alpha [H, W]."""
         background = leaf([*self._plan.background, 0.0])
         camera = CameraParams.of_arrays(view.camera)
         given = (moved.means, moved.factors, self._scene.opacities, features, camera, background, self._plan.limits)
@@ -134,10 +143,10 @@ class TorchEngine:
         return picture.features, picture.alpha
 
     def _terms(self, moved: Moved, colours: Tensor, step: StepScalars) -> Tensor:
-        """Returns the weighted terms other than picture losses."""
+        """Returns the weighted sum of all loss terms other than image and mask loss."""
         plan, scene = self._plan, self._scene
         sound = scene.rows[scene.sound]
-        share = len(sound) / max(len(scene.rows), 1)  # averages are over all moving Gaussians
+        share = len(sound) / max(len(scene.rows), 1)  # losses are averaged over all moving Gaussians
         terms = [torch.zeros((), dtype=torch.float64)]
         if plan.neighbour_terms and self._structure.neighbours is not None and len(sound):
             terms += self._neighbour_terms(moved, step)
@@ -152,7 +161,7 @@ class TorchEngine:
 
     def _neighbour_terms(self, moved: Moved, step: StepScalars) -> list[Tensor]:
         plan, scene = self._plan, self._scene
-        middle = scene.means[scene.rows[scene.sound]].mean(dim=0)  # for positions that are not finite, at weight 0
+        middle = scene.means[scene.rows[scene.sound]].mean(dim=0)  # replaces non-finite positions, which have weight 0
         now, before = (
             torch.where(scene.sound[:, None], means[scene.rows], middle) for means in (moved.means, scene.means)
         )
@@ -168,7 +177,7 @@ class TorchEngine:
 
     @torch.no_grad()
     def _settle_gloss(self, step: StepScalars) -> None:
-        """Makes the environment sum to zero, clamps its nearness to ≥ 0, and smooths changes of the gloss."""
+        """Makes the environment sum to zero, clamps its nearness to ≥ 0, and smooths the gloss if requested."""
         learnt = self._parameters.gloss
         if learnt is None:
             return
@@ -181,7 +190,7 @@ class TorchEngine:
             learnt.gloss.copy_(before + (weights[..., None] * (learnt.gloss - before)[index]).sum(dim=1))
 
     def _neighbours_on_surface(self, gloss: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the [M, k] neighbours in frame 0 and weights that are equal for neighbours on the same surface."""
+        """Returns the neighbours [M, k] in frame 0, with equal weights for those on the same surface, otherwise 0."""
         if self._smoothing is None:
             count = len(gloss)
             roots = self._structure.roots[:count]
@@ -198,7 +207,7 @@ class TorchEngine:
             self._gains.leave_out([self._views[index] for index in views])
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``; does nothing, because the host does the work itself."""
+        """See ``UpdateEngine.wait``. This method does nothing, because the host itself is the device."""
 
     @torch.no_grad()
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
@@ -243,12 +252,12 @@ class TorchEngine:
     def gains(self) -> Array:
         """See ``UpdateEngine.gains``."""
         if self._gains is None:
-            raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
+            raise ValueError(GAINS_MISSING)
         self._gains.finish_round()
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
-        """See ``UpdateEngine.gradients``; returned in float64."""
+        """See ``UpdateEngine.gradients``. The gradients are float64."""
         tables = tables_of_gradients(self._gradients, self._scene, len(self._parameters.clusters))
         if self._plan.colours is None:
             del tables["colours"]
@@ -267,7 +276,7 @@ class TorchEngine:
 
 
 def tables_of_gradients(named: Mapping[str, Array], scene: Scene, layers: int) -> dict[str, Array]:
-    """Returns gradients by table, with the columns of ``Tables``, plus "colours", "gloss" and "environment"."""
+    """Groups parameter gradients into tables with the columns of ``Tables``, plus colours, gloss and environment."""
     tables = {
         f"cluster {k}": np.concatenate(
             [named[f"{k}.{name}"].reshape(-1, 1 if name == "s" else 3) for name in "rtcs"], axis=1

@@ -1,4 +1,4 @@
-"""View-dependent colours of Gaussians in plain PyTorch (kernel: ``kernels.appearance.direction``)."""
+"""View-dependent colours in plain PyTorch, the reference for ``kernels.appearance.direction``."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ def no_turns(count: int) -> Tensor:
 def colours_seen(
     means: Tensor, turns: Tensor, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, centre: Tensor
 ) -> Tensor:
-    """Returns colours [N, 3] as seen by a camera at ``centre`` [3]; the given colours if nothing is glossy.
+    """Returns the colours [N, 3] as seen by a camera at ``centre`` [3], or ``colours`` if there is no gloss.
+
+    See ``shade`` for the other arguments.
 
     Args:
-        gloss: [M, 3] for the first M Gaussians; the others have none. See ``shade`` for the other arguments.
+        gloss: [M, 3] gloss of the first M Gaussians; the others are not glossy. None if no Gaussian is glossy.
     """
     if gloss is None or environment is None:
         return colours
@@ -31,20 +33,20 @@ def colours_seen(
 
 
 def cell_shares() -> Tensor:
-    """Returns the share of the sphere that each cell of the octahedral map covers, [CELLS]; sums to 1."""
+    """Returns the fraction of the sphere that each cell of the octahedral map covers, [CELLS]; they sum to 1."""
     line = torch.linspace(-1, 1, SIDE, dtype=torch.float64)
     v, u = torch.meshgrid(line, line, indexing="ij")
     z = 1 - u.abs() - v.abs()
     x = torch.where(z < 0, (1 - v.abs()) * u.sign(), u)
     y = torch.where(z < 0, (1 - u.abs()) * v.sign(), v)
     area = (x * x + y * y + z * z) ** -1.5  # solid angle per map area
-    area[[0, -1]] /= 2  # rim rows cover half cells
+    area[[0, -1]] /= 2  # cells on the border are cut in half
     area[:, [0, -1]] /= 2
     return (area / area.sum()).flatten()
 
 
 def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environment: Tensor, centre: Tensor) -> Tensor:
-    """Returns the shaded colours [N, 3]; same arguments as the kernel, with gloss for every Gaussian."""
+    """Returns the shaded colours [N, 3]. The arguments are those of the kernel, but with gloss for every Gaussian."""
     strength = gloss.norm(dim=1, keepdim=True)
     glossy = strength[:, 0] > float(DULL)
     strength = torch.where(glossy[:, None], strength, torch.ones_like(strength))
@@ -61,7 +63,7 @@ def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environm
 
 
 def looked_up(cells: Tensor, directions: Tensor) -> Tensor:
-    """Samples a grid [CELLS, 3] at directions [N, 3] of any length, bilinearly in the octahedral map."""
+    """Samples an octahedral map [CELLS, 3] bilinearly at directions [N, 3], which need not be normalized."""
     across = directions / directions.abs().sum(dim=1, keepdim=True)
     x, y = across[:, 0], across[:, 1]
     signs_x, signs_y = torch.where(x >= 0, 1.0, -1.0), torch.where(y >= 0, 1.0, -1.0)

@@ -1,7 +1,7 @@
-"""Losses of an update in plain PyTorch, the reference for the kernels of other engines.
+"""Loss terms of an update in plain PyTorch, the reference for the kernels of other engines.
 
-Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, the source of the local
-rigidity, isometry and rotation terms. Every function returns an unweighted scalar in the dtype of its inputs.
+The losses follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, which introduced the local
+rigidity, isometry and rotation terms. Each loss function returns an unweighted scalar in the dtype of its inputs.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.guards import ROOT_FLOOR, SMALLEST_SQUARE, SSIM_C1, SSIM_C2
 
 SSIM_WINDOW = 11
-"""Size of the Gaussian window in pixels (Wang et al. 2004)."""
+"""Side length of the Gaussian window in pixels (Wang et al. 2004)."""
 SSIM_SIGMA = 1.5
 """Standard deviation of the window in pixels."""
 SSIM_SHARE = 0.2
-"""Weight of 1 − SSIM in the image loss; L1 has the remaining weight (Kerbl et al. 2023)."""
+"""Weight of 1 − SSIM in the image loss; the L1 term has the remaining weight (Kerbl et al. 2023)."""
 
 
 @functools.cache
@@ -33,7 +33,7 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _blurred(pictures: Tensor) -> Tensor:
-    """Filters pictures [B, 1, H, W] with the SSIM window, with zero padding at the border."""
+    """Filters images [B, 1, H, W] with the SSIM window, with zero padding."""
     window = _window(pictures.dtype, pictures.device)
     half = SSIM_WINDOW // 2
     across = functional.conv2d(pictures, window.view(1, 1, 1, -1), padding=(0, half))
@@ -41,7 +41,7 @@ def _blurred(pictures: Tensor) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Returns the SSIM of every pixel and channel of two pictures [H, W, C] in 0…1, with zero padding at the border.
+    """Returns the SSIM of two images [H, W, C] in 0…1 for every pixel and channel, with zero padding.
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> similarity = ssim_map(picture, picture)
@@ -60,11 +60,11 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 
 def image_loss(image: Tensor, target: Tensor) -> Tensor:
-    """Returns 0.8·mean|I − Î| + 0.2·(1 − mean SSIM) over pixels and channels.
+    """Returns 0.8·mean|I − Î| + 0.2·(1 − mean SSIM), averaged over pixels and channels.
 
     Args:
-        image: [H, W, C] rendered picture; a mask is a picture with one channel.
-        target: [H, W, C] observed picture, 0…1.
+        image: [H, W, C] rendered image; a mask is an image with one channel.
+        target: [H, W, C] target image, in 0…1.
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> abs(float(image_loss(picture, picture))) < 1e-12
@@ -75,7 +75,7 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Returns the peak signal-to-noise ratio, in dB, of two pictures [H, W, C] in 0…1.
+    """Returns the peak signal-to-noise ratio of two images [H, W, C] in 0…1, in dB.
 
     >>> truth = torch.zeros(8, 8, 3, dtype=torch.float64)
     >>> round(float(psnr(truth + 0.1, truth)), 6)
@@ -86,7 +86,7 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
 
 def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns rows [m], their neighbours [m, k] and weights [m, k]; all rows if ``rows`` is None."""
+    """Returns the rows [m] with their neighbours [m, k] and weights [m, k]. If ``rows`` is None, uses all rows."""
     if rows is None:
         return torch.arange(len(neighbours), device=neighbours.device), neighbours, weights
     return rows, neighbours[rows], weights[rows]
@@ -95,15 +95,15 @@ def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Te
 def rigidity_loss(
     means: Tensor, turns: Tensor, previous: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None
 ) -> Tensor:
-    """Returns the mean over pairs of sqrt(w·|R_iᵀ(μ_j − μ_i) − (μ_j − μ_i)_previous|² + 1e-20), metres.
+    """Returns the mean over pairs of sqrt(w·|R_iᵀ(μ_j − μ_i) − (μ_j − μ_i)_previous|² + 1e-20), in metres.
 
     Args:
-        means: [M, 3] metres, in this frame.
-        turns: [M, 4] unit quaternions, rotation since the previous frame.
-        previous: [M, 3] metres, means in the previous frame.
-        neighbours: [M, k] int64 rows.
-        weights: [M, k].
-        rows: [m] int64, the indices i to sum over; None for all.
+        means: [M, 3] means in this frame, in metres.
+        turns: [M, 4] rotations since the previous frame, as unit quaternions.
+        previous: [M, 3] means in the previous frame, in metres.
+        neighbours: [M, k] int64 rows of the neighbours of each Gaussian.
+        weights: [M, k] weights of the pairs.
+        rows: [m] int64 rows i to average over, or None for all.
 
     >>> previous = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
     >>> still = torch.tensor([[1.0, 0, 0, 0]] * 2)
@@ -123,14 +123,14 @@ def rigidity_loss(
 def isometry_loss(
     means: Tensor, distances: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None
 ) -> Tensor:
-    """Returns the mean over pairs of sqrt(w·(|μ_j − μ_i| − d_0)² + 1e-20), metres.
+    """Returns the mean over pairs of sqrt(w·(|μ_j − μ_i| − d_0)² + 1e-20), in metres.
 
     Args:
-        means: [M, 3] metres, in this frame.
-        distances: [M, k] metres, d_0: distances of the pairs when the graph was built.
-        neighbours: [M, k] int64 rows.
-        weights: [M, k].
-        rows: [m] int64, the indices i to sum over; None for all.
+        means: [M, 3] means in this frame, in metres.
+        distances: [M, k] distances d_0 of the pairs when the graph was built, in metres.
+        neighbours: [M, k] int64 rows of the neighbours of each Gaussian.
+        weights: [M, k] weights of the pairs.
+        rows: [m] int64 rows i to average over, or None for all.
 
     >>> neighbours, weights = torch.tensor([[1], [0]]), torch.ones(2, 1)
     >>> means = torch.tensor([[0.0, 0, 0], [0, 1.5, 0]])
@@ -147,10 +147,10 @@ def rotation_loss(turns: Tensor, neighbours: Tensor, weights: Tensor, rows: Tens
     """Returns the mean over pairs of sqrt(w·|q_j − q_i|² + 1e-20) for the rotations since the previous frame.
 
     Args:
-        turns: [M, 4] unit quaternions with w ≥ 0.
-        neighbours: [M, k] int64 rows.
-        weights: [M, k].
-        rows: [m] int64, the indices i to sum over; None for all.
+        turns: [M, 4] rotations since the previous frame, as unit quaternions with w ≥ 0.
+        neighbours: [M, k] int64 rows of the neighbours of each Gaussian.
+        weights: [M, k] weights of the pairs.
+        rows: [m] int64 rows i to average over, or None for all.
 
     >>> turns = torch.tensor([[1.0, 0, 0, 0], [0.6, 0.8, 0, 0]])
     >>> rotation_loss(turns, torch.tensor([[1], [0]]), torch.ones(2, 1))
@@ -161,21 +161,21 @@ def rotation_loss(turns: Tensor, neighbours: Tensor, weights: Tensor, rows: Tens
 
 
 def axis_lengths(factors: Tensor) -> Tensor:
-    """Returns the lengths [M, 3] in metres of the transported axes, the columns of the factors [M, 3, 3]."""
+    """Returns the lengths [M, 3] of the transported axes (the columns of the factors [M, 3, 3]), in metres."""
     lengths: Tensor = torch.linalg.vector_norm(factors, dim=-2)
     return lengths
 
 
 def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tensor:
-    """Returns the scale loss of equation (8) in metres, averaged over axes too.
+    """Returns the scale loss of equation (8) in metres, averaged over both Gaussians and axes.
 
-    It is the mean over Gaussians and axes of max(0, |column a of F| − max(max_scale, |column a of F at frame 0|)). In
-    contrast to the paper, an axis may always keep its length at frame 0.
+    It is the mean of max(0, |column a of F| − max(max_scale, |column a of F in frame 0|)) over Gaussians and axes a.
+    Unlike in the paper, an axis that keeps its frame-0 length is never penalized.
 
     Args:
-        factors: [M, 3, 3] of this frame.
-        first_lengths: [M, 3] metres, ``axis_lengths`` at frame 0.
-        max_scale: metres.
+        factors: [M, 3, 3] covariance factors in this frame.
+        first_lengths: [M, 3] axis lengths in frame 0 (see ``axis_lengths``), in metres.
+        max_scale: axis length up to which the loss is always 0, in metres.
 
     >>> factors = 0.5 * torch.eye(3)[None]
     >>> scale_loss(factors, first_lengths=torch.full((1, 3), 0.1), max_scale=0.02)
@@ -185,7 +185,9 @@ def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tens
 
 
 def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
-    """Returns the mean depth (metres) of ``means`` [M, 3] below the plane (a, b, c, d): a·x + b·y + c·z + d > 0.
+    """Returns the mean depth of ``means`` [M, 3] below a plane (a, b, c, d), i.e. where a·x + b·y + c·z + d > 0.
+
+    All lengths are in metres.
 
     >>> floor_loss(torch.tensor([[0.0, 1.5, 0], [0, 0, 0]]), plane=(0, 1, 0, -1))  # y points down, the floor is at 1
     tensor(0.2500)
@@ -194,7 +196,7 @@ def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
 
 
 def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:
-    """Returns the mean |colour − colour of the previous frame| over Gaussians and channels; both [N, 3].
+    """Returns the mean absolute colour change since the previous frame over Gaussians and channels; both are [N, 3].
 
     >>> soft_colour_loss(torch.full((4, 3), 0.5), torch.full((4, 3), 0.25))
     tensor(0.2500)

@@ -1,4 +1,4 @@
-"""Parameters of one attempt as leaf tensors, and Adam over the free ones (algorithm 1, last line)."""
+"""Parameters of one attempt as leaf tensors, with Adam optimizers for the free ones (algorithm 1, last line)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scas4d_core.engines.torch.deformation import ClusterParams, Deltas
 from scas4d_core.guards import ADAM_EPSILON
 
 GLOSS_BETAS = (0.9, 0.999)
-"""Adam decay rates of gloss and environment, in every update."""
+"""Adam decay rates of gloss and environment, which are the same in every update."""
 
 
 def leaf(values: object) -> Tensor:
-    """Returns a new float64 tensor with the values of an array or a tensor."""
+    """Copies an array or tensor to a new float64 leaf tensor."""
     return torch.as_tensor(values, dtype=torch.float64).detach().clone()
 
 
@@ -27,9 +27,11 @@ class GlossParameters:
     """Gloss and environment parameters; see ``kernels.appearance.direction``.
 
     Attributes:
-        gloss: [M, 3] normals times strengths. light: rows of the environment that contain light.
-        nearness: [1, 3] the environment's row of nearness; only the first number is used.
-        middle: [1, 3] metres; not learned. rates: Adam learning rates of gloss, light and nearness.
+        gloss: [M, 3] normal of each Gaussian, scaled by its gloss strength.
+        light: rows of the environment that contain light.
+        nearness: [1, 3] row of the environment that contains the nearness in its first column.
+        middle: [1, 3] row of the environment that contains the scene centre, in metres; not learned.
+        rates: Adam learning rates of gloss, light and nearness.
     """
 
     gloss: Tensor
@@ -40,17 +42,21 @@ class GlossParameters:
 
     @property
     def environment(self) -> Tensor:
-        """[ROWS, 3]: light, middle, nearness."""
+        """[ROWS, 3] environment: light, middle and nearness."""
         return torch.cat([self.light, self.middle, self.nearness])
 
 
 @dataclass(eq=False)
 class Parameters:
-    """All learnable parameters of an attempt; parameters that are not free are not updated.
+    """All learnable parameters of an attempt. Only free parameters are updated.
 
     Attributes:
-        clusters: r, t, c, s of equation (6) per layer, coarse to fine. deltas: Δp, ΔR, Δs of equation (7).
-        moving_colours, static_colours: [M, 3] and [N − M, 3] RGB. gloss: None: not learned.
+        clusters: parameters r, t, c, s of equation (6) for each layer, coarse to fine.
+        deltas: per-Gaussian deltas Δp, ΔR, Δs of equation (7).
+        moving_colours: [M, 3] RGB colours of the moving Gaussians.
+        static_colours: [N − M, 3] RGB colours of the static Gaussians.
+        gloss: gloss and environment, or None if they are not learned.
+        optimizers: optimizers of the free parameters.
     """
 
     clusters: list[ClusterParams]
@@ -61,11 +67,11 @@ class Parameters:
     optimizers: list[FreeParameter] = field(default_factory=list)
 
     def set_tables(self, tables: Tables) -> None:
-        """Sets the deformation from host tables."""
+        """Sets the deformation parameters from host tables."""
         self.clusters, self.deltas = deformation_of(tables)
 
     def tables(self) -> Tables:
-        """Returns the deformation as host tables."""
+        """Returns the deformation parameters as host tables."""
         clusters = [torch.cat([p.r, p.t, p.c, p.s[:, None]], dim=1) for p in self.clusters]
         return Tables(
             [values.detach().float().numpy() for values in clusters],
@@ -73,10 +79,11 @@ class Parameters:
         )
 
     def free(self, start: AttemptStart, learnt: ColourPlan | None) -> None:
-        """Creates an optimizer with zero moments for each parameter whose learning rate is positive.
+        """Creates an optimizer with zero moments for each parameter with a positive learning rate.
 
         Args:
-            learnt: the free colours; None: none.
+            start: settings of the attempt, with learning rates and Adam decay rates.
+            learnt: colours to learn, or None if no colours are learned.
         """
         betas = start.beta1, start.beta2
         self.optimizers = []
@@ -100,7 +107,7 @@ class Parameters:
                 self.optimizers.append(FreeParameter(tensor.requires_grad_(), rate, betas, stage))
 
     def step(self, step: StepScalars) -> None:
-        """Steps Adam for all free parameters, with the rate factors of an iteration."""
+        """Takes an Adam step for all free parameters, with the learning rate factors of an iteration."""
         factors = {f"layer {layer}": factor for layer, factor in enumerate(step.layers)}
         factors |= {"own": step.own, "colour": step.colour, "gloss": step.gloss}
         for parameter in self.optimizers:
@@ -108,10 +115,10 @@ class Parameters:
 
 
 class FreeParameter:
-    """A tensor and its Adam optimizer.
+    """A tensor with its Adam optimizer.
 
     Attributes:
-        stage: the factor of ``StepScalars`` that scales its rate: "layer k", "own", "colour" or "gloss".
+        stage: name of the ``StepScalars`` factor that scales the learning rate: "layer k", "own", "colour" or "gloss".
     """
 
     def __init__(self, tensor: Tensor, rate: float, betas: tuple[float, float], stage: str) -> None:
@@ -119,14 +126,14 @@ class FreeParameter:
         self._adam = torch.optim.Adam([tensor], lr=rate, betas=betas, eps=ADAM_EPSILON)
 
     def step(self, factor: float) -> None:
-        """Performs one optimization step; a factor of 0 skips it and leaves the moments unchanged."""
+        """Performs one optimization step. If ``factor`` is 0, skips the step and leaves the moments unchanged."""
         if factor:
             self._adam.param_groups[0]["lr"] = self._rate * factor
             self._adam.step()
 
 
 def deformation_of(tables: Tables) -> tuple[list[ClusterParams], Deltas]:
-    """Converts the parameters of a deformation to tensors."""
+    """Converts deformation tables to leaf tensors."""
     clusters = [ClusterParams(leaf(v[:, :3]), leaf(v[:, 3:6]), leaf(v[:, 6:9]), leaf(v[:, 9])) for v in tables.clusters]
     own = tables.deltas
     return clusters, Deltas(leaf(own[:, :3]), leaf(own[:, 3:6]), leaf(own[:, 6:]))

@@ -1,8 +1,8 @@
-"""Rasterizer in plain PyTorch: dense, slow and exact; in float64 it is the reference for every other engine.
+"""Rasterizer in plain PyTorch: dense, slow and exact. In float64, it is the reference for all other engines.
 
-The projection is EWA splatting (Zwicker et al. 2001) in the form of 3D Gaussian Splatting (Kerbl et al. 2023), with
-the Jacobian clamping of gsplat. Camera axes follow OpenCV; the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
-Gradients of means, factors, opacities and features come from autograd.
+The projection is EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023), with the Jacobian
+clamping of gsplat. Camera axes follow OpenCV. The centre of the pixel in column i and row j is (i + 0.5, j + 0.5).
+Gradients of means, factors, opacities and features are computed by autograd.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import FEATURE_CEILING, NOT_FINITE
 
 PAIRS_AT_ONCE = 4_000_000
-"""Maximum pixel–Gaussian pairs in memory; larger pictures are split into strips that backward recomputes."""
+"""Maximum number of pixel–Gaussian pairs in memory. Larger images are split into strips, which backward recomputes."""
 
 
 class CameraParams(NamedTuple):
     """A camera as tensors.
 
     Attributes:
-        rotation: [3, 3] world to camera.
-        translation: [3] metres, world to camera.
-        fx, fy, cx, cy: pixels.
-        width, height: pixels.
+        rotation: [3, 3] world-to-camera rotation.
+        translation: [3] world-to-camera translation, in metres.
+        fx, fy, cx, cy: intrinsics, in pixels.
+        width, height: image size, in pixels.
     """
 
     rotation: Tensor
@@ -43,7 +43,7 @@ class CameraParams(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> CameraParams:
-        """Converts a camera to the given dtype on the given device."""
+        """Converts a camera to tensors with the given dtype and device."""
         rotation = torch.tensor(camera.rotation, dtype=dtype, device=device)
         translation = torch.tensor(camera.translation, dtype=dtype, device=device)
         fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -51,23 +51,23 @@ class CameraParams(NamedTuple):
 
     @classmethod
     def of_arrays(cls, camera: CameraArrays) -> CameraParams:
-        """Converts a camera in kernel format to float64."""
+        """Converts a camera in kernel format to float64 tensors."""
         pose = torch.as_tensor(camera.pose, dtype=torch.float64)
         fx, fy, cx, cy = camera.lens[:4].astype(float).tolist()
         return cls(pose[:, :3], pose[:, 3], fx, fy, cx, cy, camera.width, camera.height)
 
     def depths(self, means: Tensor) -> Tensor:
-        """Returns the depth [N] of points [N, 3] along the camera's z axis, for rendering depth as a feature."""
+        """Returns the depth [N] of points [N, 3] along the camera's z axis; used to render depth as a feature."""
         return means @ self.rotation[2] + self.translation[2]
 
 
 class Projected(NamedTuple):
-    """Projected Gaussians; rows closer than the near plane are meaningless.
+    """Projected Gaussians. Values are meaningless for Gaussians in front of the near plane.
 
     Attributes:
-        means: [N, 2] pixels.
-        covariances: [N, 2, 2] pixels², including the low-pass filter.
-        depths: [N] metres along z.
+        means: [N, 2] projected means, in pixels.
+        covariances: [N, 2, 2] projected covariances including the low-pass filter, in pixels².
+        depths: [N] depths along z, in metres.
     """
 
     means: Tensor
@@ -76,13 +76,13 @@ class Projected(NamedTuple):
 
 
 class Rendered(NamedTuple):
-    """A rendered picture.
+    """A rendered image.
 
     Attributes:
-        features: [H, W, C], including the background.
-        alpha: [H, W] in 0…1, one minus the remaining transmittance.
-        means: [N, 2] pixels, the projected means; adaptive density control uses their gradient.
-        depths: [N] metres along z.
+        features: [H, W, C] rendered features, including the background.
+        alpha: [H, W] alpha in 0…1, one minus the remaining transmittance.
+        means: [N, 2] projected means in pixels, whose gradient is used by adaptive density control.
+        depths: [N] depths along z, in metres.
     """
 
     features: Tensor
@@ -92,18 +92,19 @@ class Rendered(NamedTuple):
 
 
 def project(means: Tensor, factors: Tensor, camera: CameraParams, limits: Limits = DEFAULT) -> Projected:
-    """Computes the EWA projection: cov2d = (A F)(A F)ᵀ + low_pass·I, A = J_projection·W of shape 2×3.
+    """Computes the EWA projection: cov2d = (A F)(A F)ᵀ + low_pass·I, with the 2×3 matrix A = J_projection·W.
 
-    The Jacobian is evaluated with x/z and y/z clamped to the picture widened by ``tangent_margin``; the means are not.
+    The Jacobian is evaluated with x/z and y/z clamped to the image extended by ``tangent_margin``. The means are not
+    clamped.
 
     Args:
-        means: [N, 3] metres.
-        factors: [N, 3, 3].
-        camera: camera in the internal world.
-        limits: constants of the rasterizer.
+        means: [N, 3] means, in metres.
+        factors: [N, 3, 3] covariance factors.
+        camera: camera in internal world coordinates.
+        limits: rasterizer constants.
     """
     x, y, z = (means @ camera.rotation.T + camera.translation).unbind(-1)
-    # Culled rows would divide by zero and make all gradients NaN; they are not rendered, so any z is fine.
+    # For culled Gaussians, division by z could make gradients NaN. They are not rendered, so any positive z works.
     z_safe = torch.where(z < limits.near, torch.full_like(z, limits.near), z)
     tan_x, tan_y = x / z_safe, y / z_safe
     margin_x = limits.tangent_margin * camera.width / (2 * camera.fx)
@@ -128,13 +129,13 @@ def _composite(
     background: Tensor,
     limits: Limits,
 ) -> tuple[Tensor, Tensor]:
-    """Composites depth-sorted Gaussians at pixel centres [P, 2] to features [P, C] and alpha [P]."""
+    """Composites depth-sorted Gaussians at pixel centres [P, 2]; returns features [P, C] and alpha [P]."""
     d = pixels[:, None] - means
     a, b, c = conics.unbind(-1)
     power = -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
     alpha = (opacities * torch.exp(power)).clamp(max=limits.alpha_cap)
     alpha = torch.where(alpha >= limits.alpha_floor, alpha, 0)
-    # The product decreases monotonically, so a pixel below the stop is finished.
+    # Transmittance decreases monotonically, so a pixel that falls below the threshold stays finished.
     passed = torch.cumprod(1 - alpha.detach(), dim=1)
     alpha = torch.where(passed >= limits.transmittance_stop, alpha, 0)
     passed = torch.cumprod(1 - alpha, dim=1)
@@ -144,7 +145,7 @@ def _composite(
 
 
 def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
-    """Returns [N] bool: finite Gaussians within ``guards.NOT_FINITE`` metres whose features are not too large."""
+    """Returns a mask [N] of valid Gaussians: finite, and within ``guards.NOT_FINITE`` and ``FEATURE_CEILING``."""
     size = means.detach().abs().sum(-1) + factors.detach().abs().sum((-2, -1)) + opacities.detach().abs()
     return (size <= NOT_FINITE) & (features.detach().abs() <= FEATURE_CEILING).all(-1)
 
@@ -158,20 +159,21 @@ def render(
     background: Tensor,
     limits: Limits = DEFAULT,
 ) -> Rendered:
-    """Renders Σ_i w_i·feature_i + T_final·background at every pixel, front to back by depth, ties by row.
+    """Renders Σ_i w_i·feature_i + T_final·background at every pixel, front to back. Ties in depth keep row order.
 
-    alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)) with d from the projected mean to the pixel centre. A Gaussian contributes
-    exactly if alpha ≥ floor. A pixel is finished, without that Gaussian, when T·(1 − alpha) < stop. No gradient flows
-    through the cap. Gaussians that are not ``sound`` are not rendered; their gradients are 0.
+    alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)), where d is the offset of the pixel centre from the projected mean. A
+    Gaussian contributes if and only if alpha ≥ floor. Blending stops at the first Gaussian with T·(1 − alpha) < stop,
+    which is not blended. No gradient flows through the cap. Gaussians that are not ``sound`` are not rendered, and
+    their gradients are 0.
 
     Args:
-        means: [N, 3] metres.
-        factors: [N, 3, 3]; Σ = F Fᵀ.
-        opacities: [N] in (0, 1).
-        features: [N, C], C ≥ 1: colour, label and depth in one pass.
-        camera: camera in the internal world.
-        background: [C].
-        limits: constants of the rasterizer.
+        means: [N, 3] means, in metres.
+        factors: [N, 3, 3] covariance factors F, with Σ = F Fᵀ.
+        opacities: [N] opacities in (0, 1).
+        features: [N, C] features with C ≥ 1, for example colour, label and depth in one pass.
+        camera: camera in internal world coordinates.
+        background: [C] background features.
+        limits: rasterizer constants.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -186,7 +188,7 @@ def render(
     """
     finite = sound(means, factors, opacities, features)
     if not bool(finite.all()):
-        # Moved behind every near plane, with values that do not become NaN in a product with 0.
+        # Move invalid Gaussians behind the camera, and replace values that would become NaN when multiplied by 0.
         away = (-camera.translation - camera.rotation[2]) @ camera.rotation
         means = torch.where(finite[:, None], means, away)
         factors = torch.where(finite[:, None, None], factors, 0)

@@ -1,4 +1,4 @@
-"""Renderer in PyTorch, float64: the reference for the other renderers."""
+"""Renderer in PyTorch with float64, the reference for all other renderers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 TILE = 32
-"""``reached`` pads a picture to multiples of this number of pixels."""
+"""Number of pixels to a multiple of which ``reached`` pads the image."""
 
 
 class TorchRenderer:
-    """The reference ``Renderer``.
+    """The reference implementation of ``Renderer``.
 
     Args:
-        background: RGB in 0…1. limits: constants of the rasterizer.
+        background: background colour, RGB in 0…1.
+        limits: rasterizer constants.
     """
 
     def __init__(self, background: tuple[float, float, float], limits: Limits = DEFAULT) -> None:
@@ -57,7 +58,7 @@ class TorchRenderer:
         return Comparison(float(losses.psnr(picture, target)), loss, (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """See ``Renderer.gather``; computed as the feature gradient of a weighted sum of pixels."""
+        """See ``Renderer.gather``. The sums are computed as feature gradients of a weighted sum of pixels."""
         features = torch.zeros(len(state), len(planes), dtype=torch.float64, requires_grad=True)
         picture = self._drawn(state, camera, features, np.zeros(len(planes), np.float32))
         (picture.features * leaf(planes).permute(1, 2, 0)).sum().backward()  # type: ignore[no-untyped-call]
@@ -77,7 +78,7 @@ class TorchRenderer:
         return sums[:, :LABEL], sums[:, LABEL]
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """See ``Renderer.reached``; a block is set if the support contains one of its pixel centres."""
+        """See ``Renderer.reached``. A block is marked if a support contains one of its pixel centres."""
         chosen = state.rows(rows)
         params = CameraParams.of_arrays(camera)
         drawn = project(leaf(chosen.means), leaf(chosen.factors), params, self._limits)
@@ -98,7 +99,7 @@ class TorchRenderer:
         return blocks
 
     def _seen(self, state: Gaussians, camera: CameraArrays) -> Tensor:
-        """Returns [N, 4] features: RGB with gloss, and the label."""
+        """Returns the features [N, 4]: RGB including gloss, and label."""
         gloss = None if state.gloss is None else leaf(state.gloss)
         environment = None if state.environment is None else leaf(state.environment)
         means, colours = leaf(state.means), leaf(state.colours)

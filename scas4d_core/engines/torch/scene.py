@@ -1,4 +1,4 @@
-"""Tensors of one attempt: Θ_{t−1}, the structure that deforms it, and Θ_t as a function of the parameters."""
+"""Tensors of one attempt: Θ_{t−1}, its cluster structure, and Θ_t as a differentiable function of the parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ class Moved:
     """Θ_t as tensors, differentiable with respect to the parameters.
 
     Attributes:
-        means [N, 3], factors [N, 3, 3]: all Gaussians. turns: [M, 4] rotations of moving Gaussians since Θ_{t−1}.
+        means: [N, 3] means of all Gaussians.
+        factors: [N, 3, 3] covariance factors of all Gaussians.
+        turns: [M, 4] rotations of the moving Gaussians since Θ_{t−1}.
     """
 
     means: Tensor
@@ -30,12 +32,14 @@ class Moved:
 
 
 class Scene:
-    """Θ_{t−1} in float64, with the functions that derive Θ_t from it.
+    """Θ_{t−1} in float64, with methods that derive Θ_t from it.
 
-    A moving Gaussian that is not finite is held back: it stays unchanged, without influence on pivots and neighbours.
+    Moving Gaussians with non-finite values are held back: they stay unchanged and do not affect pivots or neighbours.
 
     Attributes:
-        rows: [M] moving Gaussians. sound: [M] mask of the finite ones. static: [N − M] all other Gaussians.
+        rows: [M] rows of the moving Gaussians.
+        sound: [M] mask of the moving Gaussians with finite values.
+        static: [N − M] rows of the static Gaussians.
     """
 
     def __init__(self, plan: UpdatePlan, structure: Structure, previous: Gaussians) -> None:
@@ -59,7 +63,7 @@ class Scene:
             self.pair_weights = torch.where(pairs, leaf(graph.weights), 0)
 
     def moved(self, parameters: Parameters) -> Moved:
-        """Deforms the state by equations (5) to (7)."""
+        """Deforms Θ_{t−1} by equations (5) to (7)."""
         chosen = self.rows[self.sound]
         layers = [Layer(labels, params) for labels, params in zip(self._clusters, parameters.clusters, strict=True)]
         deltas = type(parameters.deltas)(*(values[self.sound] for values in parameters.deltas))
@@ -72,20 +76,20 @@ class Scene:
         )
 
     def all_colours(self, parameters: Parameters) -> Tensor:
-        """Returns RGB colours [N, 3] without gloss."""
+        """Returns the RGB colours [N, 3] of all Gaussians, without gloss."""
         colours = self.colours.index_copy(0, self.rows, parameters.moving_colours)
         return colours.index_copy(0, self.static, parameters.static_colours)
 
     def seen(
         self, moved: Moved, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, camera: CameraArrays
     ) -> Tensor:
-        """Returns features [N, 4] as a camera sees them (RGB with gloss, label); no gradient to means and rotations."""
+        """Returns the features [N, 4] seen by a camera (RGB with gloss, label), detached from means and rotations."""
         turns = no_turns(len(self.means)).index_copy(0, self.rows, moved.turns.detach())
         seen = colours_seen(moved.means.detach(), turns, colours, gloss, environment, leaf(camera.centre))
         return torch.cat([seen, self.labels[:, None]], dim=1)
 
     def state(self, moved: Moved, parameters: Parameters | None) -> Gaussians:
-        """Returns Θ_t; with the learned colours and gloss if ``parameters`` is given, else with those of Θ_{t−1}."""
+        """Returns Θ_t. If ``parameters`` is None, it has the colours and gloss of Θ_{t−1}, not the learned ones."""
         previous, chosen = self.previous, self.rows[self.sound].numpy()
         means, factors, rotations = previous.means.copy(), previous.factors.copy(), previous.rotations.copy()
         means[chosen] = moved.means.detach()[chosen].float().numpy()

@@ -1,4 +1,8 @@
-"""Adam (Kingma and Ba 2015) over device tables; reference: ``torch.optim.Adam``, guards: ``kernels.adam``."""
+"""Adam (Kingma and Ba 2015) over device tables; reference: ``torch.optim.Adam``, guards: ``kernels.adam``.
+
+A kernel that computes the gradient of an element also steps it, by calling ``step_element``. This saves launches, and
+the gradient need not be read again.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from scas4d_core.guards import ADAM_EPSILON, GRADIENT_CEILING, MOMENT_FLOOR, GuardCounts
+from scas4d_core.guards import ADAM_EPSILON, GRADIENT_CEILING, MOMENT_FLOOR
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,95 +20,113 @@ EPSILON = wp.constant(wp.float32(ADAM_EPSILON))
 SMALLEST = wp.constant(wp.float32(MOMENT_FLOOR))
 LARGEST = wp.constant(wp.float32(GRADIENT_CEILING))
 COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
-"""Guards that ``step_table`` counts."""
+"""Guards that ``step_element`` counts."""
+SCALARS = 3
+"""Scalars of a step: factor on all rates, 1 − β₁^steps and 1 − β₂^steps."""
 
 
-@wp.kernel
-def step_table(
-    gradients: wp.array2d[wp.float32],
-    columns: wp.array[wp.float32],
-    by_row: wp.array[wp.float32],
-    factor: wp.float32,
-    beta1: wp.float32,
-    beta2: wp.float32,
-    correction1: wp.float32,
-    correction2: wp.float32,
-    first: wp.array2d[wp.float32],
-    second: wp.array2d[wp.float32],
-    table: wp.array2d[wp.float32],
-    guard_counts: wp.array[wp.int32],
-) -> None:
-    """Updates a table [n, columns] with one thread per element; elements with rate 0 and their moments are unchanged.
+@wp.struct
+class Adam:
+    """Device side of an optimizer for one table [n, columns].
 
-    Args:
-        gradients: [n, ≥ columns]. columns: learning rate of each column. by_row: [n] or [1] factor on each row's rates.
-        factor: factor on all rates. beta1, beta2: decay rates. correction1, correction2: 1 − β^steps.
-        first, second: moments. table: updated. guard_counts: [2] see ``COUNTED_GUARDS``; counts are added.
+    Attributes:
+        columns: [columns] learning rates. by_row: [n] or [1] factor on each row's rates.
+        first, second: [n, columns] moments. guard_counts: [2] see ``COUNTED_GUARDS``; counts are added.
+        scalars: [``SCALARS``] of the current iteration. beta1, beta2: decay rates.
     """
-    i, k = wp.tid()
-    row = by_row[0]
-    if by_row.shape[0] > 1:
-        row = by_row[i]
-    rate = columns[k] * row * factor
+
+    columns: wp.array[wp.float32]
+    by_row: wp.array[wp.float32]
+    first: wp.array2d[wp.float32]
+    second: wp.array2d[wp.float32]
+    guard_counts: wp.array[wp.int32]
+    scalars: wp.array[wp.float32]
+    beta1: wp.float32
+    beta2: wp.float32
+
+
+@wp.func
+def step_element(adam: Adam, table: wp.array2d[wp.float32], i: wp.int32, k: wp.int32, gradient: wp.float32) -> None:
+    """Steps one element of a table; an element with rate 0 and its moments are unchanged."""
+    row = adam.by_row[0]
+    if adam.by_row.shape[0] > 1:
+        row = adam.by_row[i]
+    rate = adam.columns[k] * row * adam.scalars[0]
     if rate > 0.0:
-        g = gradients[i, k]
+        g = gradient
         size = wp.abs(g)
         if not (size <= LARGEST):  # also true for NaN
             g = wp.where(g > 0.0, LARGEST, wp.where(g < 0.0, -LARGEST, 0.0))
-            wp.atomic_add(guard_counts, 0, 1)
+            wp.atomic_add(adam.guard_counts, 0, 1)
         elif size > 0.0 and size <= SMALLEST:
             g = wp.float32(0.0)
-            wp.atomic_add(guard_counts, 1, 1)
-        m = beta1 * first[i, k] + (1.0 - beta1) * g
-        v = beta2 * second[i, k] + (1.0 - beta2) * g * g
+            wp.atomic_add(adam.guard_counts, 1, 1)
+        m = adam.beta1 * adam.first[i, k] + (1.0 - adam.beta1) * g
+        v = adam.beta2 * adam.second[i, k] + (1.0 - adam.beta2) * g * g
         m = wp.where(wp.abs(m) > SMALLEST, m, 0.0)
         v = wp.where(v > SMALLEST * SMALLEST, v, 0.0)
-        first[i, k] = m
-        second[i, k] = v
-        table[i, k] = table[i, k] - rate * (m / correction1) / (wp.sqrt(v / correction2) + EPSILON)
+        adam.first[i, k] = m
+        adam.second[i, k] = v
+        table[i, k] = table[i, k] - rate * (m / adam.scalars[1]) / (wp.sqrt(v / adam.scalars[2]) + EPSILON)
 
 
-class Adam:
-    """Adam over one table on the device.
+@wp.kernel
+def step_table(adam: Adam, gradients: wp.array2d[wp.float32], table: wp.array2d[wp.float32]) -> None:
+    """Steps a table [n, columns] with gradients of the same shape, with one thread per element."""
+    i, k = wp.tid()
+    step_element(adam, table, i, k, gradients[i, k])
+
+
+class Optimizer:
+    """Host side of an optimizer: allocates its arrays, and counts its steps.
 
     Args:
-        table: [n, columns] float32, updated in place. columns: learning rate of each column.
-        betas: decay rates of the two moments, which start at zero. by_row: [n] factor on each row's rates; None: 1.
+        shape: of the table. scalars: [``SCALARS``] on the device, which the caller fills before each step.
+        varies_by_row: whether the rates differ between rows.
+
+    Attributes:
+        adam: argument of the kernels that step the table. steps: number of steps so far.
     """
 
-    def __init__(
-        self,
-        table: wp.array,
-        columns: Sequence[float],
-        betas: tuple[float, float],
-        by_row: NDArray[np.float32] | None = None,
-    ) -> None:
-        device = table.device
-        self._table, self._betas, self._steps = table, betas, 0
-        self._shape = table.shape[0], len(columns)
-        self._columns = wp.array(np.asarray(columns, np.float32), dtype=wp.float32, device=device)
-        rows = np.ones(1, np.float32) if by_row is None else by_row
-        self._by_row = wp.array(rows, dtype=wp.float32, device=device)
-        self._first, self._second = (wp.zeros(self._shape, dtype=wp.float32, device=device) for _ in range(2))
-        self._guard_counts = wp.zeros(len(COUNTED_GUARDS), dtype=wp.int32, device=device)
+    def __init__(self, shape: tuple[int, int], scalars: wp.array, varies_by_row: bool = False) -> None:
+        device = scalars.device
+        self.adam, self.steps = Adam(), 0
+        self.adam.columns = wp.zeros(shape[1], dtype=wp.float32, device=device)
+        self.adam.by_row = wp.ones(shape[0] if varies_by_row else 1, dtype=wp.float32, device=device)
+        self.adam.first, self.adam.second = (wp.zeros(shape, dtype=wp.float32, device=device) for _ in range(2))
+        self.adam.guard_counts = wp.zeros(len(COUNTED_GUARDS), dtype=wp.int32, device=device)
+        self.adam.scalars = scalars
 
-    def step(self, gradients: wp.array, factor: float) -> None:
-        """Performs one optimization step.
+    def begin(
+        self, columns: Sequence[float], betas: tuple[float, float], by_row: NDArray[np.float32] | None = None
+    ) -> None:
+        """Starts an attempt with zero moments.
 
         Args:
-            gradients: [n, ≥ columns]. factor: factor on all rates; 0 skips the step and leaves the moments unchanged.
+            columns: learning rate of each column. betas: decay rates of the moments.
+            by_row: [n] factor on each row's rates; None keeps the previous factors.
         """
-        if factor == 0 or self._shape[0] == 0:
-            return
-        self._steps += 1
-        beta1, beta2 = self._betas
-        corrections = 1 - beta1**self._steps, 1 - beta2**self._steps
-        inputs = [gradients, self._columns, self._by_row, factor, beta1, beta2, *corrections]
-        inputs += [self._first, self._second, self._table, self._guard_counts]
-        wp.launch(step_table, self._shape, inputs, device=self._table.device)
+        self.steps = 0
+        self.adam.beta1, self.adam.beta2 = betas
+        self.adam.columns.assign(np.asarray(columns, np.float32))
+        if by_row is not None:
+            self.adam.by_row.assign(by_row)
+        for array in (self.adam.first, self.adam.second, self.adam.guard_counts):
+            array.zero_()
 
-    def guards(self) -> GuardCounts:
-        """Returns the number of times that each guard was triggered; waits for the device."""
-        counts = GuardCounts(*COUNTED_GUARDS)
-        counts.add(COUNTED_GUARDS, self._guard_counts.numpy().astype(np.int64))
-        return counts
+    def next_scalars(self, factor: float) -> tuple[float, float, float]:
+        """Returns the scalars of the next step; a factor of 0 skips the step and leaves the moments unchanged."""
+        if factor == 0:
+            return 0.0, 1.0, 1.0
+        self.steps += 1
+        return factor, 1 - self.adam.beta1**self.steps, 1 - self.adam.beta2**self.steps
+
+    def load(self, first: NDArray[np.float32], second: NDArray[np.float32], steps: int) -> None:
+        """Continues from given moments."""
+        self.adam.first.assign(first)
+        self.adam.second.assign(second)
+        self.steps = steps
+
+    def set_columns(self, columns: NDArray[np.float32]) -> None:
+        """Changes the learning rate of each column."""
+        self.adam.columns.assign(columns)

@@ -10,6 +10,7 @@ from math import e, log2
 
 import warp as wp
 
+from scas4d_core.engines.warp.adam import Adam, step_element
 from scas4d_core.engines.warp.lanes import lane, lane_count, sum_over_lanes
 from scas4d_core.engines.warp.quaternions import (
     change_of,
@@ -184,12 +185,14 @@ def map_clusters_backward(
     g_jacobians: wp.array[wp.mat33],
     g_turns: wp.array[wp.vec4],
     g_table: wp.array2d[wp.float32],
+    adam: Adam,
 ) -> None:
-    """Backpropagates gradients through a layer: to its inputs, in place, and to its parameters.
+    """Backpropagates gradients through a layer, to its inputs, in place, and to its parameters, and steps these.
 
     Args:
         published, starts, table, sound, points, jacobians, turns, pivots: see ``map_clusters``.
         g_points, g_jacobians, g_turns: [M] gradients of the layer's outputs; overwritten. g_table: out [K, 10].
+        adam: optimizer of the table.
     """
     cluster = wp.tid() // lane_count()
     own = parameters_of(table, cluster)
@@ -261,3 +264,5 @@ def map_clusters_backward(
             g_table[cluster, 3 + k] = g_t[k]
             g_table[cluster, 6 + k] = g_c[k]
         g_table[cluster, 9] = g_s
+        for k in range(10):
+            step_element(adam, table, cluster, k, g_table[cluster, k])

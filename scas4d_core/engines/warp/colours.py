@@ -8,77 +8,73 @@ from numpy.typing import NDArray
 
 from scas4d_core.engines.engine import AttemptStart
 from scas4d_core.engines.plan import UpdatePlan
-from scas4d_core.engines.warp.adam import Adam
-from scas4d_core.guards import GuardCounts
+from scas4d_core.engines.warp.adam import Adam, Optimizer, step_element
 
 wp.set_module_options({"enable_backward": False})
 
-Array = NDArray[np.float32]
-
 
 @wp.kernel
-def colour_gradients(
+def step_colours(
+    adam: Adam,
     weight: wp.float32,
-    counted: wp.array[wp.int32],
+    learned: wp.array[wp.int32],
     before: wp.array2d[wp.float32],
-    colours: wp.array2d[wp.float32],
     g_features: wp.array2d[wp.float32],
+    features: wp.array2d[wp.float32],
     gradients: wp.array2d[wp.float32],
-    loss: wp.array[wp.float32],
+    iteration: wp.array[wp.int32],
+    losses: wp.array[wp.float32],
 ) -> None:
-    """Adds the soft-colour term to the gradients of the rendering losses, with one thread per element of N × 3.
+    """Adds the soft-colour term and steps the colours, with one thread per element of N × 3.
 
     Args:
-        weight: weight of one element's absolute change. counted: [N] 1 for Gaussians whose colours are learned.
-        before, colours: [N, 3] of Θ_{t−1} and [N, 4] current. g_features: [N, 4] gradients of the rendering losses.
-        gradients: out [N, 3]. loss: [1], to which the weighted term is added.
+        weight: weight of one element's absolute change. learned: [N] 1 for Gaussians whose colours are learned.
+        before: [N, 4] features of Θ_{t−1}. g_features: [N, 4] gradients of the rendering losses.
+        features: [N, 4], of which the first three columns are updated. gradients: out [N, 3].
+        iteration: [1] row of ``losses``, to which the weighted term is added.
     """
     i, k = wp.tid()
     g = wp.float32(0.0)
-    if counted[i] == 1:
-        change = colours[i, k] - before[i, k]
+    if learned[i] == 1:
+        change = features[i, k] - before[i, k]
         g = g_features[i, k]
         if change != 0.0:
             g += weight * wp.sign(change)
-            wp.atomic_add(loss, 0, weight * wp.abs(change))
+            wp.atomic_add(losses, iteration[0], weight * wp.abs(change))
     gradients[i, k] = g
+    step_element(adam, features, i, k, g)
 
 
 class WarpColours:
     """The colours learned in an attempt, which are the first three columns of the features.
 
     Args:
-        plan: plan of the updates; it must include colours. features: [N, 4], updated in place.
-        before: [N, 3] colours of Θ_{t−1}. rows: [M] moving Gaussians. start: learning rates and decay rates.
+        plan: plan of the updates; it must include colours. count: N Gaussians. rows: [M] moving Gaussians.
+        scalars: [3] on the device, those of the optimizer.
 
     Attributes:
-        gradients: [N, 3], filled by ``backward``.
+        gradients: [N, 3], filled by ``step``. optimizer: of the colours.
     """
 
-    def __init__(
-        self, plan: UpdatePlan, features: wp.array, before: Array, rows: NDArray[np.int64], start: AttemptStart
-    ) -> None:
+    def __init__(self, plan: UpdatePlan, count: int, rows: NDArray[np.int64], scalars: wp.array) -> None:
         assert plan.colours is not None
-        device, count = features.device, len(before)
-        rates = np.full(count, start.static_colour if plan.colours.static else 0.0, np.float32)
-        rates[rows] = start.colour
-        counted = np.full(count, plan.colours.static, np.int32)
-        counted[rows] = 1
-        self._features, self._weight = features, plan.soft_colour / max(3 * count, 1)
-        self._counted = wp.array(counted, dtype=wp.int32, device=device)
-        self._before = wp.array(before, dtype=wp.float32, ndim=2, device=device)
-        self.gradients = wp.zeros((count, 3), dtype=wp.float32, device=device)
-        self._adam = Adam(features, [1.0] * 3, (start.beta1, start.beta2), rates)
+        self._static, self._rows, self._count, self._device = plan.colours.static, rows, count, scalars.device
+        self._weight = plan.soft_colour / max(3 * count, 1)
+        learned = np.full(count, self._static, np.int32)
+        learned[rows] = 1
+        self._learned = wp.array(learned, dtype=wp.int32, device=self._device)
+        self.gradients = wp.zeros((count, 3), dtype=wp.float32, device=self._device)
+        self.optimizer = Optimizer((count, 3), scalars, varies_by_row=True)
 
-    def backward(self, g_features: wp.array, loss: wp.array) -> None:
-        """Fills ``gradients`` from the gradients of the features [N, 4]; adds the weighted term to ``loss`` [1]."""
-        inputs = [self._weight, self._counted, self._before, self._features, g_features, self.gradients, loss]
-        wp.launch(colour_gradients, self.gradients.shape, inputs, device=self._features.device)
+    def begin(self, start: AttemptStart) -> None:
+        """Starts an attempt with zero moments."""
+        rates = np.full(self._count, start.static_colour if self._static else 0.0, np.float32)
+        rates[self._rows] = start.colour
+        self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2), rates)
 
-    def step(self, factor: float) -> None:
-        """Performs one optimization step; ``factor`` scales all learning rates."""
-        self._adam.step(self.gradients, factor)
-
-    def guards(self) -> GuardCounts:
-        """Returns the number of times that each guard was triggered; waits for the device."""
-        return self._adam.guards()
+    def step(
+        self, before: wp.array, g_features: wp.array, features: wp.array, iteration: wp.array, losses: wp.array
+    ) -> None:
+        """Performs one optimization step; see ``step_colours``."""
+        given = [self.optimizer.adam, self._weight, self._learned, before, g_features, features]
+        wp.launch(step_colours, (self._count, 3), [*given, self.gradients, iteration, losses], device=self._device)

@@ -6,58 +6,65 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import without_turn
-from scas4d_core.engines.engine import StepScalars, Tables
+from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.warp import cluster_map, gaussian_deltas
+from scas4d_core.engines.warp.adam import Optimizer
 from scas4d_core.engines.warp.lanes import lanes_of
 from scas4d_core.engines.warp.neighbour_terms import neighbour_terms
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.engines.warp.step_records import StepRecords
 
 Array = NDArray[np.float32]
 
 
 class WarpDeformation:
-    """The parameters of a deformation, the deformed Gaussians, and the gradients of both.
+    """The parameters of a deformation with their optimizers, and the deformed Gaussians.
+
+    Nothing here waits for the device. ``forward`` and ``backward`` can be captured in a graph.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0". plan, structure: those of the updates.
+        records: what changes between iterations; the first optimizers are those of the layers and of the deltas.
 
     Attributes:
         clusters: [K, 10] per layer, columns r, t, c, s of equation (6). deltas: [M, 9], columns Δp, Δr, Δs.
-        cluster_gradients, delta_gradients: gradients of the same shapes, filled by ``backward``.
-        means, factors: [N] of vec3 and mat33, all Gaussians, filled by ``forward``.
-        turns: [M] of vec4 (w, x, y, z), rotation since Θ_{t−1}, filled by ``forward``.
-        loss: [1] weighted terms of the last iteration, excluding rendering losses.
-        held_back: number of moving Gaussians that are not finite; they stay unchanged.
+        gradients: gradients of the same shapes in the last iteration, layers first.
+        optimizers: of the layers and of the deltas.
+        means, factors: [N] of vec3 and mat33, all Gaussians. turns: [M] of vec4 (w, x, y, z), rotation since Θ_{t−1}.
+        unsound: [1] number of moving Gaussians that are not finite; they stay unchanged.
     """
 
-    def __init__(self, device: str, plan: UpdatePlan, structure: Structure) -> None:
-        hierarchy, graph = structure.hierarchy, structure.neighbours
+    def __init__(self, device: str, plan: UpdatePlan, structure: Structure, records: StepRecords) -> None:
+        hierarchy, graph, total = structure.hierarchy, structure.neighbours, len(structure.roots)
         count = len(hierarchy.rows)
         self._device, self._plan, self._lanes = device, plan, lanes_of(device)
+        self._records, self._count = records, count
         self._rows = self._upload(hierarchy.rows, wp.int32)
         self._starts = [self._upload(starts, wp.int32) for starts in hierarchy.starts]
-        self._moving, self._count = hierarchy.rows, count
         self.clusters = [self._zeros((size, cluster_map.COLUMNS)) for size in hierarchy.sizes]
-        self.cluster_gradients = [self._zeros((size, cluster_map.COLUMNS)) for size in hierarchy.sizes]
+        self.deltas = self._zeros((count, 9))
+        tables = [*self.clusters, self.deltas]
+        self.gradients, self._saved = ([wp.zeros_like(table) for table in tables] for _ in range(2))
+        self.optimizers = [Optimizer(table.shape, records.optimizer(k)) for k, table in enumerate(tables)]
         self._pivots = [self._zeros(size, wp.vec3) for size in hierarchy.sizes]
-        self.deltas, self.delta_gradients = self._zeros((count, 9)), self._zeros((count, 9))
-        stages = len(hierarchy.sizes) + 1
-        self._points = [self._zeros(count, wp.vec3) for _ in range(stages)]
-        self._jacobians = [self._zeros(count, wp.mat33) for _ in range(stages)]
-        self._turned = [self._zeros(count, wp.vec4) for _ in range(stages)]
+        self._points, self._jacobians, self._turned = (
+            [self._zeros(count, dtype) for _ in tables] for dtype in (wp.vec3, wp.mat33, wp.vec4)
+        )
         self._jacobians[0].assign(np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)))
-        self._turned[0].assign(without_turn(count))
         self._g_points, self._g_jacobians = self._zeros(count, wp.vec3), self._zeros(count, wp.mat33)
         self._g_turned = self._zeros(count, wp.vec4)
         self._tied_means, self._tied_turns = self._zeros(count, wp.vec3), self._zeros(count, wp.vec4)
+        self._sound, self.unsound = self._zeros(count, wp.int32), self._zeros(1, wp.int32)
+        self.means, self._previous_means = self._zeros(total, wp.vec3), self._zeros(total, wp.vec3)
+        self.factors, self._previous_factors = self._zeros(total, wp.mat33), self._zeros(total, wp.mat33)
+        self.turns = self._zeros(count, wp.vec4)
         self._bounds = self._upload(structure.length_bounds, wp.vec3)
         self._graph = graph
         if graph is not None:
             self._neighbours = self._upload(graph.index, wp.int32, 2)
             self._distances = self._upload(graph.distances, wp.float32, 2)
             self._pair_weights = self._upload(graph.weights, wp.float32, 2)
+        self._samples, self._sample_sizes = self._zeros((0, 0), wp.int32), list[int]()
         self._published = int(plan.cluster_map == "published")
         self._terms = gaussian_deltas.Terms()
         self._terms.separate = int(plan.covariance == "separate")
@@ -65,10 +72,6 @@ class WarpDeformation:
         if plan.floor is not None:
             self._terms.floor = plan.floor_weight / max(count, 1)
             self._terms.plane = wp.vec4(*plan.floor)
-        self.turns = self._zeros(count, wp.vec4)
-        self.loss = self._zeros(1)
-        self.held_back = 0
-        self._samples: list[wp.array] = []
 
     def _zeros(self, shape: int | tuple[int, ...], dtype: object = wp.float32) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)
@@ -76,83 +79,105 @@ class WarpDeformation:
     def _upload(self, values: NDArray[np.generic], dtype: object, dimensions: int = 1) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, ndim=dimensions, device=self._device)
 
-    def start(self, previous: Gaussians) -> None:
-        """Loads the initial state Θ_{t−1} of an attempt."""
-        moving = self._moving
-        given = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
-        sound: NDArray[np.bool_] = np.isfinite(given).all(axis=1)
-        self.held_back = int(np.count_nonzero(~sound))
-        self._sound = self._upload(sound.astype(np.int32), wp.int32)
-        self._previous_means = self._upload(previous.means, wp.vec3)
-        self._previous_factors = self._upload(previous.factors, wp.mat33)
-        self.means, self.factors = wp.clone(self._previous_means), wp.clone(self._previous_factors)
-        self._points[0].assign(previous.means[moving])
-        self.turns.assign(without_turn(self._count))
-        if self._graph is not None:
-            pairs = sound[:, None] & sound[self._graph.index]
-            self._pair_weights.assign(np.where(pairs, self._graph.weights, np.float32(0)))
+    def load_state(self, means: wp.array, factors: wp.array) -> None:
+        """Loads Θ_{t−1}: means and factors, [N] of vec3 and mat33."""
+        for array, values in (
+            (self._previous_means, means), (self._previous_factors, factors), (self.means, means),
+            (self.factors, factors),
+        ):  # fmt: skip
+            wp.copy(array, values)
+        self.unsound.zero_()
+        inputs = [self._rows, means, factors, self._sound, self._points[0], self.turns, self.unsound]
+        wp.launch(gaussian_deltas.take_moving, self._count, inputs, device=self._device)
+        wp.copy(self._turned[0], self.turns)
 
     @property
     def previous(self) -> tuple[wp.array, wp.array]:
-        """Returns means and factors of Θ_{t−1}, [N] of vec3 and mat33."""
+        """Means and factors of Θ_{t−1}, [N] of vec3 and mat33."""
         return self._previous_means, self._previous_factors
 
     def set_tables(self, tables: Tables) -> None:
         """Sets the parameters from host tables."""
-        for table, values in zip(self.clusters, tables.clusters, strict=True):
+        for table, values in zip([*self.clusters, self.deltas], [*tables.clusters, tables.deltas], strict=True):
             table.assign(values)
-        self.deltas.assign(tables.deltas)
 
-    def tables(self) -> Tables:
-        """Returns the parameters as host tables; waits for the device."""
-        return Tables([table.numpy().copy() for table in self.clusters], self.deltas.numpy().copy())
+    def begin(self, start: AttemptStart) -> bool:
+        """Starts an attempt from the current parameters; ``restart`` must follow.
 
-    def set_samples(self, samples: list[NDArray[np.int64]]) -> None:
-        """Sets the samples of an attempt whose neighbours are compared."""
-        self._samples = [self._upload(sample, wp.int32) for sample in samples]
+        Returns:
+            Whether buffers were replaced, which invalidates captured graphs.
+        """
+        for table, saved in zip([*self.clusters, self.deltas], self._saved, strict=True):
+            wp.copy(saved, table)
+        self._sample_sizes = [len(sample) for sample in start.samples]
+        samples = np.full((len(start.samples), max(self._sample_sizes, default=0)), -1, np.int32)
+        for row, sample in enumerate(start.samples):
+            samples[row, : len(sample)] = sample
+        replaced = bool(samples.shape != self._samples.shape)
+        if replaced:
+            self._samples = self._zeros(samples.shape, wp.int32)
+        self._samples.assign(samples)
+        return replaced
 
-    def forward(self) -> None:
-        """Evaluates equations (5) to (7); fills ``means``, ``factors`` and ``turns``."""
-        for layer, table in enumerate(self.clusters):
+    def restart(self, start: AttemptStart) -> None:
+        """Returns to the parameters at the beginning of the attempt, with zero moments."""
+        betas = start.beta1, start.beta2
+        for optimizer, columns in zip(self.optimizers, [*start.cluster_columns, start.delta_columns], strict=True):
+            optimizer.begin(columns, betas)
+        for table, saved in zip([*self.clusters, self.deltas], self._saved, strict=True):
+            wp.copy(table, saved)
+
+    def scalars(self, step: StepScalars) -> list[float]:
+        """Returns the scalars of an iteration for ``StepRecords.write``: weights, then those of each optimizer."""
+        plan, pairs = self._plan, 1
+        if self._graph is not None:
+            pairs = max(1, self._sample_sizes[step.sample] * self._graph.index.shape[1])
+        scalars = [step.rigidity / pairs, plan.isometry / pairs, plan.rotation / pairs]
+        for place, (optimizer, factor) in enumerate(zip(self.optimizers, [*step.layers, step.own], strict=True)):
+            scalars += optimizer.next_scalars(0.0 if place < step.frozen else factor)
+        return scalars
+
+    def forward(self, unchanged: int = 0) -> None:
+        """Evaluates equations (5) to (7); fills ``means``, ``factors`` and ``turns``.
+
+        Args:
+            unchanged: number of layers, starting with the coarsest, that have not changed since the last call.
+        """
+        for layer in range(unchanged, len(self.clusters)):
+            table = self.clusters[layer]
             inputs = [self._published, self._starts[layer], table, self._sound, *self._stage(layer)]
             inputs += [self._pivots[layer], *self._stage(layer + 1)]
             wp.launch(cluster_map.map_clusters, table.shape[0] * self._lanes, inputs, device=self._device)
         inputs = [self._terms, self._rows, self._sound, *self._stage(-1), self._previous_factors, self.deltas]
-        inputs += [self.means, self.factors, self.turns]
+        inputs += [self.means, self.factors, self.turns, self._tied_means, self._tied_turns]
         wp.launch(gaussian_deltas.apply_deltas, self._count, inputs, device=self._device)
 
     def _stage(self, layer: int) -> tuple[wp.array, wp.array, wp.array]:
         return self._points[layer], self._jacobians[layer], self._turned[layer]
 
-    def backward(self, g_means: wp.array, g_factors: wp.array, step: StepScalars) -> None:
-        """Fills ``delta_gradients``, ``cluster_gradients`` of the layers that are not frozen, and ``loss``.
+    def backward(self, g_means: wp.array, g_factors: wp.array, frozen: int, losses: wp.array) -> None:
+        """Computes the gradients and steps all parameters, except those of frozen layers.
 
         Args:
             g_means, g_factors: [N] of vec3 and mat33, gradients of the rendering losses.
+            frozen: number of frozen layers, starting with the coarsest.
+            losses: weighted terms by iteration, excluding rendering losses; added to.
         """
-        plan, device = self._plan, self._device
-        for array in (self.loss, self._tied_means, self._tied_turns):
-            array.zero_()
-        if plan.neighbour_terms and self._graph is not None:
-            sample = self._samples[step.sample]
-            pairs = max(1, sample.shape[0] * self._graph.index.shape[1])
-            weights = wp.vec3(step.rigidity / pairs, plan.isometry / pairs, plan.rotation / pairs)
+        device, iteration = self._device, self._records.iteration
+        if self._plan.neighbour_terms and self._graph is not None:
+            sampled = [self._records.weights, self._samples, self._records.sample, self._sound]
             graph = [self._neighbours, self._pair_weights, self._distances]
-            inputs = [weights, sample, *graph, self._rows, self._previous_means, self.means, self.turns]
-            inputs += [self._tied_means, self._tied_turns, self.loss]
-            wp.launch(neighbour_terms, sample.shape[0], inputs, device=device)
+            inputs = [*sampled, *graph, self._rows, self._previous_means, self.means, self.turns]
+            inputs += [self._tied_means, self._tied_turns, iteration, losses]
+            wp.launch(neighbour_terms, self._samples.shape[1], inputs, device=device)
         inputs = [self._terms, self._rows, self._sound, self._jacobians[-1], self._turned[-1], self._previous_factors]
         inputs += [self.deltas, self._bounds, self.means, self.factors, g_means, g_factors]
         inputs += [self._tied_means, self._tied_turns, self._g_points, self._g_jacobians, self._g_turned]
-        wp.launch(
-            gaussian_deltas.apply_deltas_backward, self._count, [*inputs, self.delta_gradients, self.loss],
-            device=device,
-        )  # fmt: skip
-        for layer in reversed(range(step.frozen, len(self.clusters))):
+        inputs += [self.gradients[-1], self.optimizers[-1].adam, iteration, losses]
+        wp.launch(gaussian_deltas.apply_deltas_backward, self._count, inputs, device=device)
+        for layer in reversed(range(frozen, len(self.clusters))):
             table = self.clusters[layer]
             inputs = [self._published, self._starts[layer], table, self._sound, *self._stage(layer)]
             inputs += [self._pivots[layer], self._g_points, self._g_jacobians, self._g_turned]
-            wp.launch(
-                cluster_map.map_clusters_backward, table.shape[0] * self._lanes,
-                [*inputs, self.cluster_gradients[layer]], device=device,
-            )  # fmt: skip
+            inputs += [self.gradients[layer], self.optimizers[layer].adam]
+            wp.launch(cluster_map.map_clusters_backward, table.shape[0] * self._lanes, inputs, device=device)

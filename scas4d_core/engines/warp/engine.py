@@ -1,44 +1,86 @@
-"""GPU engine: one iteration of an update in Warp, in the order of algorithm 1."""
+"""GPU engine: one iteration of an update in Warp, in the order of algorithm 1.
+
+The launches of an iteration are captured in a CUDA graph. What changes between iterations is read from device memory
+(``StepRecords``), so that the host only enqueues. It reads losses and results when the loop asks for them. If tile
+lists turn out to be too small, the attempt is repeated with larger ones.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import LearntGloss, features_seen, without_turn
-from scas4d_core.engines.engine import AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
-from scas4d_core.engines.gains import GainEstimator
+from scas4d_core.engines.engine import (
+    GAINS_MISSING,
+    KEPT_PICTURES,
+    AttemptStart,
+    IterationLog,
+    StepScalars,
+    Tables,
+    ViewRecord,
+)
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import psnr_of
 from scas4d_core.engines.views import LABEL, TrainingView
-from scas4d_core.engines.warp.adam import Adam
+from scas4d_core.engines.warp.adam import COUNTED_GUARDS as ADAM_GUARDS
 from scas4d_core.engines.warp.colours import WarpColours
 from scas4d_core.engines.warp.deformation import WarpDeformation
-from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES
+from scas4d_core.engines.warp.downloads import Downloads
+from scas4d_core.engines.warp.gains import WarpGains
+from scas4d_core.engines.warp.gloss import WarpGloss
+from scas4d_core.engines.warp.graphs import Graphs
+from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, PAIRS, SHIFT, SQUARES
 from scas4d_core.engines.warp.pictures import PicturePass
+from scas4d_core.engines.warp.projection import COUNTED_GUARDS as RENDERING_GUARDS
 from scas4d_core.engines.warp.renderer import WarpRenderer
+from scas4d_core.engines.warp.step_records import StepRecords
 from scas4d_core.gaussians import Gaussians, turned_rotations
 from scas4d_core.guards import GuardCounts, summed
 
 Array = NDArray[np.float32]
 
+MOST_VIEWS = 64
+"""Largest number of views per iteration."""
+LOG_ROWS = 1024
+"""Renderings that the device logs before the host reads them."""
+ITERATIONS = "iterations"
+"""Stage of an update in which the host enqueues iterations."""
+AHEAD = 2
+"""Iterations that may be pending while the time limit of an update is checked."""
+
+
+class Variant(NamedTuple):
+    """What determines the launches of an iteration.
+
+    Attributes:
+        views: number of views. unchanged: layers whose output is that of the previous iteration.
+        frozen: layers without backward pass. keeps: whether the renderings are kept.
+        smooths: whether the gloss is smoothed. smooths_first: whether this is the first time in the attempt.
+    """
+
+    views: int
+    unchanged: int
+    frozen: int
+    keeps: bool
+    smooths: bool
+    smooths_first: bool
+
 
 class WarpEngine:
     """The ``UpdateEngine`` based on NVIDIA Warp, on a GPU or on Warp's CPU device.
-
-    Kernels are launched individually, and the host reads the overflow flag after each rendering. Gloss and camera gains
-    are computed on the host from downloaded pictures and gradients.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
         renderer: renderer of states with the background and limits of the plan.
+        downloads: reads of device memory by the host.
     """
 
     name = "warp"
@@ -46,227 +88,338 @@ class WarpEngine:
 
     def __init__(self, device: str = "cuda:0") -> None:
         self._device = device
+        self.downloads = Downloads(device)
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
         """See ``UpdateEngine.bind``; this engine supports all options of a plan."""
         self._plan, self._structure, self._rows = plan, structure, structure.hierarchy.rows
-        self.renderer = WarpRenderer(plan.background, plan.limits, self._device, plan.image)
-        self._deformation = WarpDeformation(self._device, plan, structure)
-        self._pictures = PicturePass(self._device, plan, len(structure.roots))
+        count, device, layers = len(structure.roots), self._device, len(structure.hierarchy.sizes)
+        self.renderer = WarpRenderer(plan.background, plan.limits, device, plan.image)
+        # The optimizers: one per layer, then those of the deltas, the colours, the gloss and the environment.
+        self._records = StepRecords(device, layers + 4, MOST_VIEWS, LOG_ROWS)
+        _, colours, *self._gloss_scalars = (self._records.optimizer(layers + k) for k in range(4))
+        self._deformation = WarpDeformation(device, plan, structure, self._records)
+        self._pictures = PicturePass(device, plan, count)
+        self._colours = None if plan.colours is None else WarpColours(plan, count, self._rows, colours)
+        self._gains = WarpGains(device, len(plan.cameras)) if plan.camera_gains else None
+        self._gloss: WarpGloss | None = None
+        self._opacities = wp.zeros(count, dtype=wp.float32, device=device)
+        self._features, self._previous_features = (wp.zeros(count, dtype=wp.vec4, device=device) for _ in range(2))
+        self._losses = wp.zeros(LOG_ROWS, dtype=wp.float32, device=device)
+        self._probe_view, self._probe_row = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
+        self._graphs, self._captured_for = Graphs(device), object()
+        self._events: deque[wp.Event] = deque()
         self._views: list[TrainingView] = []
         self._probes: list[TrainingView] = []
-        self._view, self._record = (wp.zeros(1, dtype=wp.int32, device=self._device) for _ in range(2))
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
-        """See ``UpdateEngine.load_views``; if gains are estimated, the views get their own copies of the exposures."""
+        """See ``UpdateEngine.load_views``."""
         self._views, self._probes = list(views), list(probes)
-        if self._plan.camera_gains:
-            exposures = {view.name: view.exposure.copy() for view in views}
-            self._views = [replace(view, exposure=exposures[view.name]) for view in views]
-            self._probes = [replace(view, exposure=exposures[view.name]) for view in probes]
-        self._pictures.load_views([*self._views, *self._probes])
+        self._pictures.load_views([*views, *probes])
+        self._pictures.reserve(LOG_ROWS + len(probes))
+        if self._gains is not None:
+            rows = [self._camera_rows[view.name] for view in (*views, *probes)]
+            if self._gains.load_views(rows, len(views)):
+                self._graphs.forget()
 
     def load_state(self, previous: Gaussians) -> None:
         """See ``UpdateEngine.load_state``."""
         self._previous, device = previous, self._device
-        self._deformation.start(previous)
+        means = wp.array(previous.means, dtype=wp.vec3, device=device)
+        self._deformation.load_state(means, wp.array(previous.factors, dtype=wp.mat33, device=device))
+        self._opacities.assign(previous.opacities)
+        self._previous_features.assign(previous.features(previous.colours))
+        self._load_gloss()
         self._pictures.forget_guards()
-        self._opacities = wp.array(previous.opacities, dtype=wp.float32, device=device)
-        self._features = wp.array(previous.features(previous.colours), dtype=wp.float32, ndim=2, device=device)
-        self._gloss: LearntGloss | None = None
-        self._gains: GainEstimator | None = None
-        self._colours: WarpColours | None = None
-        self._layer_steps: list[Adam] = []
-        self._own_step: Adam | None = None
-        self._log = IterationLog()
+        self._start: AttemptStart | None = None
+        self._reset()
+
+    def _load_gloss(self) -> None:
+        """Loads the gloss of Θ_{t−1}, if it has one."""
+        previous, before = self._previous, self._gloss
+        if previous.gloss is None or previous.environment is None:
+            self._gloss = None
+        elif before is None or before.glossy != len(previous.gloss):
+            self._gloss = WarpGloss(previous, self._rows, self._structure.roots, *self._gloss_scalars)
+        if self._gloss is not before:
+            self._graphs.forget()
+        if self._gloss is not None:
+            self._gloss.load(previous)
+
+    @property
+    def _learnt_gloss(self) -> WarpGloss | None:
+        """The gloss, if the plan learns it; otherwise iterations render without gloss."""
+        return self._gloss if self._plan.gloss else None
 
     def set_tables(self, tables: Tables) -> None:
         """See ``UpdateEngine.set_tables``."""
         self._deformation.set_tables(tables)
+        self._unchanged = 0
 
     def begin(self, start: AttemptStart) -> None:
         """See ``UpdateEngine.begin``."""
-        plan, previous, deformation = self._plan, self._previous, self._deformation
-        self._start, self._log = start, IterationLog()
-        betas = start.beta1, start.beta2
-        if plan.colours is not None:
-            self._colours = WarpColours(plan, self._features, previous.colours, self._rows, start)
-        if plan.gloss and previous.gloss is not None and previous.environment is not None:
-            roots = self._structure.roots
-            self._gloss = LearntGloss(previous.gloss, previous.environment, len(previous), self._rows, roots)
-        if start.gains is not None:
-            self._gains = GainEstimator(start.gains, self._camera_rows, self._views)
-            self._expose()
-        self._layer_steps = [
-            Adam(table, rates, betas) for table, rates in zip(deformation.clusters, start.cluster_columns, strict=True)
-        ]
-        self._own_step = Adam(deformation.deltas, start.delta_columns, betas)
-        deformation.set_samples(list(start.samples))
+        self._start = start
+        replaced = self._deformation.begin(start)
+        # Graphs contain the addresses of buffers and the values of Adam's decay rates.
+        captured_for = start.beta1, start.beta2, start.gains is None, self._pictures.generation
+        if replaced or captured_for != self._captured_for:
+            self._graphs.forget()
+        self._captured_for = captured_for
+        self._reset()
+
+    def _reset(self) -> None:
+        """Returns what iterations change to the beginning of the attempt."""
+        wp.copy(self._features, self._previous_features)
+        self._losses.zero_()
+        self._log, self._history = IterationLog(), list[tuple[Sequence[int], StepScalars | None]]()
+        self._pending: list[Sequence[int]] = []
+        self._slots: dict[int, int] = {}
+        self._used_rows = self._unchanged = 0
+        self._smoothed = self._keeps_unread = False
+        if self._start is None:
+            return
+        self._deformation.restart(self._start)
+        if self._colours is not None:
+            self._colours.begin(self._start)
+        if self._gloss is not None:
+            self._gloss.reset()
+        if self._gains is not None and self._start.gains is not None:
+            self._gains.begin(self._start.gains, self._pictures.exposures)
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
-        """See ``UpdateEngine.iterate``."""
-        deformation, pictures, lap = self._deformation, self._pictures, self._start.lap
-        deformation.forward()
-        lap("cascade")
-        for gradient in (pictures.grad_means, pictures.grad_factors, pictures.grad_features):
-            gradient.zero_()
-        rows = [self._picture(index, 1.0 / len(views), step) for index in views]
-        lap("render backward")
-        deformation.backward(pictures.grad_means, pictures.grad_factors, step)
-        if self._colours is not None:
-            self._colours.backward(_as_table(pictures.grad_features), deformation.loss)
-        lap("cascade backward")
-        self._step(step)
-        loss = sum(row[IMAGE_LOSS] + row[MASK_LOSS] for row in rows) / len(views)
-        self._log.losses.append(float(loss + deformation.loss.numpy()[0]))
-        lap("adam")
+        """See ``UpdateEngine.iterate``.
 
-    def _picture(self, index: int, weight: float, step: StepScalars) -> Array:
-        """Renders a view, backpropagates its loss times a weight, and returns its row of the log."""
-        view, deformation, pictures = self._views[index], self._deformation, self._pictures
-        if self._gloss is None:
-            row = self._launched(index, _as_rows(self._features), weight)
+        Raises:
+            ValueError: more than ``MOST_VIEWS`` views.
+        """
+        if len(views) > MOST_VIEWS:
+            raise ValueError(f"update.views: {len(views)} views per iteration; this engine has room for {MOST_VIEWS}")
+        if self._used_rows + len(views) > LOG_ROWS:
+            self._settle()
+        self._history.append((views, step))
+        keeps = [self._slot(view) if step.keep_pictures else 0 for view in views]
+        rows = range(self._used_rows, self._used_rows + len(views))
+        self._records.write(
+            step.sample, len(self._pending), list(zip(views, rows, keeps, strict=True)), self._scalars(step)
+        )
+        variant = Variant(
+            len(views), self._unchanged, step.frozen, step.keep_pictures, step.smooth_gloss,
+            step.smooth_gloss and not self._smoothed,
+        )  # fmt: skip
+        self._graphs.run(variant, partial(self._launch, variant))
+        self._pending.append(views)
+        self._used_rows += len(views)
+        self._unchanged, self._smoothed = step.frozen, self._smoothed or step.smooth_gloss
+        assert self._start is not None  # iterations follow `begin`
+        self._start.lap(ITERATIONS)
+
+    def _slot(self, view: int) -> int:
+        """Returns the slot for a rendering of a view, as ``IterationLog.keep`` replaces kept pictures."""
+        self._keeps_unread = True
+        slot = self._slots.pop(view, len(self._slots))
+        if slot == KEPT_PICTURES:
+            slot = self._slots.pop(next(iter(self._slots)))
+        self._slots[view] = slot
+        return slot
+
+    def _scalars(self, step: StepScalars) -> list[float]:
+        """Returns the scalars of an iteration for ``StepRecords.write``; counts the steps of all optimizers."""
+        scalars = self._deformation.scalars(step)
+        idle = [0.0, 1.0, 1.0]
+        scalars += idle if self._colours is None else self._colours.optimizer.next_scalars(step.colour)
+        for place in range(2):
+            gloss = self._learnt_gloss
+            scalars += idle if gloss is None else gloss.optimizers[place].next_scalars(step.gloss)
+        return scalars
+
+    def _launch(self, variant: Variant) -> None:
+        """Enqueues an iteration."""
+        deformation, pictures, gloss = self._deformation, self._pictures, self._learnt_gloss
+        deformation.forward(variant.unchanged)
+        for place in range(variant.views):
+            self._launch_view(place, variant)
+        deformation.backward(pictures.grad_means, pictures.grad_factors, variant.frozen, self._losses)
+        if self._colours is not None:
+            tables = self._previous_features, pictures.grad_features, self._features
+            before, gradients, features = (_as_table(array) for array in tables)
+            self._colours.step(before, gradients, features, self._records.iteration, self._losses)
+        if gloss is not None:
+            gloss.step()
+            if variant.smooths:
+                gloss.smooth(variant.smooths_first)
+
+    def _launch_view(self, place: int, variant: Variant) -> None:
+        """Enqueues the rendering of a view of the iteration and its backward pass."""
+        deformation, pictures, gloss = self._deformation, self._pictures, self._learnt_gloss
+        view, record, slot = self._records.view(place)
+        shapes = deformation.means, deformation.factors, self._opacities
+        weight, add = 1.0 / variant.views, place > 0
+        if gloss is None:
+            pictures.launch(view, record, *shapes, self._features, weight, add=add)
         else:
-            means, turns = deformation.means.numpy(), deformation.turns.numpy()
-            seen, total = self._features.numpy().copy(), pictures.grad_features.numpy().copy()
-            colours = np.ascontiguousarray(seen[:, :LABEL])
-            self._gloss.shade(means, turns, colours, view.camera, seen)
-            pictures.grad_features.zero_()
-            row = self._launched(index, wp.array(seen, dtype=wp.vec4, device=self._device), weight)
-            own = pictures.grad_features.numpy() / np.float32(weight)
-            self._gloss.shade_backward(means, colours, view.camera, own)
-            pictures.grad_features.assign(total + np.float32(weight) * own)
-        if self._gains is not None or step.keep_pictures:
-            height, width = view.target.shape[1:]
-            planes = pictures.planes.numpy()[:, :height, :width]
-            if step.keep_pictures:
-                self._log.keep(index, Thinned.of(planes[: LABEL + 1], planes[LABEL + 1]))
-            if self._gains is not None:
-                self._gains.record_rendering(view, planes[:LABEL])
-                self._expose()
-        self._log.rendered.append(record_of(index, row, view))
-        return row
-
-    def _launched(self, index: int, features: wp.array, weight: float) -> Array:
-        """Renders a view, adds its gradients times a weight, and returns its row of the log."""
-        deformation, pictures = self._deformation, self._pictures
-        given = (self._view, self._record, deformation.means, deformation.factors, self._opacities, features)
-        return self._until_it_fits(index, lambda: pictures.launch(*given, weight))
-
-    def _until_it_fits(self, index: int, render: Callable[[], None]) -> Array:
-        """Renders a loaded view, again with larger lists after an overflow; returns its row of the log."""
-        self._view.fill_(index)
-        render()
-        while self._pictures.grow():  # the picture was empty and no gradient was added
-            render()
-        row: Array = self._pictures.log.numpy()[0]
-        return row
-
-    def _step(self, step: StepScalars) -> None:
-        """Steps Adam for all free parameters."""
-        deformation = self._deformation
-        for adam, gradient, factor in zip(self._layer_steps, deformation.cluster_gradients, step.layers, strict=True):
-            adam.step(gradient, factor)
-        assert self._own_step is not None  # set by `begin`
-        self._own_step.step(deformation.delta_gradients, step.own)
-        if self._colours is not None:
-            self._colours.step(step.colour)
-        if self._gloss is not None:
-            self._gloss.step(step.gloss, step.smooth_gloss)
-
-    def _expose(self) -> None:
-        """Uploads the exposures of the views and probes to the device."""
-        views = [*self._views, *self._probes]
-        exposures = np.zeros((len(views), LABEL + 1, 2), np.float32)
-        exposures[..., 0] = 1
-        for row, view in enumerate(views):
-            exposures[row, : len(view.exposure)] = view.exposure
-        self._pictures.exposures.assign(exposures)
+            seen = pictures.cameras, view, deformation.means, deformation.turns, self._features
+            gloss.shade(*seen, gloss.tables)
+            gloss.g_seen.zero_()
+            pictures.launch(view, record, *shapes, gloss.seen, weight, add=add, grad_features=gloss.g_seen)
+            gloss.shade_backward(*seen, pictures.grad_features, add)
+        if variant.keeps:
+            pictures.keep(view, slot)
+        if self._gains is not None and self._start is not None and self._start.gains is not None:
+            self._gains.record(pictures.cameras, view, pictures.planes, pictures.targets, pictures.exposures)
 
     def leave_out(self, views: Sequence[int]) -> None:
         """See ``UpdateEngine.leave_out``."""
+        self._history.append((views, None))
         if self._gains is not None:
-            self._gains.leave_out([self._views[index] for index in views])
+            left_out = {view for entry, step in self._history if step is None for view in entry}
+            self._gains.leave_out(left_out)
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``."""
-        wp.synchronize_device(self._device)
+        """See ``UpdateEngine.wait``; at most ``AHEAD`` iterations stay pending."""
+        if wp.get_device(self._device).is_cuda:
+            self._events.append(wp.get_stream(self._device).record_event())
+            if len(self._events) > AHEAD:
+                wp.synchronize_event(self._events.popleft())
+
+    def _settle(self) -> None:
+        """Reads the log of all pending iterations; the attempt is repeated while tile lists are too small."""
+        while self._pending and self._read_log() is None:
+            pass
+
+    def _read_log(self, probes: int = 0) -> Array | None:
+        """Reads the log of the pending iterations and the rows of probes; waits for the device.
+
+        Returns:
+            [probes, 8] rows of the probes; None if a picture was incomplete, because the tile lists were too small. The
+            lists are larger then, and the iterations have been repeated.
+        """
+        log, losses = self.downloads.read(self._pictures.log, self._losses)
+        rows, probed = log[: self._used_rows], log[LOG_ROWS : LOG_ROWS + probes]
+        if self._pictures.grow(rows[:, PAIRS].max(initial=0)):
+            self._repeat()
+            return None
+        first = 0
+        for views, terms in zip(self._pending, losses, strict=False):
+            own = rows[first : first + len(views)]
+            self._log.rendered += [
+                record_of(view, row, self._views[view]) for view, row in zip(views, own, strict=True)
+            ]
+            self._log.losses.append(float(own[:, [IMAGE_LOSS, MASK_LOSS]].sum() / len(views) + terms))
+            first += len(views)
+        self._pending, self._used_rows = [], 0
+        self._losses.zero_()
+        return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else probed
+
+    def _repeat(self) -> None:
+        """Repeats all iterations of the attempt, after buffers were replaced."""
+        self._graphs.forget()
+        history = self._history
+        self._pictures.forget_guards()
+        self._reset()
+        for views, step in history:
+            if step is None:
+                self.leave_out(views)
+            else:
+                self.iterate(views, step)
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """See ``UpdateEngine.probe``."""
-        deformation, pictures, state, turns = self._deformation, self._pictures, self._previous, None
+        while True:
+            self._launch_probes(which, moved, learnt)
+            rows = self._read_log(len(which))
+            if rows is not None:
+                return [float(loss) for loss in rows[:, IMAGE_LOSS]]
+
+    def _launch_probes(self, which: Iterable[int], moved: bool, learnt: bool) -> None:
+        """Enqueues the renderings of probe views; see ``UpdateEngine.probe``."""
+        deformation, pictures = self._deformation, self._pictures
         means, factors = deformation.previous
         if moved:
             deformation.forward()
             means, factors = deformation.means, deformation.factors
-        if learnt:
-            state = self._with_looks(state)
-        if state.gloss is not None and moved:
-            state = state.replace(means=means.numpy())
-            turns = without_turn(len(state))
-            turns[self._rows] = deformation.turns.numpy()
-        errors = []
-        for index in which:
-            seen = features_seen(state, self._probes[index].camera, turns)
-            features = wp.array(seen, dtype=wp.vec4, device=self._device)
-            given = (self._view, self._record, means, factors, self._opacities, features)
-            row = self._until_it_fits(len(self._views) + index, partial(pictures.measure, *given))
-            errors.append(float(row[IMAGE_LOSS]))
-        return errors
+        features = self._features if learnt else self._previous_features
+        turns = deformation.turns if moved else None
+        for place, index in enumerate(which):
+            self._probe_view.fill_(len(self._views) + index)
+            self._probe_row.fill_(LOG_ROWS + place)
+            seen = features
+            if self._gloss is not None:
+                tables = self._gloss.tables if learnt else self._gloss.before
+                self._gloss.shade(pictures.cameras, self._probe_view, means, turns, features, tables)
+                seen = self._gloss.seen
+            pictures.measure(self._probe_view, self._probe_row, means, factors, self._opacities, seen)
 
     def tables(self) -> Tables:
         """See ``UpdateEngine.tables``."""
-        return self._deformation.tables()
+        self._settle()
+        *clusters, deltas = self.downloads.read(*self._deformation.clusters, self._deformation.deltas)
+        return Tables(clusters, deltas)
 
     def log(self) -> IterationLog:
         """See ``UpdateEngine.log``."""
-        steps = [*self._layer_steps, *([] if self._own_step is None else [self._own_step])]
-        counts: list[GuardCounts] = [self._pictures.guards(), *(step.guards() for step in steps)]
-        if self._colours is not None:
-            counts.append(self._colours.guards())
-        acted = dict(summed(counts)) | {"held_back": self._deformation.held_back}
-        self._log.guards = {name: count for name, count in acted.items() if count}
+        self._settle()
+        if self._keeps_unread:
+            self._keeps_unread = False
+            kept = self._pictures.kept(
+                [(slot, self._views[view]) for view, slot in self._slots.items()], self.downloads
+            )
+            for view, picture in zip(self._slots, kept, strict=True):
+                self._log.keep(view, picture)
+        self._log.guards = self._guards()
         return self._log
+
+    def _guards(self) -> dict[str, int]:
+        """Returns the number of times that each guard was triggered; waits for the device."""
+        optimizers = [*self._deformation.optimizers]
+        optimizers += [] if self._colours is None else [self._colours.optimizer]
+        optimizers += [] if self._learnt_gloss is None else self._learnt_gloss.optimizers
+        arrays = [self._deformation.unsound, self._pictures.guard_counts]
+        unsound, rendered, *stepped = self.downloads.read(*arrays, *(each.adam.guard_counts for each in optimizers))
+        counts = [guard_counts(RENDERING_GUARDS, rendered), *(guard_counts(ADAM_GUARDS, each) for each in stepped)]
+        triggered = dict(summed(counts)) | {"held_back": int(unsound[0])}
+        return {name: count for name, count in triggered.items() if count}
 
     def state(self, learnt: bool) -> Gaussians:
         """See ``UpdateEngine.state``."""
+        self._settle()
         previous, deformation = self._previous, self._deformation
         deformation.forward()
-        rotations = turned_rotations(previous.rotations, self._rows, deformation.turns.numpy())
-        means, factors = deformation.means.numpy().copy(), deformation.factors.numpy().copy()
-        moved = previous.replace(means=means, factors=factors, rotations=rotations)
-        return self._with_looks(moved) if learnt else moved
+        arrays = [deformation.means, deformation.factors, deformation.turns]
+        if learnt:
+            arrays += [self._features, *([] if self._gloss is None else self._gloss.tables)]
+        means, factors, turns, *looks = self.downloads.read(*arrays)
+        rotations = turned_rotations(previous.rotations, self._rows, turns)
+        state = previous.replace(means=means, factors=factors, rotations=rotations)
+        if not learnt:
+            return state
+        state = state.replace(colours=np.ascontiguousarray(looks[0][:, :LABEL]))
+        return state if self._gloss is None else state.replace(gloss=looks[1], environment=looks[2])
 
     def exposures(self) -> Mapping[str, Array]:
         """See ``UpdateEngine.exposures``."""
-        return {view.name: view.exposure.copy() for view in self._views}
+        if self._gains is None:
+            return {view.name: view.exposure.copy() for view in self._views}
+        self._settle()
+        (exposures,) = self.downloads.read(self._pictures.exposures)
+        return {view.name: exposures[row, : len(view.exposure)].copy() for row, view in enumerate(self._views)}
 
     def gains(self) -> Array:
         """See ``UpdateEngine.gains``."""
-        if self._gains is None:
-            raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
-        self._gains.finish_round()
-        self._expose()
-        return self._gains.gains.copy()
+        if self._gains is None or self._start is None or self._start.gains is None:
+            raise ValueError(GAINS_MISSING)
+        self._settle()
+        return self._gains.finish(self._pictures.exposures)
 
     def gradients(self) -> dict[str, Array]:
         """See ``UpdateEngine.gradients``; those of frozen layers are not up to date."""
-        deformation = self._deformation
-        tables = {f"cluster {k}": table.numpy().copy() for k, table in enumerate(deformation.cluster_gradients)}
-        tables["deltas"] = deformation.delta_gradients.numpy().copy()
+        *clusters, deltas = self.downloads.read(*self._deformation.gradients)
+        tables = {f"cluster {k}": gradient for k, gradient in enumerate(clusters)} | {"deltas": deltas}
         if self._colours is not None:
-            tables["colours"] = self._colours.gradients.numpy().copy()
-        if self._gloss is not None:
-            tables["gloss"], tables["environment"] = (gradient.copy() for gradient in self._gloss.gradients)
+            (tables["colours"],) = self.downloads.read(self._colours.gradients)
+        if self._learnt_gloss is not None:
+            tables["gloss"], tables["environment"] = self.downloads.read(*self._learnt_gloss.gradients)
         return tables
-
-    def _with_looks(self, state: Gaussians) -> Gaussians:
-        """Returns a state with the colours, gloss and environment learned so far."""
-        state = state.replace(colours=np.ascontiguousarray(self._features.numpy()[:, :LABEL]))
-        if self._gloss is None:
-            return state
-        return state.replace(gloss=self._gloss.gloss.copy(), environment=self._gloss.environment.copy())
 
 
 def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
@@ -276,9 +429,11 @@ def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
     return ViewRecord(index, psnr_of(float(row[SQUARES]), height * width), (red, green, blue))
 
 
-def _as_rows(table: wp.array) -> wp.array:
-    """Views a table [N, 4] as [N] of vec4 without copying."""
-    return wp.array(ptr=table.ptr, dtype=wp.vec4, shape=table.shape[0], device=table.device)
+def guard_counts(names: Sequence[str], values: NDArray[np.int32]) -> GuardCounts:
+    """Converts counts from the device."""
+    counts = GuardCounts(*names)
+    counts.add(names, values.astype(np.int64))
+    return counts
 
 
 def _as_table(rows: wp.array) -> wp.array:

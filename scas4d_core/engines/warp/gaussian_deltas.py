@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from scas4d_core.engines.warp.adam import Adam, step_element
 from scas4d_core.engines.warp.cluster_map import LARGEST
 from scas4d_core.engines.warp.quaternions import (
     conjugate,
@@ -51,6 +52,33 @@ def stretch(ds: wp.vec3) -> wp.mat33:
 
 
 @wp.kernel
+def take_moving(
+    rows: wp.array[wp.int32],
+    previous_means: wp.array[wp.vec3],
+    previous_factors: wp.array[wp.mat33],
+    sound: wp.array[wp.int32],
+    points: wp.array[wp.vec3],
+    turns: wp.array[wp.vec4],
+    unsound: wp.array[wp.int32],
+) -> None:
+    """Gathers the moving Gaussians of Θ_{t−1}, with one thread each.
+
+    Args:
+        rows: [M] rows of the Gaussians in Θ. previous_means, previous_factors: [N] of Θ_{t−1}.
+        sound: out [M] 1 for entries that are finite. points: out [M]. turns: out [M] identity.
+        unsound: [1], to which the number of other entries is added.
+    """
+    entry = wp.tid()
+    mean = previous_means[rows[entry]]
+    points[entry] = mean
+    turns[entry] = wp.vec4(1.0, 0.0, 0.0, 0.0)
+    sound[entry] = 1
+    if not (wp.isfinite(mean) and wp.isfinite(previous_factors[rows[entry]])):
+        sound[entry] = 0
+        wp.atomic_add(unsound, 0, 1)
+
+
+@wp.kernel
 def apply_deltas(
     terms: Terms,
     rows: wp.array[wp.int32],
@@ -63,6 +91,8 @@ def apply_deltas(
     means: wp.array[wp.vec3],
     factors: wp.array[wp.mat33],
     turns: wp.array[wp.vec4],
+    tied_means: wp.array[wp.vec3],
+    tied_turns: wp.array[wp.vec4],
 ) -> None:
     """Applies Δp, ΔR, Δs after the cascade, with one thread per moving Gaussian.
 
@@ -70,8 +100,11 @@ def apply_deltas(
         rows: [M] rows of the Gaussians in Θ. sound: [M] 1 for entries that are finite; others stay unchanged.
         points, jacobians, turned: [M] after the cascade. previous_factors: [N] of Θ_{t−1}. deltas: [M, 9].
         means, factors: out [N], the moving rows. turns: out [M] unit quaternions with w ≥ 0.
+        tied_means, tied_turns: [M] gradients of the neighbour terms, set to 0.
     """
     entry = wp.tid()
+    tied_means[entry] = wp.vec3(0.0, 0.0, 0.0)
+    tied_turns[entry] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if sound[entry] == 1:
         row = rows[entry]
         q = of_tangent(delta(deltas, entry, 3))
@@ -104,16 +137,21 @@ def apply_deltas_backward(
     g_jacobians: wp.array[wp.mat33],
     g_turned: wp.array[wp.vec4],
     g_deltas: wp.array2d[wp.float32],
-    loss: wp.array[wp.float32],
+    adam: Adam,
+    iteration: wp.array[wp.int32],
+    losses: wp.array[wp.float32],
 ) -> None:
-    """Backpropagates gradients of the moved Gaussians to deltas and cascade; adds the scale and floor terms.
+    """Backpropagates gradients of the moved Gaussians to deltas and cascade, and steps the deltas.
+
+    Adds the scale and floor terms.
 
     Args:
         terms, rows, sound, jacobians, turned, previous_factors, deltas: see ``apply_deltas``.
         length_bounds: [M] metres; longer axes are penalized (equation (8)). means, factors: [N] after deformation.
         g_means, g_factors: [N] gradients of the rendering losses. tied_means, tied_turns: [M] of the neighbour terms.
         g_points, g_jacobians, g_turned: out [M] gradients of the cascade's outputs. g_deltas: out [M, 9].
-        loss: [1], to which the weighted scale and floor terms are added.
+        adam: optimizer of the deltas.
+        iteration: [1] row of ``losses``, to which the weighted scale and floor terms are added.
     """
     entry = wp.tid()
     if sound[entry] == 0:
@@ -163,8 +201,10 @@ def apply_deltas_backward(
     for k in range(3):
         g_deltas[entry, k] = g_mean[k]
         g_deltas[entry, 3 + k] = g_r[k]
+    for k in range(9):
+        step_element(adam, deltas, entry, k, g_deltas[entry, k])
     g_points[entry] = g_mean
     g_jacobians[entry] = g_jacobian
     g_turned[entry] = product(conjugate(q), g_turn)
     if here != 0.0:
-        wp.atomic_add(loss, 0, here)
+        wp.atomic_add(losses, iteration[0], here)

@@ -26,7 +26,8 @@ COLUMNS = 8
 """Columns of the log, which has one row per rendering."""
 IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
 """Columns of the log: weighted losses, sum of squared RGB differences, mean of the picture minus mean of the rendering
-(three columns, RGB in 0…1, with exposure), and number of tile-list entries."""
+(three columns, RGB in 0…1, with exposure), and number of tile-list entries, or the capacity that would hold them with
+room to spare, if they exceed it."""
 
 
 @wp.struct
@@ -52,6 +53,7 @@ class Raster:
         capacity: maximum number of entries in all lists of one picture.
         alpha_floor, alpha_cap, stop, low_pass, near, margin: the fields of ``Limits``.
         log_floor: natural logarithm of ``alpha_floor``.
+        detached: 1 if the gradient of the label only reaches the labels, not the shapes.
     """
 
     count: wp.int32
@@ -67,6 +69,7 @@ class Raster:
     near: wp.float32
     margin: wp.float32
     log_floor: wp.float32
+    detached: wp.int32
 
 
 def camera_of(camera: CameraArrays) -> Camera:
@@ -79,16 +82,17 @@ def camera_of(camera: CameraArrays) -> Camera:
     return made
 
 
-def raster_of(limits: Limits, count: int, columns: int, rows: int, capacity: int) -> Raster:
+def raster_of(limits: Limits, count: int, columns: int, rows: int, capacity: int, detached: bool = False) -> Raster:
     """Returns the kernel structure of the rasterizer constants.
 
     Args:
-        count: number of Gaussians. columns, rows: size of the largest picture in pixels. capacity: see ``Raster``.
+        count: number of Gaussians. columns, rows: size of the largest picture in pixels.
+        capacity, detached: see ``Raster``.
     """
     made = Raster()
     made.count, made.columns, made.rows, made.capacity = count, columns, rows, capacity
     made.tiles_x, made.tiles_y = -(-columns // TILE), -(-rows // TILE)
     made.alpha_floor, made.alpha_cap, made.stop = limits.alpha_floor, limits.alpha_cap, limits.transmittance_stop
     made.low_pass, made.near, made.margin = limits.low_pass, limits.near, limits.tangent_margin
-    made.log_floor = log(limits.alpha_floor)
+    made.log_floor, made.detached = log(limits.alpha_floor), int(detached)
     return made

@@ -14,8 +14,10 @@ FLOOR = wp.constant(wp.float32(ROOT_FLOOR))
 
 @wp.kernel
 def neighbour_terms(
-    weights: wp.vec3,
+    weights: wp.array[wp.float32],
+    samples: wp.array2d[wp.int32],
     sample: wp.array[wp.int32],
+    sound: wp.array[wp.int32],
     neighbours: wp.array2d[wp.int32],
     pair_weights: wp.array2d[wp.float32],
     distances: wp.array2d[wp.float32],
@@ -25,7 +27,8 @@ def neighbour_terms(
     turns: wp.array[wp.vec4],
     tied_means: wp.array[wp.vec3],
     tied_turns: wp.array[wp.vec4],
-    loss: wp.array[wp.float32],
+    iteration: wp.array[wp.int32],
+    losses: wp.array[wp.float32],
 ) -> None:
     """Accumulates the three terms and their gradients, with one thread per sampled Gaussian.
 
@@ -33,12 +36,18 @@ def neighbour_terms(
     full-size gradients.
 
     Args:
-        weights: weights of rigidity, isometry and rotation per pair; 0: no such term.
-        sample: [S] entries. neighbours, pair_weights, distances: [M, k]; weights are 0 for unused pairs.
+        weights: [3] weights of rigidity, isometry and rotation per pair; 0: no such term.
+        samples: [samples, S] entries; −1 fills short samples. sample: [1] index of the sample. sound: [M] 1 for entries
+            that are finite. neighbours, pair_weights, distances: [M, k]; weights are 0 for unused pairs.
         rows: [M] rows of the Gaussians in Θ. previous, means: [N] of Θ_{t−1} and after deformation. turns: [M].
-        tied_means, tied_turns: [M] accumulated gradients. loss: [1], to which the weighted terms are added.
+        tied_means, tied_turns: [M] accumulated gradients.
+        iteration: [1] row of ``losses``, to which the weighted terms are added.
     """
-    i = sample[wp.tid()]
+    i = samples[sample[0], wp.tid()]
+    if i < 0:
+        return
+    if sound[i] == 0:
+        return
     here = wp.float32(0.0)
     turn = turns[i]
     rotation = matrix_of(turn)
@@ -48,8 +57,8 @@ def neighbour_terms(
     g_turn = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for k in range(neighbours.shape[1]):
         weight = pair_weights[i, k]
-        if weight > 0.0:
-            j = neighbours[i, k]
+        j = neighbours[i, k]
+        if weight > 0.0 and sound[j] == 1:
             g_other = wp.vec3(0.0, 0.0, 0.0)
             offset = means[rows[j]] - mean
             if weights[0] > 0.0:
@@ -76,4 +85,4 @@ def neighbour_terms(
             wp.atomic_add(tied_means, j, g_other)
     wp.atomic_add(tied_means, i, g_mean)
     wp.atomic_add(tied_turns, i, g_turn)
-    wp.atomic_add(loss, 0, here)
+    wp.atomic_add(losses, iteration[0], here)

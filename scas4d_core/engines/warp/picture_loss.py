@@ -217,6 +217,7 @@ def picture_loss(
     starts: wp.array[wp.int32],
     background: wp.array[wp.vec4],
     blank: wp.array3d[wp.int32],
+    everywhere: wp.int32,
     by_window: wp.array3d[wp.vec3],
     log: wp.array2d[wp.float32],
 ) -> None:
@@ -233,6 +234,7 @@ def picture_loss(
         planes: [4 or more, rows, columns] the rendering.
         targets, means, squares: [views, 4, rows, columns] see ``target_moments``.
         tiles_x, starts, background: tile lists and background of the rendering. blank: see ``find_blank``.
+        everywhere: 1 to write all derivatives.
         by_window: out [4, rows, columns] derivatives by SSIM's windowed mean, mean square and mean product.
         log: [records, ``COLUMNS``], accumulated.
     """
@@ -241,7 +243,7 @@ def picture_loss(
     loss = wp.float32(0.0)
     squared = wp.float32(0.0)
     shift = wp.float32(0.0)
-    if at.compared == 1 and not nothing_near(at, tiles_x, starts, background, blank):
+    if at.compared == 1 and (everywhere == 1 or not nothing_near(at, tiles_x, starts, background, blank)):
         mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
         square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         product = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -307,12 +309,13 @@ def picture_gradient(
     targets: wp.array4d[wp.float32],
     tiles_x: wp.int32,
     starts: wp.array[wp.int32],
+    everywhere: wp.int32,
     by_window: wp.array3d[wp.vec3],
     g_planes: wp.array3d[wp.float32],
 ) -> None:
     """Fills the gradient of a view's loss with respect to the planes; the launch is that of ``picture_loss``.
 
-    Tiles with empty lists are not written, because nothing there has a gradient.
+    Tiles with empty lists are not written unless ``everywhere`` is 1, because no Gaussian has a gradient there.
 
     Args:
         weights: weight of each channel's mean. by_window: from ``picture_loss``.
@@ -323,7 +326,7 @@ def picture_gradient(
     some = wp.int32(0)
     if at.shown == 1:
         tile = (at.y // TILE) * tiles_x + x // TILE
-        some = starts[tile + 1] - starts[tile]
+        some = starts[tile + 1] - starts[tile] + everywhere
     if some > 0:
         by_mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
         by_square = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -354,19 +357,47 @@ def picture_gradient(
                 g_planes[channel, y, x] = g
 
 
+@wp.kernel
+def exposure_gradient(
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    exposures: wp.array2d[wp.vec2],
+    planes: wp.array3d[wp.float32],
+    g_planes: wp.array3d[wp.float32],
+    gradients: wp.array[wp.vec2],
+) -> None:
+    """Accumulates the gradient of gain and offset, with one thread per channel and column.
+
+    Args:
+        exposures: [views, 4] gain and offset. planes, g_planes: rendering, and gradient of the loss everywhere in it.
+        gradients: [4], accumulated.
+    """
+    channel, x = wp.tid()
+    camera = cameras[view[0]]
+    if x < camera.width:
+        by_gain = wp.float32(0.0)
+        by_offset = wp.float32(0.0)
+        for y in range(camera.height):
+            g = g_planes[channel, y, x]
+            by_gain += g * planes[channel, y, x]
+            by_offset += g
+        wp.atomic_add(gradients, channel, wp.vec2(by_gain, by_offset) / exposures[view[0], channel][0])
+
+
 class PictureLoss:
     """The pictures of a frame on a device, and the loss of a rendering compared with one of them.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0". image_weight, mask_weight: weights of the two terms.
+        everywhere: whether the gradient is needed in pixels without Gaussians, as for exposures.
 
     Attributes:
         columns, rows: size of the largest picture so far, in pixels.
         cameras: [views] of type ``Camera``. exposures: [views, 4] of vec2, gain and offset of each channel.
     """
 
-    def __init__(self, device: str, image_weight: float, mask_weight: float) -> None:
-        self._device = device
+    def __init__(self, device: str, image_weight: float, mask_weight: float, everywhere: bool = False) -> None:
+        self._device, self._everywhere = device, int(everywhere)
         self._weights = [image_weight / 3] * 3 + [mask_weight]
         self._taken: list[Array | None] = []
         self._sent: wp.Event | None = None
@@ -420,15 +451,28 @@ class PictureLoss:
         """
         given = [self.cameras, self.channels, view, record, *self._window, self.exposures, wp.vec4(*self._weights)]
         targets = [drawn.planes, self.targets, self.target_means, self.target_squares]
-        kept = [drawn.tiles_x, drawn.starts, background, self._blank, self._by_window, log]
+        kept = [drawn.tiles_x, drawn.starts, background, self._blank, self._everywhere, self._by_window, log]
         wp.launch(picture_loss, self._threads, given + targets + kept, device=self._device)
 
     def carry_back(self, view: wp.array, drawn: Rasterizer, weight: float) -> None:
         """Fills ``drawn.g_planes`` with the gradient of the last measured loss, times a weight."""
         weights = wp.vec4(*(weight * each for each in self._weights))
         given = [self.cameras, self.channels, view, *self._window, self.exposures, weights]
-        kept = [drawn.planes, self.targets, drawn.tiles_x, drawn.starts, self._by_window, drawn.g_planes]
+        kept = [drawn.planes, self.targets, drawn.tiles_x, drawn.starts, self._everywhere, self._by_window]
+        kept += [drawn.g_planes]
         wp.launch(picture_gradient, self._threads, given + kept, device=self._device)
+
+    def exposure_gradient(self, view: wp.array, drawn: Rasterizer, gradients: wp.array) -> None:
+        """Fills the gradient, [4] of vec2, of the view's gain and offset from ``drawn.g_planes``."""
+        gradients.zero_()
+        inputs = [self.cameras, view, self.exposures, drawn.planes, drawn.g_planes, gradients]
+        wp.launch(exposure_gradient, (CHANNELS, self.columns), inputs, device=self._device)
+
+    def set_exposure(self, index: int, view: TrainingView) -> None:
+        """Uploads the current exposure of a loaded view."""
+        values = np.tile(np.array([1, 0], np.float32), (CHANNELS, 1))
+        values[: len(view.exposure)] = view.exposure
+        self.exposures[index].assign(values)
 
     def _allocate(self, views: int, columns: int, rows: int) -> None:
         """Allocates buffers for a number of views, and marks all pictures for upload."""

@@ -4,33 +4,60 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import warp as wp
 
+from scas4d_core.engines.engine import KEPT_PICTURES, KEPT_ROWS, Thinned, kept_step
 from scas4d_core.engines.plan import UpdatePlan
+from scas4d_core.engines.renderer import CHANNELS
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.layout import COLUMNS
+from scas4d_core.engines.warp.downloads import Downloads
+from scas4d_core.engines.warp.layout import COLUMNS, Camera
 from scas4d_core.engines.warp.picture_loss import PictureLoss
-from scas4d_core.engines.warp.projection import COUNTED_GUARDS
 from scas4d_core.engines.warp.rasterizer import Rasterizer
-from scas4d_core.guards import GuardCounts
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def step_of(camera: Camera) -> wp.int32:
+    """Returns the step between the kept rows and columns of a picture; see ``engine.Thinned``."""
+    return wp.max(1, wp.min(camera.height, camera.width) // KEPT_ROWS)
+
+
+@wp.kernel
+def keep_picture(
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    slot: wp.array[wp.int32],
+    planes: wp.array3d[wp.float32],
+    kept: wp.array4d[wp.float32],
+) -> None:
+    """Copies a subsampled rendering, with one thread per element of a slot.
+
+    Args:
+        slot: [1] index of the slot. planes: [5, rows, columns]. kept: [slots, 5, rows, columns].
+    """
+    plane, y, x = wp.tid()
+    camera = cameras[view[0]]
+    every = step_of(camera)
+    if every * y < camera.height and every * x < camera.width:
+        kept[slot[0], plane, y, x] = planes[plane, every * y, every * x]
 
 
 class PicturePass:
     """Renders, compares and backpropagates the views of an iteration one after the other.
 
-    ``launch`` and ``measure`` can be captured in a CUDA graph after each has run once, which compiles the kernels. A
-    graph is valid while ``generation`` does not change.
+    ``launch``, ``measure`` and ``keep`` can be captured in a CUDA graph after each has run once, which compiles the
+    kernels. A graph is valid while ``generation`` does not change.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0". plan: plan of the updates. count: N Gaussians.
 
     Attributes:
-        grad_means, grad_factors, grad_features: [N] of vec3, mat33 and vec4, accumulated by ``launch``.
+        grad_means, grad_factors, grad_features: [N] of vec3, mat33 and vec4, filled by ``launch``.
         planes: [5, rows, columns] of the last rendering: RGB before exposure, label, remaining transmittance.
         exposures: [views, 4] of vec2, gain and offset; may be changed between launches.
         log: [records, 8] float32, columns as in ``layout``.
-        overflow: [1] int32, set to 1 if a picture is empty because its lists exceeded the capacity; see ``grow``.
         generation: number of times that buffers were replaced.
     """
 
@@ -43,6 +70,7 @@ class PicturePass:
         self.grad_factors = wp.zeros(count, dtype=wp.mat33, device=device)
         self.grad_features = wp.zeros(count, dtype=wp.vec4, device=device)
         self.log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
+        self._kept = wp.zeros((0, 0, 0, 0), dtype=wp.float32, device=device)
         self.generation = 0
 
     @property
@@ -60,24 +88,31 @@ class PicturePass:
         return self._loss.cameras
 
     @property
-    def overflow(self) -> wp.array:  # noqa: D102
-        return self._rasterizer.overflow
+    def targets(self) -> wp.array:
+        """[views, 4, rows, columns] pictures and masks."""
+        return self._loss.targets
 
-    def guards(self) -> GuardCounts:
-        """Returns how often the rendering guards were triggered since ``forget_guards``; waits for the device."""
-        counts = GuardCounts(*COUNTED_GUARDS)
-        counts.add(COUNTED_GUARDS, self._rasterizer.guard_counts.numpy().astype(np.int64))
-        return counts
+    @property
+    def guard_counts(self) -> wp.array:
+        """[3] number of times that the guards ``projection.COUNTED_GUARDS`` were triggered."""
+        return self._rasterizer.guard_counts
 
     def forget_guards(self) -> None:
         """Resets the counts of the guards to 0."""
-        self._rasterizer.guard_counts.zero_()
+        self.guard_counts.zero_()
 
     def load_views(self, views: Sequence[TrainingView]) -> None:
         """Uploads the pictures, cameras and exposures of a frame; pictures that are already loaded are reused."""
-        if self._loss.load(views):
+        replaced = self._loss.load(views)
+        if replaced:
             self._rasterizer.resize(self._loss.columns, self._loss.rows)
-            self.generation += 1
+        sizes = [kept_size(view) for view in views]
+        rows, columns = max(rows for rows, _ in sizes), max(columns for _, columns in sizes)
+        if rows > self._kept.shape[2] or columns > self._kept.shape[3]:
+            shape = (KEPT_PICTURES, CHANNELS + 1, max(rows, self._kept.shape[2]), max(columns, self._kept.shape[3]))
+            self._kept = wp.zeros(shape, dtype=wp.float32, device=self._device)
+            replaced = True
+        self.generation += replaced
 
     def reserve(self, records: int) -> None:
         """Allocates log rows for a number of records; the previous contents may be lost."""
@@ -85,9 +120,9 @@ class PicturePass:
             self.log = wp.zeros((records, COLUMNS), dtype=wp.float32, device=self._device)
             self.generation += 1
 
-    def grow(self) -> bool:
-        """Enlarges the lists after an overflow and returns whether there was one; waits for the device."""
-        grew = self._rasterizer.grow()
+    def grow(self, room: float) -> bool:
+        """Enlarges the tile lists if a picture needs more room; see ``Rasterizer.grow``."""
+        grew = self._rasterizer.grow(room)
         self.generation += grew
         return grew
 
@@ -109,12 +144,38 @@ class PicturePass:
 
     def launch(
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
-        features: wp.array, weight: float,
+        features: wp.array, weight: float, *, add: bool, grad_features: wp.array | None = None,
     ) -> None:  # fmt: skip
-        """Runs ``measure`` and adds the gradients, times a weight, to ``grad_means`` etc."""
+        """Runs ``measure`` and backpropagates.
+
+        Args:
+            weight: factor on all gradients. add: add to the gradients of another view instead of overwriting them.
+            grad_features: [N] of vec4 for the gradient of the features; the attribute if None.
+        """
         self.measure(view, record, means, factors, opacities, features)
         rasterizer, cameras = self._rasterizer, self._loss.cameras
         self._loss.carry_back(view, rasterizer, weight)
         rasterizer.carry_back(cameras, view, features)
-        gradients = self.grad_means, self.grad_factors, self.grad_features
-        rasterizer.carry_to_world(cameras, view, means, factors, *gradients)
+        features_out = self.grad_features if grad_features is None else grad_features
+        gradients = self.grad_means, self.grad_factors, features_out
+        rasterizer.carry_to_world(cameras, view, means, factors, *gradients, add=add)
+
+    def keep(self, view: wp.array, slot: wp.array) -> None:
+        """Keeps the last rendering, subsampled, in a slot; both arguments are [1] int32."""
+        inputs = [self._loss.cameras, view, slot, self.planes, self._kept]
+        wp.launch(keep_picture, self._kept.shape[1:], inputs, device=self._device)
+
+    def kept(self, slots: Sequence[tuple[int, TrainingView]], downloads: Downloads) -> list[Thinned]:
+        """Returns kept pictures, each given by slot and view; waits for the device."""
+        (kept,), pictures = downloads.read(self._kept), []
+        for slot, view in slots:
+            rows, columns = kept_size(view)
+            every = kept_step(view.camera.height, view.camera.width)
+            pictures.append(Thinned(every, kept[slot, :, :rows, :columns].copy()))
+        return pictures
+
+
+def kept_size(view: TrainingView) -> tuple[int, int]:
+    """Returns the rows and columns of a kept rendering of a view."""
+    every = kept_step(view.camera.height, view.camera.width)
+    return -(-view.camera.height // every), -(-view.camera.width // every)

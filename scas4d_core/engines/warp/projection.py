@@ -163,6 +163,7 @@ def project_backward(
     splats: wp.array[wp.vec4],
     records: wp.array[wp.vec4],
     guard_counts: wp.array[wp.int32],
+    adds: wp.int32,
     g_means: wp.array[wp.vec3],
     g_factors: wp.array[wp.mat33],
     g_features: wp.array[wp.vec4],
@@ -171,11 +172,15 @@ def project_backward(
 
     Args:
         raster, cameras, view, means, factors: see ``project``. splats: from it. records: from ``blend_backward``.
-        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, accumulated. g_means, g_factors, g_features: [N],
-            accumulated.
+        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, accumulated.
+        adds: 1 to add to the gradients, 0 to overwrite them. g_means, g_factors, g_features: [N] gradients.
     """
     i = wp.tid()
     second = load(splats, 2 * i + 1)
+    if adds == 0:
+        g_means[i] = wp.vec3(0.0, 0.0, 0.0)
+        g_factors[i] = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        g_features[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if second[2] > 0.0:
         first = load(splats, 2 * i)
         r0 = load(records, RECORD * i)

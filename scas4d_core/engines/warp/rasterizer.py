@@ -27,21 +27,20 @@ class Rasterizer:
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0". count: number of Gaussians. limits: constants of the rasterizer.
+        detached: whether the gradient of the label only reaches the labels.
 
     Attributes:
-        count: number of Gaussians.
+        count: number of Gaussians; see ``draw_fewer``.
         planes: [5, rows, columns] of the last picture: four features, with background, and remaining transmittance.
         g_planes: [4, rows, columns] gradient that ``carry_back`` reads.
         splats, records: [2 N] and [4 N] of vec4, see ``projection``.
         starts, items: [tiles + 1] and [capacity] tile lists of the last picture. tiles_x: number of tiles in a row.
-        overflow: [1] set to 1 on the device if the lists of a picture exceeded the capacity; that picture is rendered
-            empty.
         guard_counts: [3] number of times that the guards ``projection.COUNTED_GUARDS`` were triggered.
-        capacity: maximum number of list entries.
+        capacity: maximum number of list entries; a picture that needs more is rendered empty, see ``grow``.
     """
 
-    def __init__(self, device: str, count: int, limits: Limits = DEFAULT) -> None:
-        self._device, self.count, self._limits = device, count, limits
+    def __init__(self, device: str, count: int, limits: Limits = DEFAULT, detached: bool = False) -> None:
+        self._device, self.count, self._limits, self._detached = device, count, limits, detached
         self._lanes = lanes_of(device)
         self._warps = max(1, WARPS_EACH * wp.get_device(device).sm_count)
         self._columns = self._rows = 0
@@ -50,13 +49,12 @@ class Rasterizer:
         self.records = wp.zeros(projection.RECORD * count, dtype=wp.vec4, device=device)
         self._boxes = wp.zeros(count, dtype=wp.vec4i, device=device)
         self.guard_counts = wp.zeros(len(projection.COUNTED_GUARDS), dtype=wp.int32, device=device)
-        self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
 
     def resize(self, columns: int, rows: int) -> None:
         """Allocates buffers for pictures of a given size and for ``capacity`` list entries."""
         device = self._device
         self._columns, self._rows = columns, rows
-        self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity)
+        self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity, self._detached)
         self.tiles_x = -(-columns // TILE)
         self._tiles = self.tiles_x * -(-rows // TILE)
         segments = self.capacity // SEGMENT + self._tiles
@@ -72,20 +70,26 @@ class Rasterizer:
         self._keys = wp.zeros(self.capacity, dtype=wp.uint64, device=device)
         self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
 
+    def draw_fewer(self, count: int) -> None:
+        """Sets the number of Gaussians, at most that of the buffers."""
+        self.count = self._raster.count = count
+
     def holds(self, columns: int, rows: int) -> bool:
         """Returns whether pictures of a given size fit into the buffers."""
         return columns <= self._columns and rows <= self._rows
 
-    def grow(self) -> bool:
-        """Doubles the capacity after an overflow; waits for the device.
+    def grow(self, room: float) -> bool:
+        """Enlarges the lists if a picture needs more room.
+
+        Args:
+            room: largest value of the column ``layout.PAIRS`` of the log.
 
         Returns:
             Whether buffers were replaced, which invalidates captured graphs.
         """
-        if self.overflow.numpy()[0] == 0:
+        if room <= self.capacity:
             return False
-        self.overflow.zero_()
-        self.capacity *= 2
+        self.capacity = int(room)
         self.resize(self._columns, self._rows)
         return True
 
@@ -98,8 +102,7 @@ class Rasterizer:
         Args:
             cameras: array of ``Camera``. view: [1] index of the camera.
             means, factors, opacities, features: [N] of vec3, mat33, float32 and vec4.
-            record, log: [1] and [records, 8]: this row of the log is reset to 0, except its second to last value,
-                which is set to the number of list entries.
+            record, log: [1] and [records, 8]: this row of the log is reset to 0, except the column ``PAIRS``.
         """
         device, view_of = self._device, [cameras, view]
         count = -(-self.count // self._lanes) * self._lanes
@@ -107,7 +110,7 @@ class Rasterizer:
         out = [self.splats, self._boxes, self.records, self.guard_counts, self._tile_counts, self.starts, self._keys]
         wp.launch(projection.project, count, [self._raster, *view_of, *given, *out], device=device)
         threads = tiles.SCAN_BLOCK if self._lanes > 1 else 1
-        lists = [self.starts, self._segment_starts, self.overflow, record, log]
+        lists = [self.starts, self._segment_starts, record, log]
         wp.launch(
             tiles.place_lists, threads, [threads, self._raster, self._tile_counts, *lists], device=device,
             block_dim=tiles.SCAN_BLOCK,
@@ -140,11 +143,15 @@ class Rasterizer:
 
     def carry_to_world(
         self, cameras: wp.array, view: wp.array, means: wp.array, factors: wp.array, g_means: wp.array,
-        g_factors: wp.array, g_features: wp.array,
+        g_factors: wp.array, g_features: wp.array, *, add: bool = True,
     ) -> None:  # fmt: skip
-        """Adds the gradients of the Gaussians, computed from ``records``, to [N] of vec3, mat33 and vec4."""
+        """Computes the gradients of the Gaussians from ``records``.
+
+        Args:
+            g_means, g_factors, g_features: [N] of vec3, mat33 and vec4. add: add to them instead of overwriting.
+        """
         given = [self._raster, cameras, view, means, factors, self.splats, self.records, self.guard_counts]
-        inputs = [*given, g_means, g_factors, g_features]
+        inputs = [*given, int(add), g_means, g_factors, g_features]
         wp.launch(projection.project_backward, self.count, inputs, device=self._device)
 
     def mark(self, cameras: wp.array, side: int, marks: wp.array) -> None:

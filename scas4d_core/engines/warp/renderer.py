@@ -10,7 +10,7 @@ from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import BLOCK, CHANNELS, Comparison, Picture, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
-from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, SHIFT, SQUARES, Camera, camera_of
+from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, PAIRS, SHIFT, SQUARES, Camera, camera_of
 from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.projection import FEATURES, RECORD
 from scas4d_core.engines.warp.rasterizer import Rasterizer
@@ -28,6 +28,9 @@ class WarpRenderer:
     Args:
         background: RGB in 0…1. limits: constants of the rasterizer.
         device: Warp device, such as "cpu" or "cuda:0". image_weight: weight of the image loss in ``compare``.
+
+    Attributes:
+        device, limits, background: as given.
     """
 
     def __init__(
@@ -37,7 +40,7 @@ class WarpRenderer:
         device: str = "cuda:0",
         image_weight: float = 1.0,
     ) -> None:
-        self._device, self._limits = device, limits
+        self.device, self.limits, self.background = device, limits, background
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
         self._rasterizer = Rasterizer(device, 0, limits)
@@ -112,16 +115,16 @@ class WarpRenderer:
         chosen = state.rows(rows)
         cameras = self._projected(chosen, camera, np.zeros((len(rows), CHANNELS), np.float32))
         height, width = (-(-size // PADDING) * PADDING // BLOCK for size in (camera.height, camera.width))
-        marks = wp.zeros((height, width), dtype=wp.int32, device=self._device)
+        marks = wp.zeros((height, width), dtype=wp.int32, device=self.device)
         self._rasterizer.mark(cameras, BLOCK, marks)
         blocks: NDArray[np.bool_] = marks.numpy() != 0
         return blocks
 
     def _projected(self, state: Gaussians, camera: CameraArrays, features: Array) -> wp.array:
         """Projects a state and builds lists of sufficient capacity; returns the cameras, [1], on the device."""
-        device, count = self._device, len(state)
+        device, count = self.device, len(state)
         if count != self._rasterizer.count or not self._rasterizer.holds(camera.width, camera.height):
-            self._rasterizer = Rasterizer(device, count, self._limits)
+            self._rasterizer = Rasterizer(device, count, self.limits)
             self._rasterizer.resize(camera.width, camera.height)
         cameras = wp.array([camera_of(camera)], dtype=Camera, device=device)
         # Projection gets no features if there are more than four; Gaussians it would drop get zero opacity instead.
@@ -132,13 +135,13 @@ class WarpRenderer:
         unseen = wp.zeros(count, dtype=wp.vec4, device=device)
         given = (cameras, self._first, means, factors, opacities, unseen, self._first, self._log)
         self._rasterizer.project(*given)
-        while self._rasterizer.grow():
+        while self._rasterizer.grow(self._log.numpy()[0, PAIRS]):
             self._rasterizer.project(*given)
         return cameras
 
     def _rasterize(self, cameras: wp.array, features: Array, background: Array) -> wp.array:
         """Rasterizes features [N, 4] of the projected Gaussians; returns the uploaded features."""
-        on_device = wp.array(np.ascontiguousarray(features, np.float32), dtype=wp.vec4, device=self._device)
+        on_device = wp.array(np.ascontiguousarray(features, np.float32), dtype=wp.vec4, device=self.device)
         self._behind.assign(background[None])
         self._rasterizer.draw(cameras, self._first, on_device, self._behind)
         return on_device

@@ -51,14 +51,16 @@ for (int step = 1; step < blockDim.x; step <<= 1) {
     parts[thread] += parts_before;
     __syncthreads();
 }
-const bool fits = entries[blockDim.x - 1] <= capacity;
+const long long total = entries[blockDim.x - 1];
 entry = entries[thread] - own_entries;
 part = parts[thread] - own_parts;
 const bool ends = thread == blockDim.x - 1;
 #else
-const bool fits = entry <= capacity, ends = true;
+const long long total = entry;
+const bool ends = true;
 entry = part = 0;
 #endif
+const bool fits = total <= capacity;
 for (int tile = first; tile < last; ++tile) {
     const int count = counts.data[tile];
     starts.data[tile] = fits ? (int)entry : 0;
@@ -70,13 +72,13 @@ for (int tile = first; tile < last; ++tile) {
 if (ends) {
     starts.data[tiles] = fits ? (int)entry : 0;
     segment_starts.data[tiles] = fits ? part : 0;
-    if (!fits) overflow.data[0] = 1;
 }
+return fits ? (float)total : 1.25f * (float)total;
 """)
 def scan_lists(
     thread: wp.int32, capacity: wp.int32, length: wp.int32, counts: wp.array[wp.int32], starts: wp.array[wp.int32],
-    segment_starts: wp.array[wp.int32], overflow: wp.array[wp.int32],
-) -> None:  # fmt: skip
+    segment_starts: wp.array[wp.int32],
+) -> wp.float32:  # fmt: skip
     """Implements ``place_lists``; called by all threads of one block."""
     ...
 
@@ -88,7 +90,6 @@ def place_lists(
     tile_counts: wp.array[wp.int32],
     starts: wp.array[wp.int32],
     segment_starts: wp.array[wp.int32],
-    overflow: wp.array[wp.int32],
     record: wp.array[wp.int32],
     log: wp.array2d[wp.float32],
 ) -> None:
@@ -97,14 +98,13 @@ def place_lists(
     Args:
         threads: threads of the block, 1 on the CPU device. tile_counts: [tiles] entries of each list; reset to 0.
         starts, segment_starts: out [tiles + 1]; all 0 if the lists exceed the capacity.
-        overflow: [1], set to 1 in that case.
         record: [1] row of the log to initialize. log: [records, ``COLUMNS``].
     """
-    scan_lists(wp.tid(), raster.capacity, SEGMENT, tile_counts, starts, segment_starts, overflow)
+    room = scan_lists(wp.tid(), raster.capacity, SEGMENT, tile_counts, starts, segment_starts)
     if wp.tid() == threads - 1:
         for column in range(COLUMNS):
             log[record[0], column] = 0.0
-        log[record[0], PAIRS] = wp.float32(starts[raster.tiles_x * raster.tiles_y])
+        log[record[0], PAIRS] = room
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""Converts errors of files that are damaged, truncated or not exports to one-sentence errors with the file name."""
+"""Converts exceptions from damaged, truncated or foreign files to one-sentence errors that name the file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FAULTS = (
     ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, OSError, EOFError,
     struct.error, zipfile.BadZipFile,
 )  # fmt: skip
-"""Exceptions that reading a malicious or damaged export can raise, since its own numbers control offsets and sizes."""
+"""Exceptions that a malicious or damaged export can cause, because numbers in the file control offsets and sizes."""
 
 
 @contextmanager

@@ -16,14 +16,14 @@ from scas4d_core.query.ply import SH_DEGREE_0, Splats
 
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 FLOAT = 5126
-REMEDY = "give a .glb of scas4d export --format glb"
+REMEDY = "give a .glb written by scas4d export --format glb"
 
 
 class GltfFrame:
-    """The document and the binary data of one file.
+    """The JSON document and binary data of one ``.glb`` file.
 
     Args:
-        data: bytes of the file.
+        data: contents of the file.
         name: name of the file, for messages.
 
     Raises:
@@ -36,11 +36,11 @@ class GltfFrame:
             self._document, self._bytes = _chunks(data)
             self._meshes: list[Any] = self._document.get("meshes", [])
         except (ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
-            raise InputError(f"{name} is no .glb ({error})", REMEDY) from None
+            raise InputError(f"{name} is not a .glb file ({error})", REMEDY) from None
         if self._document.get("animations"):
             raise InputError(
-                f"{name} holds parts and their motion (glb-parts), not the states of frames",
-                "give files of scas4d export --format glb, usd or s4d",
+                f"{name} contains parts and their motion (glb-parts), not the states of frames",
+                "give files written by scas4d export --format glb, usd or s4d",
             )
 
     @property
@@ -52,7 +52,7 @@ class GltfFrame:
         return float(unit)
 
     def cloud(self) -> Cloud:
-        """Returns the Gaussians in the user's world and unit with OpenCV axes, with all harmonics of the file.
+        """Returns the Gaussians with all harmonics, in the user's world and units with OpenCV axes.
 
         Raises:
             InputError: attributes or ids are missing, or the file does not contain exactly one set of splats.
@@ -68,7 +68,7 @@ class GltfFrame:
             if "_ID" not in attributes:
                 raise InputError(
                     f"{self._name} has no ids (_ID), so Gaussians cannot be identified in other frames",
-                    "export it as usd or s4d; ids from 2^24 on are left out of .glb",
+                    "export it as usd or s4d; a .glb cannot store ids of 2^24 or more",
                 )
             means, scales, rotations = (
                 self._values(attributes[key]) for key in ("POSITION", f"{EXTENSION}:SCALE", f"{EXTENSION}:ROTATION")
@@ -85,14 +85,14 @@ class GltfFrame:
                 means, scales, np.roll(rotations, 1, axis=1), opacities, 0.5 + SH_DEGREE_0 * harmonics[:, 0]
             )
             if {len(each) for each in (means, scales, rotations, harmonics, ids, opacities)} != {len(means)}:
-                raise ValueError("its attributes have different counts")
+                raise ValueError("attributes have different counts")
             if not np.linalg.norm(rotations, axis=1).all():
                 raise ValueError("a rotation is zero")
             cloud = Cloud(splats, harmonics, ids)
         except (ValueError, KeyError, IndexError, TypeError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"{self._name} holds no splats that can be read ({error})", REMEDY) from None
+            raise InputError(f"{self._name} contains no readable splats ({error})", REMEDY) from None
         return cloud.half_turned().scaled(1 / self.metres_per_unit)
 
     def _values(self, number: int) -> NDArray[np.float64]:
@@ -101,7 +101,7 @@ class GltfFrame:
         view = self._document["bufferViews"][accessor["bufferView"]]
         width, count = WIDTHS[accessor["type"]], accessor["count"]
         if accessor["componentType"] != FLOAT or "byteStride" in view or "sparse" in accessor:
-            raise ValueError("its numbers are no plain float32")
+            raise ValueError("values are not plain float32")
         begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         return np.frombuffer(self._bytes, "<f4", count * width, begin).reshape(count, width).astype(np.float64)
 
@@ -110,10 +110,10 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     """Returns the document and the binary chunk (glTF 2.0, section 4.4)."""
     magic, version, _ = struct.unpack_from("<4sII", data)
     if magic != b"glTF" or version != 2:
-        raise ValueError("it does not begin as one")
+        raise ValueError("it has no glTF 2.0 header")
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":
-        raise ValueError("its first chunk is not valid JSON")
+        raise ValueError("its first chunk is not JSON")
     document = json.loads(data[20 : 20 + length])
     begin = 20 + length
     if begin + 8 > len(data):

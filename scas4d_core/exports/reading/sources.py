@@ -23,39 +23,39 @@ from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 from scas4d_core.query.ply import SH_DEGREE_0, read_ply
 
 DEFAULT_FPS = 30.0
-"""Frames per second of numbered files, which have no times."""
+"""Default frame rate of numbered files, which have no times."""
 NUMBERED = re.compile(r"frame_(\d+)(\.\w+)")
 LOST = {
-    ".splat": "its rows are sorted by size, and have no ids",
+    ".splat": "its rows are sorted by size and have no ids",
     ".spz": "it has no ids",
-    ".csv": "it has centres or poses alone",
+    ".csv": "it contains only centres or poses",
 }
 REMEDY = "give a .s4d file, USD, or numbered .glb files (scas4d export --format s4d, usd, glb)"
 Bytes = Callable[[], bytes]
 LARGEST = 1 << 30
-"""Maximum size in bytes of a frame's file in a .zip; a small archive can decompress to more than the memory."""
+"""Maximum uncompressed size of a frame in a .zip, in bytes; a small archive could otherwise exhaust memory."""
 
 
 def open_export(path: Path | str, frames_per_second: float = DEFAULT_FPS) -> ExportedStates:
     """Opens an export as states; frames are read one at a time.
 
     Args:
-        path: folder or .zip of numbered .glb or .ply files, a single such file, or USD.
-        frames_per_second: frame rate of numbered files; frame n is at n / frames_per_second.
+        path: folder or .zip of numbered .glb or .ply files, a single such file, or a USD file.
+        frames_per_second: frame rate of numbered files; the time of frame n is n / frames_per_second.
 
     Raises:
         InputError: the path is not an export, or its format has no Gaussian ids.
 
     >>> open_export("scene.splat")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: 'scene.splat' cannot be read as states: its rows are sorted by size, and ...
+    scas4d_core.errors.InputError: 'scene.splat' cannot be read as states: its rows are sorted by size and ...
     """
     given = Path(path)
     suffix = given.suffix.lower()
     if suffix in LOST:
         raise InputError(f"{str(given)!r} cannot be read as states: {LOST[suffix]}", REMEDY)
     if not given.exists():
-        raise InputError(f"there is no {str(given)!r}", REMEDY)
+        raise InputError(f"{str(given)!r} does not exist", REMEDY)
     with translate_read_errors(given.name):
         return _opened(given, suffix, frames_per_second)
 
@@ -69,7 +69,7 @@ def _opened(given: Path, suffix: str, frames_per_second: float) -> ExportedState
     if suffix == ".zip":
         return _numbered(str(given), _of_zip(given), frames_per_second)
     if suffix not in (".glb", ".ply"):
-        raise InputError(f"{str(given)!r} is no export that can be read", REMEDY)
+        raise InputError(f"{str(given)!r} is not a readable export", REMEDY)
     return _sequence(str(given), suffix, {_number(given.name): (given.name, given.read_bytes)}, frames_per_second)
 
 
@@ -82,7 +82,7 @@ def _of_zip(path: Path) -> dict[str, Bytes]:
     try:
         archive = zipfile.ZipFile(path)
     except (zipfile.BadZipFile, OSError) as error:
-        raise InputError(f"{str(path)!r} is no .zip ({error})", REMEDY) from None
+        raise InputError(f"{str(path)!r} is not a .zip file ({error})", REMEDY) from None
     with archive:
         sizes = {each.filename: each.file_size for each in archive.infolist()}
 
@@ -102,11 +102,11 @@ def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ExportedStat
         raise InputError(f"{source!r} cannot be read as states: {lost[0]}: {LOST[lost[0]]}", REMEDY)
     if suffixes not in ([".glb"], [".ply"]):
         held = f"files {', '.join(suffixes)}" if suffixes else "no numbered files (frame_000000.glb)"
-        raise InputError(f"{source!r} holds {held}", REMEDY)
+        raise InputError(f"{source!r} contains {held}", REMEDY)
     by_index = {int(match[1]): (name, files[name]) for name, match in matches.items()}
     if len(by_index) < len(matches):
         raise InputError(
-            f"{source!r} holds several files of one frame, as frame_1 and frame_000001", "remove all but one"
+            f"{source!r} has several files of one frame, such as frame_1 and frame_000001", "remove all but one"
         )
     return _sequence(source, suffixes[0], dict(sorted(by_index.items())), rate)
 
@@ -116,10 +116,10 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
         raise InputError(f"frames_per_second is {rate!r}", "give a positive number")
     frames, named = list(files), list(files.values())
     name, read = named[0]
-    remarks = [f"numbered files have no times: {rate:g} frames a second are taken"] if len(frames) > 1 else []
+    remarks = [f"numbered files have no times: {rate:g} frames per second are assumed"] if len(frames) > 1 else []
     if NUMBERED.fullmatch(name) is None:
         remarks.append(
-            f"{name} names no frame and is taken for frame 0: call it frame_000013{suffix} if it is frame 13"
+            f"{name} has no frame number, so frame 0 is assumed: for frame 13, rename it to frame_000013{suffix}"
         )
     cloud: Callable[[int], Cloud]
     if suffix == ".ply":
@@ -140,12 +140,12 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
 
 
 class PlyRows:
-    """Reads numbered .ply files. Rows identify Gaussians if all files have the same rows.
+    """Reads numbered .ply files. If all files have the same rows, the rows identify Gaussians.
 
     A Gaussian's opacity never changes, so rows with different opacities are different Gaussians.
 
     Args:
-        files: name of each file, and a function that reads its bytes.
+        files: name of each file, and a function that returns its contents.
 
     Raises:
         InputError: the first file is not a 3DGS .ply.
@@ -161,15 +161,15 @@ class PlyRows:
         """Returns the Gaussians of a frame in the user's world; ids are row numbers.
 
         Raises:
-            InputError: the frame has other Gaussians than the first.
+            InputError: the frame does not have the same Gaussians as the first.
         """
         name, read = self._files[place]
         splats = read_ply(io.BytesIO(read()), name)
         own = np.asarray(_vertex(name, read)["opacity"], np.float64)
         if not np.array_equal(own, self._opacities):
             raise InputError(
-                f"{name} has other Gaussians than {self._files[0][0]} (a .ply has no ids, and some came or went), so "
-                "nobody knows which is which",
+                f"{name} has different Gaussians from {self._files[0][0]}, and a .ply has no ids with which they could "
+                "be matched",
                 REMEDY,
             )
         return Cloud(splats, (splats.colours[:, None] - 0.5) / SH_DEGREE_0, np.arange(len(splats), dtype=np.int64))

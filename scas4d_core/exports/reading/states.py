@@ -1,9 +1,9 @@
-"""Reconstructs states from the clouds of a sequence's frames: rows with fixed identity, births, and retirements.
+"""Reconstructs states from one cloud per frame: assigns rows to Gaussians, and detects births and retirements.
 
-A cloud has the Gaussians present in its frame, with their ids. A Gaussian gets its row in the first frame that contains
-it, and is retired in each frame that does not. Data missing from the files is inferred: a Gaussian moves if its
-position changes. Its material rotation is that of its covariance's axes, which exports keep in the order of the
-transported axes.
+A cloud contains the Gaussians present in its frame, with their ids. A Gaussian gets its row in the first frame that
+contains it, and is retired in each later frame that does not. Data missing from the files is inferred: a Gaussian moves
+if its position changes. Its material rotation is the rotation of its covariance axes, which exports keep in the order
+of the transported axes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STANDS = 1e-6
-"""Displacement relative to the Gaussians' extent below which one is static; float32 resolves a tenth of it."""
+"""Displacement below which a Gaussian is static, relative to the extent of all; float32 resolves a tenth of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class _GaussianTable:
-    """Constant data of each Gaussian, by row: ids, moving flags and opacities [N], and initial axes [N, 4]."""
+    """Constant data of each Gaussian: ids, moving flags and opacities [N], and initial axes as quaternions [N, 4]."""
 
     ids: Int
     moving: NDArray[np.bool_]
@@ -41,16 +41,16 @@ class _GaussianTable:
 
 @dataclass(eq=False)
 class ExportedStates:
-    """Presents a sequence of clouds as states. Only one frame is in memory, plus the constant data of each Gaussian.
+    """Presents a sequence of clouds as states. Only one frame and the constant data of each Gaussian are in memory.
 
     Attributes:
         frames: frame indices in increasing order.
         times: times in seconds, in increasing order.
-        cloud: returns the cloud of a frame by its position in ``frames``, in the user's world and unit, with OpenCV
+        cloud: function that returns the cloud at a position in ``frames``, in the user's world and units, with OpenCV
             axes.
-        head: header of the states; the origin of its world is zero, because files have none.
-        part_of: part label by id; empty if the file has none.
-        remarks: lost information, one sentence each.
+        head: header of the states; the origin of its world is zero, because files do not store one.
+        part_of: maps each Gaussian id to its part label; empty if the file has no parts.
+        remarks: sentences about lost or assumed information.
         damage: always None; exists for compatibility with compact files.
 
     >>> from scas4d_core.exports.cloud import cloud_of
@@ -79,13 +79,13 @@ class ExportedStates:
         return self._known
 
     def parts(self) -> Int | None:
-        """Returns the part of each Gaussian [N] by row, −1 for none, or None if the file has no parts."""
+        """Returns the part label of each Gaussian [N], −1 for none; None if the file has no parts."""
         if not self.part_of:
             return None
         return np.array([self.part_of.get(id, -1) for id in self.known.ids.tolist()], np.int64)
 
     def states(self, low: int = 0, high: int | None = None) -> Iterator[tuple[int, float, Gaussians]]:
-        """Yields index, time in seconds and state of frames ``low`` to ``high``, in the internal world of ``head``.
+        """Yields the index, time in seconds and state of frames ``low`` to ``high``, in the internal world of ``head``.
 
         Raises:
             InputError: a file is damaged, or is inconsistent with previous ones.
@@ -124,7 +124,7 @@ class ExportedStates:
                 cloud = self.cloud(place)
             given = cloud.ids.tolist()
             if len(set(given)) < len(given):
-                raise InputError(f"frame {self.frames[place]}: an id belongs to two Gaussians", "export it again")
+                raise InputError(f"frame {self.frames[place]}: two Gaussians have the same id", "export it again")
             new = np.array([id not in ids for id in given], np.bool_)
             ids.update({id: len(ids) + k for k, id in enumerate(np.asarray(given)[new].tolist())})
             of = cloud.splats
@@ -168,7 +168,7 @@ def _state(
 
 
 def default_header(metres_per_unit: float, frames_per_second: float | None) -> FileHeader:
-    """Returns a header for states in the user's world, in metres.
+    """Returns a header for states in the user's world, converted to metres.
 
     >>> default_header(0.01, 30.0).world.to_inside(np.array([[100.0, 0, 0]]))
     array([[1., 0., 0.]])

@@ -16,21 +16,21 @@ from scas4d_core.query.ply import SH_DEGREE_0, Splats
 
 GAUSSIANS = "/World/Gaussians"
 PARTS = "/World/Parts"
-REMEDY = "give a file of scas4d export --format usd"
+REMEDY = "give a file written by scas4d export --format usd"
 
 
 def open_usd(path: Path) -> ExportedStates:
-    """Opens a file; frames are read on demand.
+    """Opens a USD file as states; frames are read on demand.
 
     Raises:
-        InputError: usd-core is missing, or the file is not such an export or has no ids.
+        InputError: usd-core is missing, or the file was not written by ``exports.usd`` or has no ids.
     """
     usd, geometry, volume = (import_optional(f"pxr.{name}", "usd") for name in ("Usd", "UsdGeom", "UsdVol"))
     failure = import_optional("pxr.Tf", "usd").ErrorException
     try:
         stage = usd.Stage.Open(str(path))
     except failure as error:
-        raise InputError(f"{path.name} is not USD ({message_of(error)})", REMEDY) from None
+        raise InputError(f"{path.name} is not a USD file ({message_of(error)})", REMEDY) from None
     prim = stage.GetPrimAtPath(GAUSSIANS)
     if not prim or not prim.IsA("ParticleField3DGaussianSplat"):
         raise InputError(f"{path.name} has no Gaussians at {GAUSSIANS}", REMEDY)
@@ -62,7 +62,7 @@ def open_usd(path: Path) -> ExportedStates:
 
 
 def _codes(stage: Any, prim: Any) -> list[float]:
-    """Returns the time codes of the frames, from all samples, because unchanging attributes have a single sample."""
+    """Collects the time codes of frames from all samples, because constant attributes have only one sample."""
     codes = {float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())}
     scope = stage.GetPrimAtPath(PARTS)
     for each in [prim, *(scope.GetChildren() if scope else ())]:
@@ -91,7 +91,7 @@ class _Reader:
         opacities = np.array(prim.GetOpacitiesAttr().Get(code), np.float64)
         harmonics = np.array(prim.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(code), np.float64)
         if not len(means) == len(scales) == len(quaternions) == len(opacities) == count:
-            raise InputError(f"its Gaussians have {len(means)} places and {count} ids", REMEDY)
+            raise InputError(f"the file has {len(means)} positions but {count} ids", REMEDY)
         harmonics = harmonics.reshape(count, -1, 3)
         colours = 0.5 + SH_DEGREE_0 * harmonics[:, 0]
         there = opacities > 0

@@ -1,1 +1,1 @@
-"""Compares the calibration with the images of frame 0, and refines it on request."""
+"""Checks the calibration against the images of frame 0, and refines it on request."""

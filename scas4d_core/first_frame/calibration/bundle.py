@@ -2,9 +2,9 @@
 
 Matches leave some degrees of freedom undetermined: the position, orientation and scale of the rig. Others, such as a
 slight bend of a camera ring, are nearly undetermined. Here, a Cauchy loss pulls each camera towards its calibrated
-pose. Values that the matches do not determine are kept, and a camera that is far off does not pull the others along.
-pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of an exact rig by
-0.6 pixels in the median (docs/calibration.md).
+pose. Values that the matches do not determine thus stay as calibrated, and a camera that is far off does not pull the
+others along. pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of an
+exact rig by a median of 0.6 pixels (docs/calibration.md).
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from scas4d_core.first_frame.points.triangulation import group_by_track, triangu
 from scas4d_core.posed_pictures import Float
 
 BOUNDS = (16.0, 6.0, 2.0)
-"""Maximum reprojection errors in pixels for successive rounds. The first includes cameras that are far off; the last
+"""Maximum reprojection error in pixels in each round. The first bound includes cameras that are far off; the last
 excludes wrong matches."""
 NOISE = 0.5
-"""Scale of the Cauchy loss of features, in pixels."""
+"""Scale of the Cauchy loss on reprojection errors, in pixels."""
 MIN_PRIOR_SCALE = 0.5
-"""Minimum scale, in pixels, of the Cauchy loss of the calibration prior. Rotation, translation and focal length are
-weighted by the image displacement that they cause. After the first round, the rig's median is used if it is larger."""
+"""Minimum scale of the Cauchy loss of the calibration prior, in pixels. Rotation, translation and focal length are
+weighted by the image displacement that they cause. After the first round, the scale is the rig's median displacement
+if that is larger."""
 MIN_ANGLE_DEG = 1.0
-"""Minimum triangulation angle; rays at smaller angles hardly determine depth."""
+"""Minimum triangulation angle in degrees; rays at smaller angles hardly constrain depth."""
 MAX_STEPS = 40
-"""Maximum number of Levenberg-Marquardt steps in a round."""
+"""Maximum number of Levenberg-Marquardt steps per round."""
 MIN_RELATIVE_GAIN = 1e-5
 """Relative decrease of the loss below which a round ends."""
 
@@ -42,7 +43,7 @@ Track = tuple[NDArray[np.intp], Float]
 
 
 def build_tracks(matches: Matches) -> list[Track]:
-    """Returns tracks of matching features; tracks with two features in one image are left out."""
+    """Returns the tracks of matching features, except tracks with several features in the same image."""
     label, offsets = matches.tracks()
     owner = np.repeat(np.arange(len(matches.pixels)), np.diff(offsets))
     pixels = np.concatenate(matches.pixels) if len(owner) else np.zeros((0, 2))
@@ -56,14 +57,15 @@ def build_tracks(matches: Matches) -> list[Track]:
 def bundle_adjust(
     cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool = False, seed: int = 0
 ) -> list[Camera]:
-    """Returns the cameras adjusted to agree with the tracks, in the calibrated world; cameras without tracks are
-    unchanged.
+    """Adjusts cameras to agree with feature tracks, and returns them in the calibrated world.
+
+    Cameras without tracks are unchanged.
 
     Args:
-        cameras: cameras of the tracks.
-        tracks: features of one point each, some of them wrong.
-        focal: whether to adjust each camera's focal length too; the ratio of fx and fy is fixed.
-        seed: for RANSAC.
+        cameras: calibrated cameras to which the tracks refer.
+        tracks: feature tracks, one per point; some features may be wrong.
+        focal: whether to adjust each camera's focal length too; the ratio of fx to fy is fixed.
+        seed: random seed of RANSAC.
     """
     current, trust = list(cameras), MIN_PRIOR_SCALE
     for bound in BOUNDS:
@@ -77,7 +79,7 @@ def bundle_adjust(
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Features of points: the camera and point index of each [M], and its pixel [M, 2]."""
+    """Observed features: the camera index [M], point index [M] and pixel [M, 2] of each."""
 
     camera: NDArray[np.intp]
     point: NDArray[np.intp]
@@ -114,7 +116,7 @@ class _BundleAdjustment:
         self.count = len(given)
 
     def solve(self, cameras: list[Camera], points: Float) -> list[Camera]:
-        """Returns the cameras after the last step that lowers the loss."""
+        """Returns the cameras after the last step that reduced the loss."""
         depth = self._depths(cameras, points)
         damping, loss = 1e-3, self._loss(cameras, points, depth)
         for _ in range(MAX_STEPS):
@@ -131,12 +133,12 @@ class _BundleAdjustment:
         return cameras
 
     def median_prior_distance(self, cameras: list[Camera], points: Float) -> float:
-        """Returns the median distance in pixels of the observing cameras from their calibration."""
+        """Returns the median distance between adjusted and calibrated cameras in pixels, over cameras with features."""
         pulls = np.linalg.norm(self._prior_residuals(cameras, self._depths(cameras, points))[0], axis=1)
         return float(np.median(pulls[np.unique(self.seen.camera)]))
 
     def _depths(self, cameras: Sequence[Camera], points: Float) -> Float:
-        """Returns the [V] median depth of each camera's points; 1 if it has none."""
+        """Returns the [V] median depth of each camera's points; 1 for cameras without points."""
         depths = np.ones(self.count)
         for index, camera in enumerate(cameras):
             own = points[self.seen.point[self.seen.camera == index]]
@@ -145,7 +147,7 @@ class _BundleAdjustment:
         return depths
 
     def _residuals(self, cameras: Sequence[Camera], points: Float) -> tuple[Float, Float, Float]:
-        """Returns the reprojection errors [M, 2] and their derivatives by camera [M, 2, 6 or 7] and by point."""
+        """Returns the reprojection errors [M, 2] and their Jacobians by camera [M, 2, 6 or 7] and point [M, 2, 3]."""
         seen = self.seen
         rotation = np.array([c.rotation for c in cameras])[seen.camera]
         shift = np.array([c.translation for c in cameras])[seen.camera]
@@ -158,12 +160,12 @@ class _BundleAdjustment:
             by_place[:, 0, 0], by_place[:, 1, 1] = lens[:, 0] / z, lens[:, 1] / z
             by_place[:, :, 2] = -offset / z[:, None]
         miss = offset + lens[:, 2:] - seen.pixel
-        miss[z <= 0] = np.inf  # behind the camera: such a step is rejected
+        miss[z <= 0] = np.inf  # a step that puts a point behind a camera is rejected
         columns = [by_place @ -_cross(place), by_place, *([offset[:, :, None]] if self.focal else [])]
         return miss, np.concatenate(columns, axis=2), by_place @ rotation
 
     def _prior_residuals(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
-        """Returns each camera's distance from its calibration [V, 6 or 7] in pixels, and the pixels per unit."""
+        """Returns each camera's change from its calibration [V, 6 or 7] in pixels, and the pixels per unit."""
         rows, units = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
         for index, (before, now) in enumerate(zip(self.given, cameras, strict=True)):
             units[index, :3], units[index, 3:6] = now.fx, now.fx / depth[index]
@@ -232,9 +234,7 @@ def _cross(vectors: Float) -> Float:
 
 
 def _apply_step(camera: Camera, move: Float) -> Camera:
-    """Returns the camera rotated about and translated along its axes; the last value scales the focal length by its
-    exponential.
-    """
+    """Returns a camera rotated and translated in its own axes; a seventh value is the log of a focal length factor."""
     turn = Rotation.from_rotvec(move[:3]).as_matrix()
     pose, intrinsics = np.eye(4), camera.intrinsics.copy()
     pose[:3, :3], pose[:3, 3] = turn @ camera.rotation, turn @ camera.translation + move[3:6]

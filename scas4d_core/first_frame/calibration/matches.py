@@ -1,8 +1,8 @@
-"""SIFT matches between neighbouring cameras by appearance only, so that calibration errors do not bias them.
+"""SIFT matches between neighbouring cameras, by appearance only, so that calibration errors do not bias them.
 
-The matches for the initial points (``points/triangulation.py``) lie within two pixels of their epipolar lines in the
-given calibration. The matches here are searched in whole images. They are fewer, but they show the size of a
-calibration error.
+The matches for the initial points (``points/triangulation.py``) are restricted to within two pixels of the epipolar
+lines of the given calibration. Here, the whole image is searched. This yields fewer matches, but they reveal how large
+a calibration error is.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from scas4d_core.posed_pictures import Float, PosedPicture
 
 LONGEST_SIDE = 800
 """Maximum image side, in pixels; larger images are downscaled before feature detection. Full size would reveal smaller
-errors but takes seconds per camera."""
+errors but would take seconds per camera."""
 FEATURES, CONTRAST = 2048, 0.0067
-"""Maximum number of features per image, and COLMAP's contrast threshold. On `basketball` this gives half as many
-features as for the initial points, but as many of them match. For images of the same size, they are a bit-identical
-subset of the features for the initial points in 50 of 51 images. Which subset is unknown, because pycolmap returns
-keypoints without their contrast. Features are therefore detected twice, at up to 1.0 s of CPU time for `robot` and 3.0
-s for `basketball`."""
+"""Maximum number of features per image, and COLMAP's contrast threshold. On `basketball`, this gives half as many
+features as for the initial points, but the same number of matches. For images of the same size, they are a
+bit-identical subset of the features for the initial points in 50 of 51 images. The subset cannot be selected, because
+pycolmap returns keypoints without their contrast. Features are therefore detected twice, which takes up to 1.0 s of
+CPU time for `robot` and 3.0 s for `basketball`."""
 NEIGHBOURS = 6
 """Number of nearest cameras that each camera is matched with; more distant views hardly match."""
 HELD_OUT_EVERY = 5
-"""Every how many tracks one is held out for testing."""
+"""One in this many tracks is held out for testing."""
 
 Pair = tuple[int, int]
 
@@ -46,9 +46,10 @@ class Matches:
     """Features of the images of one frame, and the matches between cameras.
 
     Attributes:
-        cameras: as given, at the size at which features were detected.
-        scale: by camera, size of such a pixel in pixels of its image, at least 1.
-        pixels: by camera, [K, 2] features. pairs: [M, 2] indices of matching features, by pair of camera indices.
+        cameras: calibrated cameras, at the image size used for feature detection.
+        scale: factor from that image size to the full size of each camera's image; at least 1.
+        pixels: [K, 2] feature positions of each camera.
+        pairs: maps each pair of camera indices to the [M, 2] indices of their matching features.
     """
 
     cameras: tuple[Camera, ...]
@@ -61,21 +62,21 @@ class Matches:
         return replace(self, cameras=tuple(cameras))
 
     def without(self, left_out: Collection[int]) -> Matches:
-        """Returns the matches without those of some cameras."""
+        """Returns the matches that do not involve any of the given cameras."""
         pairs = {pair: rows for pair, rows in self.pairs.items() if not set(pair) & set(left_out)}
         return replace(self, pairs=pairs)
 
     def tracks(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Returns the track number of each feature, concatenated over cameras, and each camera's offset."""
+        """Returns the track index of each feature, concatenated over cameras, and the offset of each camera."""
         offsets = np.concatenate([[0], np.cumsum([len(uv) for uv in self.pixels])])
         edges = [rows + offsets[list(pair)] for pair, rows in self.pairs.items()]
         all_edges = np.concatenate(edges) if edges else np.zeros((0, 2), np.intp)
         return label_tracks(all_edges, int(offsets[-1])), offsets
 
     def split(self) -> tuple[Matches, Matches]:
-        """Splits the matches into a training set and a held-out set without common features."""
+        """Splits the matches into a training set and a held-out set that share no features."""
         track, offsets = self.tracks()
-        # Counting only tracks with matches, in order of their first features, gives both sets matches of all cameras.
+        # Only tracks with matches are counted, in order of their first features, so that both sets cover all cameras.
         matched = np.concatenate(
             [np.zeros(0, np.intp), *(track[r + offsets[list(p)]][:, 0] for p, r in self.pairs.items())]
         )
@@ -111,7 +112,7 @@ def _downscale(view: PosedPicture) -> PosedPicture:
 
 
 def neighbour_pairs(rig: Rig) -> list[Pair]:
-    """Returns pairs of cameras worth matching: each with its ``NEIGHBOURS`` nearest in direction and position.
+    """Returns the pairs of cameras to match: each camera with its ``NEIGHBOURS`` nearest in direction and position.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> row = [np.eye(4) for _ in range(9)]
@@ -136,14 +137,14 @@ def neighbour_pairs(rig: Rig) -> list[Pair]:
 
 
 def _mutual_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Returns [M, 2] rows of mutual nearest neighbours of unit descriptors that pass the ratio test."""
+    """Returns the [M, 2] indices of unit descriptors that are mutual nearest neighbours and pass the ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.intp)
     return mutual_best(descriptor_distances(first, second))
 
 
 def epipolar_distances(matches: Matches, pair: Pair) -> Float:
-    """Returns the [M] epipolar distances of a pair's matches in pixels: the larger of the two images."""
+    """Returns the [M] epipolar distance of each match of a pair in pixels: the larger of those in the two images."""
     (a, b), rows = pair, matches.pairs[pair]
     first, second = (np.pad(matches.pixels[v][rows[:, k]], ((0, 0), (0, 1)), constant_values=1.0)
                      for k, v in enumerate((a, b)))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Checks the calibration of a rig with the images of frame 0, and refines it on request."""
+"""Checks the calibration of a rig against the images of frame 0, and refines it on request."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
 
 MIN_CAMERAS = 3
-"""Minimum number of cameras; with two, either could be off."""
+"""Minimum number of cameras for a refinement; with two, either one could be off."""
 STANDARD_ERRORS = 2.0
-"""Number of standard errors by which the loss of held-out matches must decrease."""
+"""Number of standard errors by which a refinement must reduce the loss of held-out matches."""
 MIN_HELD_OUT = 20
 """Minimum number of held-out matches for a meaningful standard error."""
 
@@ -33,8 +33,14 @@ def calibrate_first_frame(
     """Runs ``check_calibration`` on frame 0, with refinement if the settings request it.
 
     Args:
-        rig: as given, at the size of the frame's images. measured: whether to check the calibration even if no
-            refinement is requested. If false, the result is None in this case.
+        rig: calibrated rig, at the size of the frame's images.
+        frame: frame 0.
+        settings: settings of frame 0.
+        on_progress: called at the start and at the end.
+        measured: whether to check the calibration even if no refinement is requested.
+
+    Returns:
+        The report, or None if neither a check nor a refinement is requested.
     """
     if not (measured or settings.refine_calibration):
         return None
@@ -45,11 +51,12 @@ def calibrate_first_frame(
 
 
 def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> CalibrationReport | None:
-    """Measures the calibration error in the images; returns None if fewer than two cameras have an image.
+    """Measures the calibration error in the images of a frame; returns None if fewer than two cameras have an image.
 
     Args:
-        rig: rig in the user's world, at image size. images: [H, W, 3] uint8 of one frame, by camera name.
-        refine: whether to refine poses; the result is kept only if held-out matches improve.
+        rig: rig in the user's world, at image size.
+        images: maps each camera name to its image, [H, W, 3] uint8.
+        refine: whether to refine poses; the refined poses are used only if held-out matches improve.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -59,7 +66,7 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
     """
     try:
         views = collect_views(rig, images, {})
-    except InitialPointsError:  # one image, or a wrong size, which is rejected elsewhere
+    except InitialPointsError:  # only one image, or a wrong size, which is rejected elsewhere
         return None
     matches = match_by_appearance(views)
     cameras, off = measure_residuals(matches)
@@ -75,22 +82,22 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
 
 
 def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], matches: Matches) -> list[str]:
-    """Returns sentences for people that describe the calibration errors."""
+    """Returns user-facing warnings that describe the calibration errors."""
     known = {name: fit.pixels for name, fit in cameras.items() if np.isfinite(fit.pixels)}
     if not known:
         return []
     usual = float(np.median(list(known.values())))
-    remedy = "static.refine_calibration has it refined from the pictures of frame 0"
+    remedy = "set static.refine_calibration to refine it from the images of frame 0"
     inside = [known[camera.name] / scale for camera, scale in zip(matches.cameras, matches.scale, strict=True)
               if camera.name in known]  # fmt: skip
     if float(np.median(inside)) > MAX_RESIDUAL:
         return [
-            f"the calibration seems to be off: matching features miss their epipolar lines by {usual:.1f} px, median "
-            f"over {len(known)} cameras; {remedy}"
+            f"the calibration seems to be off: matching features miss their epipolar lines by {usual:.1f} px (median "
+            f"over {len(known)} cameras); {remedy}"
         ]
     return [
         f"the calibration of camera {name!r} seems to be off: its matching features miss their epipolar lines by "
-        f"{known[name]:.1f} px, median of {cameras[name].matches}, usual in the rig is {usual:.1f} px; {remedy}"
+        f"{known[name]:.1f} px (median of {cameras[name].matches}), compared with {usual:.1f} px for the rig; {remedy}"
         for name in off
     ]
 
@@ -99,7 +106,8 @@ def refine_rig(rig: Rig, matches: Matches) -> Refinement:
     """Refines the poses of a rig; the result is accepted only if held-out matches improve.
 
     Args:
-        rig: as given, in the user's world. matches: from its cameras' images of one frame.
+        rig: calibrated rig, in the user's world.
+        matches: matches between its cameras' images of one frame.
     """
     learnt, held = matches.split()
     fits = list(measure_residuals(matches)[0].values())
@@ -108,15 +116,15 @@ def refine_rig(rig: Rig, matches: Matches) -> Refinement:
         i for i, camera_fit in enumerate(fits) if camera_fit.matches < MIN_INLIERS or not np.isfinite(camera_fit.pixels)
     ]
     if len(counts) - len(fixed) < MIN_CAMERAS:
-        return _not_refined(f"only {len(counts) - len(fixed)} cameras have {MIN_INLIERS} matches or more")
+        return _not_refined(f"only {len(counts) - len(fixed)} cameras have at least {MIN_INLIERS} matches")
     before = list(matches.cameras)
     tracks = build_tracks(learnt.without(fixed))
     best = _HeldOutTest.of(held, before, bundle_adjust(before, tracks))
     if len(best.losses) < MIN_HELD_OUT:
-        return _not_refined(f"only {len(best.losses)} matches could be held out to test it")
+        return _not_refined(f"only {len(best.losses)} matches could be held out for testing")
     if not best.is_better:
         return _not_refined(
-            f"{len(best.losses)} matches that were held out are not met better: {best.before:.2f} px before, "
+            f"the error of {len(best.losses)} held-out matches did not improve: {best.before:.2f} px before, "
             f"{best.after:.2f} px after"
         )
     longer = _HeldOutTest.of(held, best.cameras, bundle_adjust(before, tracks, focal=True))
@@ -134,7 +142,10 @@ class _HeldOutTest:
     """A comparison of two calibrations on held-out matches.
 
     Attributes:
-        cameras: of the new rig. losses: [M] decrease of the loss of each match. before, after: see ``Refinement``.
+        cameras: cameras of the new calibration.
+        losses: [M] decrease of the loss of each match.
+        before: error of the old calibration in pixels, as in ``Refinement``.
+        after: error of the new calibration in pixels, as in ``Refinement``.
     """
 
     cameras: list[Camera]
@@ -144,7 +155,7 @@ class _HeldOutTest:
 
     @classmethod
     def of(cls, held: Matches, given: Sequence[Camera], found: list[Camera]) -> _HeldOutTest:
-        """Compares two calibrations on held-out matches, without matches that are far off in both, which are wrong."""
+        """Compares two calibrations on held-out matches, ignoring wrong matches, which are far off in both."""
         pairs = list(held.pairs)
         before, after = (
             np.concatenate([np.zeros(0), *(epipolar_distances(held.with_cameras(rig), pair) for pair in pairs)])
@@ -157,7 +168,7 @@ class _HeldOutTest:
 
     @property
     def is_better(self) -> bool:
-        """True if the loss has decreased significantly."""
+        """True if the loss decreased significantly."""
         count = len(self.losses)
         return (
             count >= MIN_HELD_OUT
@@ -178,18 +189,18 @@ def _refinement(rig: Rig, matches: Matches, test: _HeldOutTest, fixed: Sequence[
         )  # fmt: skip
     far = max(cameras, key=lambda name: cameras[name].rotation_deg)
     text = (
-        f"the calibration was refined, as asked: {len(test.losses)} matches held out miss their epipolar lines "
-        f"by {test.after:.2f} px in place of {test.before:.2f}; camera {far!r} was turned most, by "
-        f"{cameras[far].rotation_deg:.2f}°: {cameras[far].after:.2f} px in place of {cameras[far].before:.2f}"
+        f"the calibration was refined, as requested: {len(test.losses)} held-out matches miss their epipolar lines "
+        f"by {test.after:.2f} px instead of {test.before:.2f}; camera {far!r} was rotated most, by "
+        f"{cameras[far].rotation_deg:.2f}°: {cameras[far].after:.2f} px instead of {cameras[far].before:.2f}"
     )
     if focal:
-        text += "; their focal lengths were adjusted too"
+        text += "; focal lengths were adjusted too"
     if fixed:
-        text += f"; left as given for want of matches: {', '.join(matches.cameras[index].name for index in fixed)}"
+        text += f"; unchanged for lack of matches: {', '.join(matches.cameras[index].name for index in fixed)}"
     return Refinement(True, text, test.before, test.after, len(test.losses), cameras)
 
 
 def _pose_change(given: Camera, found: Camera) -> tuple[float, float]:
-    """Returns the rotation in degrees and the distance by which a camera has moved."""
+    """Returns the rotation of a camera in degrees, and the distance by which its centre moved."""
     turn = Rotation.from_matrix(found.rotation @ given.rotation.T).magnitude()
     return float(np.degrees(turn)), float(np.linalg.norm(found.centre - given.centre))

@@ -1,4 +1,4 @@
-"""Calibration results in the report of frame 0, and the refined rig read from it. NumPy only."""
+"""Calibration results in the report of frame 0, and the refined rig that is read from it. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from scas4d_core.cameras import Camera, Rig
 
 @dataclass(frozen=True)
 class CameraResidual:
-    """Calibration error of a camera according to its matches.
+    """Calibration error of a camera, estimated from its matches.
 
     Attributes:
-        pixels: median epipolar distance, in pixels of the camera's images; NaN if too few matches determine it.
+        pixels: median epipolar distance, in pixels of the camera's images; NaN if there are too few matches.
         matches: approximate number of correct matches.
     """
 
@@ -30,11 +30,13 @@ class RefinedCamera:
     """A camera after refinement.
 
     Attributes:
-        rotation_deg: rotation, in degrees. translation: displacement of the centre, in the user's unit. focal: factor
-            on the given focal length.
-        before, after: residual in pixels; NaN with too few matches. fixed: whether it was kept as given because it had
-            too few matches.
-        pose: [4][4] world to camera, in the user's world.
+        rotation_deg: rotation from the given pose, in degrees.
+        translation: displacement of the camera centre, in the user's units.
+        focal: factor applied to the given focal length.
+        before: residual before refinement in pixels; NaN if there are too few matches.
+        after: residual after refinement in pixels; NaN if there are too few matches.
+        fixed: whether the camera was left unchanged because it had too few matches.
+        pose: [4][4] world-to-camera transform, in the user's world.
     """
 
     rotation_deg: float
@@ -51,10 +53,12 @@ class Refinement:
     """The result of refining a calibration.
 
     Attributes:
-        accepted: whether the scene uses the refined rig. text: the reason, as text for people.
-        before, after: epipolar distance in pixels that corresponds to the mean loss of held-out matches.
+        accepted: whether the scene uses the refined rig.
+        text: user-facing explanation.
+        before: error before refinement: the epipolar distance in pixels that has the mean loss of held-out matches.
+        after: the same error after refinement.
         matches: number of held-out matches.
-        cameras: refined cameras by name; empty if not accepted.
+        cameras: refined cameras, keyed by name; empty if the refinement was not accepted.
     """
 
     accepted: bool
@@ -65,18 +69,19 @@ class Refinement:
     cameras: dict[str, RefinedCamera] = field(default_factory=dict)
 
     def apply_to(self, camera: Camera) -> Camera:
-        """Returns the refined version of a camera of any size."""
+        """Returns a camera, at any image size, with its refined pose and focal length; unchanged if it has none."""
         refined_camera = self.cameras.get(camera.name)
         return camera if refined_camera is None else _with_pose(camera, refined_camera.pose, refined_camera.focal)
 
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """The calibration compared with the images of frame 0.
+    """Result of checking the calibration against the images of frame 0.
 
     Attributes:
-        cameras: residual of each camera as given, by name. miscalibrated: names of cameras that are clearly off.
-        warnings: sentences for people; about the refined rig if there is one.
+        cameras: residual of each camera before refinement, keyed by name.
+        miscalibrated: names of cameras that are clearly off.
+        warnings: user-facing warnings; about the refined rig if there is one.
         refined: result of the refinement; None if not requested.
     """
 
@@ -90,7 +95,8 @@ def effective_rig(rig: Rig, record: Mapping[str, Any]) -> Rig:
     """Returns the rig that a scene uses: with refined cameras if frame 0 accepted a refinement.
 
     Args:
-        rig: as given, of any size, or some of its cameras. record: report of frame 0, as from ``History.report``.
+        rig: calibrated rig at any image size, or a subset of its cameras.
+        record: report of frame 0, as returned by ``History.report``.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""Epipolar residual of each camera in pixels: how far the calibration is off in the images of frame 0."""
+"""Measures the epipolar residual of each camera in pixels: its calibration error in the images of frame 0."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from scas4d_core.posed_pictures import Float
 
 NEAR, FAR = 16.0, 80.0
 """Epipolar distances in pixels. Matches below the first are correct except for some chance matches. Matches between the
-two are wrong and uniformly distributed, so their density per pixel is subtracted."""
+two are wrong and uniformly distributed; their density per pixel estimates the number of chance matches."""
 MIN_INLIERS = 30
 """Minimum number of correct matches of a camera for an estimate."""
 MIN_INLIER_SHARE = 0.5
-"""Minimum share of correct matches among those nearer than ``NEAR``; otherwise the distances are due to chance."""
+"""Minimum fraction of correct matches among those below ``NEAR``; otherwise the distances are due to chance."""
 MAX_RESIDUAL, MAX_TIMES_MEDIAN = 0.9, 2.0
-"""Residual in pixels at the size of feature detection, and multiple of the rig's median, above which a camera is off.
-Correct captures have 0.1 to 0.6, up to 1.6 times the median; a camera rotated by two pixels has 0.9 to 2.2
-(docs/calibration.md)."""
+"""A camera is off if its residual exceeds both this number of pixels, at the image size of feature detection, and this
+multiple of the rig's median. Correct captures have 0.1 to 0.6 pixels, up to 1.6 times the median; a camera rotated by
+two pixels has 0.9 to 2.2 (docs/calibration.md)."""
 
 
 class ResidualEstimate(NamedTuple):
-    """Distances of correct matches: their median, its lower bound (two standard errors), and their number."""
+    """Median distance of correct matches, its lower bound (two standard errors), and the number of these matches."""
 
     median: float
     lower_bound: float
@@ -37,7 +37,7 @@ def estimate_residual(distances: Float) -> ResidualEstimate:
     """Estimates the median distance of correct matches by subtracting the density of wrong ones.
 
     Args:
-        distances: [M] epipolar distances in pixels, of correct and wrong matches.
+        distances: [M] epipolar distances of correct and wrong matches, in pixels.
 
     >>> right, wrong = np.linspace(0, 1, 101), np.linspace(0, 80, 81)
     >>> estimate_residual(np.concatenate([right, wrong]))
@@ -55,11 +55,11 @@ def estimate_residual(distances: Float) -> ResidualEstimate:
 
 
 def measure_residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
-    """Returns each camera's residual relative to correct cameras, by name, and the names of cameras that are off.
+    """Returns each camera's residual relative to correct cameras, keyed by name, and the names of cameras that are off.
 
-    A camera that is off increases the residuals of its neighbours. The worst camera is therefore removed, and the
-    others are measured again, while one is far worse than most. If most cameras are off, the faulty ones cannot be
-    identified.
+    A camera that is off increases the residuals of its neighbours. Therefore, as long as a camera is far worse than
+    most, the worst one is excluded and the others are measured again. If most cameras are off, the faulty ones cannot
+    be identified, and no names are returned.
     """
     measured = [(pair, epipolar_distances(matches, pair)) for pair in matches.pairs]
     off: list[int] = []
@@ -86,6 +86,6 @@ def measure_residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list
 
 
 def _of_camera(index: int, measured: Sequence[tuple[Pair, Float]], off: Sequence[int]) -> ResidualEstimate:
-    """Returns ``estimate_residual`` of a camera's matches with cameras that are not off."""
+    """Estimates the residual of a camera from its matches with cameras that are not off."""
     own = [distances for pair, distances in measured if index in pair and not {*pair} - {index} & {*off}]
     return estimate_residual(np.concatenate([*own, np.zeros(0)]))

@@ -1,4 +1,4 @@
-"""Points that cameras agree on: features, stereo, the visual hull, and surfaces that they support."""
+"""Finds points on which cameras agree, using features, stereo, the visual hull and fitted surfaces."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from scas4d_core.posed_pictures import (
 )
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with a stage, the completed steps and the total steps."""
+"""Called with the name of a stage, and its completed and total number of steps."""
 
 REFUTING_VIOLATIONS = 2
-"""Number of cameras seeing through an unconfirmed point that reject it; a single depth may be wrong."""
+"""Number of cameras that must see through an unconfirmed point to reject it; a single depth may be wrong."""
 REFUTING_MASKS = 1
-"""Number of masks contradicting a point that reject it; one is sufficient, because all masks support the hull."""
+"""Number of masks that must contradict a point to reject it; one suffices, because all masks support the hull."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,16 @@ class PointSearch:
     """Inputs and settings of a point search.
 
     Attributes:
-        labelled: views with the given masks, if any. views: the same, or with silhouettes in front of a backdrop.
-            backdrop: whether the masks of ``views`` are such silhouettes.
-        min_views: number of cameras that must agree on a point. stereo: whether to use dense stereo. iterations: of
-            stereo.
-        tracks: of features. max_points: maximum number of points. radius: of the rig, in world units. seed: of every
-            random choice.
+        labelled: views with the given masks, if any.
+        views: the same views, or with silhouettes in front of a backdrop as masks.
+        tracks: feature tracks.
+        backdrop: whether the masks of ``views`` are silhouettes in front of a backdrop.
+        min_views: number of cameras that must agree on a point.
+        stereo: whether to use dense stereo.
+        iterations: number of stereo iterations.
+        max_points: maximum number of points.
+        radius: radius of the rig, in world units.
+        seed: random seed.
         limit: time limit of frame 0.
     """
 
@@ -74,10 +78,10 @@ class PointSearch:
 
 
 def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> InitialPoints:
-    """Finds points on which ``search.min_views`` cameras agree.
+    """Finds points on which at least ``search.min_views`` cameras agree.
 
     Raises:
-        InitialPointsError: there are none.
+        InitialPointsError: there are no such points.
     """
     views, plain, min_views, seed = search.views, search.backdrop, search.min_views, search.seed
     middle = look_at_point(views)
@@ -87,7 +91,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     on_progress("hull", 0, 1)
     hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
-    # Two cameras agree by chance somewhere on an epipolar line, so planes through such points are unreliable.
+    # Two cameras can agree by chance anywhere along an epipolar line, so planes through such points are unreliable.
     if not plain and min_views > 2 and len(triangulated.positions) >= 10:
         standing = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
@@ -108,7 +112,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     solid = _free_hull(hull, maps, min_views)
     walls = np.zeros((0, 3))
     if supports:
-        # One sample per about four pixels of the stereo images is dense enough for the thinning below.
+        # About one sample per four pixels of the stereo images is dense enough for the thinning below.
         stride = max(2, max(view.camera.width for view in views) // 160)
         samples = sample_surfaces(views, supports, stride, search.radius)
         samples, _ = average_per_cell(samples, 2.0 * SPACING * pixel)
@@ -119,7 +123,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
-    """Returns [P] true if most cameras that saw a triangulated point have it in their mask."""
+    """Returns whether each triangulated point is in the masks of most cameras that observed it, [P]."""
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for view, seen in zip(views, triangulated.views.T, strict=True):
@@ -162,7 +166,7 @@ def _stereo(
             depth = np.concatenate([depth, prior[prior > 0][::16]])
         if len(depth) < 10:
             depth = np.array([0.05, 2.0]) * float(np.linalg.norm(camera.centre - middle))
-        # Features do not extend to the limits of the scene, but a hull does.
+        # Features do not extend to the limits of the scene, but the hull does.
         low, high = (0.9, 1.1) if plain else (0.6, 1.3)
         ranges.append((low * float(np.percentile(depth, 1)), high * float(np.percentile(depth, 99))))
         if len(hull_surface):
@@ -187,7 +191,7 @@ def _stereo(
 
 
 def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Float:
-    """Returns the [P, 3] surface of the hull without the space that cameras see through."""
+    """Returns the [P, 3] surface points of the hull, after removing voxels that cameras see through."""
     if len(hull.cells) == 0:
         return np.zeros((0, 3))
     solid = count_violations(maps, hull.centres, min_views, margin=0.01) < REFUTING_VIOLATIONS

@@ -22,7 +22,7 @@ from scas4d_core.posed_pictures import (
 SPACING = 1.5
 """Spacing of neighbouring points, in pixels at the scene centre; twice that on the background."""
 COLOUR_SPREAD = 0.12
-"""Median deviation of the cameras' colours (0…1) above which a point that stereo has not confirmed is misplaced."""
+"""Median deviation between cameras' colours (0…1) above which a point that stereo did not confirm is misplaced."""
 CROWD = 4
 """Minimum number of stereo points in the 27 cells around a point: many pixels see true surfaces, few see outliers."""
 
@@ -38,18 +38,25 @@ def merge_candidates(
 ) -> InitialPoints:
     """Thins, colours and labels the candidates, and drops those that the images contradict.
 
-    ``sources``: points that cameras agree on, hull points, and points of fitted surfaces. A later source is used only
-    if no earlier one has a point nearby.
+    Args:
+        labelled: views with the given masks, if any.
+        views: the same views, or with silhouettes in front of a plain background as masks.
+        sources: points on which cameras agree, hull points, and points on fitted surfaces. A point is used only if no
+            earlier source has a point nearby.
+        pixel: size of a pixel at the scene centre, in world units.
+        plain: whether the masks of ``views`` are silhouettes.
+        stereo: whether the first source contains stereo points.
+        max_points: maximum number of points.
     """
     fine = SPACING * pixel
-    # Minimum number of cameras that see a point and agree on its colour: none for points that stereo or features have
-    # confirmed, two for the hull, which all masks support, and one for walls that other points support.
+    # Minimum number of cameras that see a point and agree on its colour. Points confirmed by stereo or features need
+    # none. Hull points, which all masks support, need two; walls, which other points support, need one.
     needed_by = (0, 2, 1)
     points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
         new, sizes = average_per_cell(candidates, fine)
         if source == 0 and stereo and len(new):
-            # Features are few and verified; hull and walls cover those that have no stereo points nearby.
+            # This also drops isolated features. They are few, and the hull or walls cover their surfaces.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
             new = new[(crowd >= CROWD) | (sizes >= CROWD)]
         elif len(points) and len(new):
@@ -58,13 +65,13 @@ def merge_candidates(
         needed = np.concatenate([needed, np.full(len(new), views_needed, dtype=np.intp)])
     if len(points) == 0:
         raise InitialPointsError(
-            "images: no point is supported by enough cameras; check that the calibration belongs to the pictures, "
+            "images: no point is supported by enough cameras; check that the calibration matches the images, "
             "or start from a point cloud"
         )
     visible = visible_from(views, points, fine)
     foreground = labelled_share(labelled, points, visible)
     if plain:
-        # A point that projects to the plain background is next to an outline, and the background is not its colour.
+        # A point that projects onto the plain background is next to an outline; its colour is not the background's.
         for row, view in zip(visible, views, strict=True):
             column, line, _, _ = pixels_inside(view.camera, points)
             row &= np.asarray(view.mask)[line, column]
@@ -90,14 +97,14 @@ def merge_candidates(
         scale *= 1.15
     if not chosen.any():
         raise InitialPointsError(
-            "images: the cameras contradict every candidate point; check that the calibration belongs to the pictures, "
+            "images: the cameras contradict every candidate point; check that the calibration matches the images, "
             "or start from a point cloud"
         )
     return InitialPoints(points[chosen], seen.colours[chosen], None if foreground is None else foreground[chosen])
 
 
 def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
-    """Returns the [P] share of the cameras that may see a point whose masks contain it; None without masks."""
+    """Returns the fraction of the cameras that may see each point whose masks contain it, [P]; None without masks."""
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):
         if view.mask is None:
@@ -111,7 +118,7 @@ def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) 
 
 
 def pick_one_per_cell(points: Float, cell: float) -> NDArray[np.intp]:
-    """Returns one point index per cubic cell, nearest to the mean of its points, for an even distribution."""
+    """Returns the index of one point per cubic cell: the point nearest to the mean, for an even distribution."""
     where, count = _cells(points, cell)
     means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
     order = np.lexsort((((points - means[where]) ** 2).sum(-1), where))
@@ -120,7 +127,7 @@ def pick_one_per_cell(points: Float, cell: float) -> NDArray[np.intp]:
 
 
 def average_per_cell(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
-    """Returns means [Q, 3] of the points in each cubic cell with edge ``cell``, and the number of points [Q]."""
+    """Returns the mean [Q, 3] and number [Q] of the points in each occupied cubic cell with edge length ``cell``."""
     if len(points) == 0:
         return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)
     where, count = _cells(points, cell)

@@ -1,7 +1,7 @@
-"""PatchMatch stereo: depth and normal of every pixel of one image, matched against several neighbours. Numba.
+"""PatchMatch stereo in Numba: depth and normal of every pixel of an image, matched against several neighbours.
 
-Each pixel holds a small plane. Planes that match well propagate to neighbouring pixels and are refined by random
-perturbation. After Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015 (red–black
+Each pixel stores a small plane. Planes that match well propagate to neighbouring pixels and are refined by random
+perturbation. Based on Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015 (red–black
 order, several views). The matching cost is the weighted normalized cross-correlation of COLMAP (Schönberger et al.
 2016).
 """
@@ -20,7 +20,7 @@ REACH = 2
 STEP = 2
 """Spacing of the samples in pixels: a window of 9 pixels at the cost of 25 samples."""
 TEXTURE = 0.012
-"""Minimum standard deviation of a patch (0…1) for a meaningful match: three steps of an 8-bit image."""
+"""Minimum standard deviation of a patch (0…1) for a meaningful match: three levels of an 8-bit image."""
 NO_MATCH = 2.0
 """Cost of a patch that cannot be compared; otherwise the cost is 1 − NCC, between 0 and 2."""
 ROUNDED = 1e-6
@@ -45,10 +45,10 @@ def _cost(
     nx: float, ny: float, nz: float, inverse: Any, rays: Any, inverses: Any, others: Any, sizes: Any, shifts: Any,
     best: int, enough: float,
 ) -> float:  # fmt: skip
-    """Returns 1 − NCC, the mean over the ``best`` best neighbours.
+    """Returns 1 − NCC, averaged over the ``best`` neighbours that match best.
 
-    The result is NO_MATCH if fewer neighbours see the patch or the cost exceeds ``enough``. ``rays`` [V, samples, 3]:
-    see ``_rays``; ``inverses`` [samples]: scratch buffer.
+    The result is NO_MATCH if fewer neighbours see the patch, or if the cost certainly exceeds ``enough``. ``rays``
+    [V, samples, 3] are filled by ``_rays``; ``inverses`` [samples] is a scratch buffer.
     """
     rx, ry = inverse[0] * x + inverse[1], inverse[2] * y + inverse[3]
     reach = depth * (nx * rx + ny * ry + nz)  # n · X of the plane's centre
@@ -136,7 +136,7 @@ def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
 
 @kernel
 def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, float]:
-    """Fills the samples around a pixel and their bilateral weights; returns mean and standard deviation."""
+    """Fills in the samples around a pixel and their bilateral weights; returns their mean and standard deviation."""
     height, width = image.shape
     middle = image[y, x]
     sum_w, sum_i, sum_ii = 0.0, 0.0, 0.0
@@ -231,25 +231,25 @@ def patch_match(
     image: Any, active: Any, prior: Any, inverse: Any, others: Any, sizes: Any, matrices: Any, shifts: Any,
     *, near: float, far: float, iterations: int, best: int, seed: int,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
-    """Computes the depth of each pixel of one image.
+    """Computes the depth and normal of each pixel of an image.
 
     Args:
         image: [H, W] float32 grayscale in 0…1.
         active: [H, W] bool, pixels to compute.
         prior: [H, W] float64 depth to try first, 0 if unknown.
-        inverse: [4] float64, (1/fx, −cx/fx, 1/fy, −cy/fy).
+        inverse: [4] float64 inverse intrinsics (1/fx, −cx/fx, 1/fy, −cy/fy).
         others: [V, H', W'] float32 images of the neighbours, each in the upper left corner of its plane.
-        sizes: [V, 2] int64, height and width of each neighbour's image.
-        matrices: [V, 3, 3] float64, K' R of each neighbour, with R from the reference's axes.
-        shifts: [V, 3] float64, K' t of each neighbour.
+        sizes: [V, 2] int64 height and width of each neighbour's image.
+        matrices: [V, 3, 3] float64 K' R of each neighbour, where R rotates from the axes of the reference camera.
+        shifts: [V, 3] float64 K' t of each neighbour.
         near: minimum depth, in world units.
-        far: maximum depth.
+        far: maximum depth, in world units.
         iterations: number of rounds.
-        best: 1 to 3, number of neighbours that must match well.
-        seed: for the random planes.
+        best: number of neighbours that must match well, 1 to 3.
+        seed: random seed of the planes.
 
     Returns:
-        depth [H, W] float64 (0 if there is none), normals [H, W, 3] in camera axes, cost [H, W] 1 − NCC.
+        Depths [H, W] float64 (0 if there is no match), normals [H, W, 3] in camera axes, and costs 1 − NCC [H, W].
     """
     height, width = image.shape
     depth, cost = np.zeros((height, width)), np.full((height, width), NO_MATCH)

@@ -1,4 +1,4 @@
-"""The plane on which images agree: a floor or table seen from directions that differ too much for stereo."""
+"""Finds the plane on which images agree: a floor or table seen from directions that differ too much for stereo."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ from scas4d_core.posed_pictures import (
 Planes = NDArray[np.float32]
 
 CELLS = 48
-"""Number of cells along the side of the search square, which is as wide as most images at the scene centre."""
+"""Number of cells along the side of the search square, which is as wide as a typical image at the scene centre."""
 MAX_CELLS = 160
-"""Maximum number of cells along the side when points are sampled."""
+"""Maximum number of cells along the side of the square when points are sampled."""
 REACH = 1.5
-"""Maximum offset of a plane from the scene centre, in half squares."""
+"""Maximum offset of a plane from the scene centre, relative to half the side of the square."""
 OFFSETS = 37
 """Number of offsets tried along a normal, two cells apart."""
 TILT, TILTS = 0.2, 5
 """Maximum tilt about either axis of the square, in radians, and number of tilts per axis."""
 ROUNDS = 6
-"""Number of refinement rounds, each with steps reduced by ``SHRINK``."""
+"""Number of refinement rounds; after a round without improvement, steps are divided by ``SHRINK``."""
 SHRINK = 1.7
 UNLIKE = 0.8
-"""Maximum cosine between two normals that are both tried."""
+"""Maximum cosine between the normals of two start planes; a start plane closer to a previous one is skipped."""
 PATCH = 7
 """Side of the compared patches, in cells."""
 TEXTURE = 4.0
-"""Minimum standard deviation, in gray levels, of a textured patch."""
+"""Minimum standard deviation, in grey levels, of a textured patch."""
 ALIKE, HALF_ALIKE = 0.6, 0.3
-"""Correlation of two cameras' patches above which they agree on a cell, and above which it counts for the plane."""
+"""Correlation of patches above which two cameras agree on a cell, and above which it adds to the score of a plane."""
 PAIRS = 2
-"""Minimum number of camera pairs that agree on a cell, and therefore at least three cameras."""
+"""Number of camera pairs that must agree on a cell; two pairs involve at least three cameras."""
 BEYOND_CHANCE = 1.8
 """Minimum score of a plane as a multiple of the score of mirrored images, which agree only by chance. The ratio is 2.2
-to 4.7 with a floor or table (six rigs), and 0.9 to 1.6 without (three)."""
+to 4.7 on six rigs with a floor or table, and 0.9 to 1.6 on three rigs without one."""
 MIN_CELLS = 40
-"""Minimum number of agreeing cells of a valid plane."""
+"""Minimum number of cells of a plane on which cameras agree."""
 MAX_VIEWS = 6
-"""Maximum number of compared views, evenly selected."""
+"""Maximum number of views that are compared, evenly spaced in the rig's order."""
 CLOSED = 15
-"""Width, in cells, of gaps between agreeing cells that are filled."""
+"""Maximum width, in cells, of gaps between agreeing cells that are filled."""
 
 NO_PLANE = "images: cameras agree on no plane; start from a point cloud"
 
@@ -65,7 +65,9 @@ class Plane:
     """A square piece of a plane.
 
     Attributes:
-        middle: [3] centre in the world. normal: [3] unit vector. half: half of the side, in world units.
+        middle: [3] centre in the world.
+        normal: [3] unit normal.
+        half: half of the side length, in world units.
     """
 
     middle: Float
@@ -73,7 +75,7 @@ class Plane:
     half: float
 
     def cells(self, count: int) -> Float:
-        """Returns the [count, count, 3] centres of the cells, in the world.
+        """Divides the square into count × count cells and returns their centres [count, count, 3] in the world.
 
         >>> Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]), 2.0).cells(2).shape
         (2, 2, 3)
@@ -85,7 +87,7 @@ class Plane:
 
 
 def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
-    """Returns points of the plane on which most images agree, including small gaps between agreeing cells.
+    """Returns points on the plane on which most images agree, including small gaps between agreeing cells.
 
     A plane has only two angles and an offset, so planes can be tried exhaustively (plane sweeping, Collins 1996).
     Projected onto the correct plane, images from very different directions look the same. Patches are compared by
@@ -95,7 +97,7 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
         labelled: views, with masks if available.
 
     Raises:
-        InitialPointsError: the images agree on no plane.
+        InitialPointsError: there is no plane on which the images agree.
 
     >>> from scas4d_core.cameras import Camera
     >>> texture = np.random.default_rng(0).integers(0, 255, (100, 100, 1), np.uint8).repeat(3, axis=2)
@@ -132,7 +134,7 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
     """Returns the plane on which images agree most: horizontal, parallel to the camera ring, or facing the cameras.
 
     Raises:
-        InitialPointsError: the agreement is hardly above that of mirrored images.
+        InitialPointsError: the images hardly agree more than mirrored images do.
     """
     candidates = [(_best(views, start), start) for start in _starts(views)]
     (score, plane), start = max(candidates, key=lambda one: one[0][0])
@@ -144,14 +146,14 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
 
 
 def _agreed_cells(views: Sequence[PosedPicture], plane: Plane, count: int) -> Bool:
-    """Returns [count, count] true for cells on which enough pairs of cameras agree."""
+    """Returns whether enough pairs of cameras agree on each cell, [count, count]."""
     pairs = _agreement(views, _smooth(views, plane, count), plane.cells(count)[None])[1][0]
     agreed: Bool = pairs >= min(PAIRS, len(views) - 1)
     return agreed
 
 
 def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
-    """Returns start planes through the scene centre with sufficiently different normals."""
+    """Returns start planes through the scene centre whose normals differ sufficiently."""
     middle = look_at_point(views)
     centres = np.array([view.camera.centre for view in views])
     up = -np.mean([view.camera.rotation[1] for view in views], axis=0)
@@ -210,7 +212,7 @@ def _axes(normal: Float) -> tuple[Float, Float]:
 
 
 def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Planes]:
-    """Returns grayscale images, low-pass filtered to the cell size."""
+    """Returns the images in greyscale, low-pass filtered to the cell size."""
     cell = 2 * plane.half / count / pixel_size_at(views, plane.middle)
     return [gaussian_filter(view.image.mean(axis=2, dtype=np.float32), max(0.5, cell / 2)) for view in views]
 
@@ -218,13 +220,16 @@ def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Pla
 def _agreement(
     views: Sequence[PosedPicture], smooth: Sequence[Planes], points: Float
 ) -> tuple[Float, NDArray[np.intp]]:
-    """Measures the agreement of images on planes.
+    """Measures how well images agree on each of several planes.
 
     Args:
-        points: [T, C, C, 3] cells of each plane, in the world.
+        views: views of the cameras.
+        smooth: filtered greyscale image of each view.
+        points: [T, C, C, 3] cell centres of each plane, in the world.
 
     Returns:
-        [T] sums of correlations above ``HALF_ALIKE``; [T, C, C] numbers of camera pairs that agree on a cell.
+        [T] score of each plane, the sum of correlations in excess of ``HALF_ALIKE``, and [T, C, C] number of camera
+        pairs that agree on each cell.
     """
     laid = [_warp_to_plane(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
     scores, pairs = np.zeros(len(points)), np.zeros(points.shape[:3], np.intp)
@@ -241,7 +246,7 @@ def _agreement(
 
 
 def _warp_to_plane(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
-    """Returns an image warped to planes: [T, C, C] values, patch means, patch deviations, and a texture mask."""
+    """Returns an image warped to planes, [T, C, C], and the mean, deviation and texture mask of its patches."""
     uv, depth = view.camera.project(points.reshape(-1, 3))
     height, width = picture.shape
     with np.errstate(invalid="ignore"):

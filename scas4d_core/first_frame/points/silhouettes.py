@@ -1,4 +1,4 @@
-"""The backdrop colour of a scene and the silhouettes in front of it, from the images only."""
+"""Estimates the backdrop colour of a scene and the silhouettes in front of it from the images alone."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from scipy.ndimage import label
 from scas4d_core.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
-"""Difference from the background, in levels of 255 in any channel, that still counts as background: above resampling
-and mild compression noise."""
+"""Maximum difference of a background pixel from the background colour in any channel, in levels of 255; above the noise
+from resampling and mild compression."""
 PLAIN_BORDER = 0.95
-"""Minimum share of one colour on the border of every image for the background to count as plain."""
+"""Minimum fraction of the border of each image that must have the same colour for a plain background."""
 SMALL_HOLE = 12
-"""Maximum size, in pixels, of background islands inside an object that are dark texture and not holes."""
+"""Maximum size, in pixels, of background islands inside an object that are treated as texture instead of holes."""
 
 PLAIN = 0.2
-"""Minimum share of all pixels in one colour for a plain backdrop; most cameras must have half of it."""
+"""Minimum fraction of all pixels that must have a similar colour for a plain backdrop; most cameras must reach half of
+it."""
 SAME = 0.05
-"""Minimum share of pixels in exactly one colour for a synthetic background. Quantized images of rooms have up to
-0.03."""
+"""Minimum fraction of all pixels that must have exactly the same colour for a synthetic background. Quantized images of
+rooms reach up to 0.03."""
 ALIKE = 8
-"""Tolerance, in levels of 255, for pixels of one colour: noise and JPEG artefacts."""
+"""Maximum difference between similar colours, in levels of 255, due to noise and JPEG artefacts."""
 PIXEL_STRIDE = 4
 """Spacing of the sampled pixels."""
 
@@ -35,10 +36,10 @@ def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
-    """Returns the colour [3], in levels of 255, of a plain backdrop in many of the images; None if there is none.
+    """Returns the [3] colour of a plain backdrop that many images show, in levels of 255; None if there is none.
 
     Args:
-        images: [H, W, 3] each, larger than ``PIXEL_STRIDE`` pixels on both sides.
+        images: images [H, W, 3], each side larger than ``PIXEL_STRIDE`` pixels.
     """
     pixels = [_sampled(image) for image in images]
     everyone = np.concatenate(pixels)
@@ -68,14 +69,17 @@ def _alike(pixels: NDArray[np.uint8], colour: NDArray[np.float64], levels: int) 
 
 
 def _is_backdrop(of_it: list[Bool], share: float) -> bool:
-    """Returns true if enough pixels show the backdrop overall, and half that share in most cameras; ``of_it``: by
-    camera.
+    """Returns whether enough pixels show the backdrop.
+
+    Args:
+        of_it: for each camera, whether each pixel shows the backdrop.
+        share: minimum fraction of all pixels; most cameras must reach half of it.
     """
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 
 
 def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
-    """Returns the colour [3] uint8 that the borders of all images share; None if they differ."""
+    """Returns the [3] uint8 colour that the borders of all images share; None if they differ."""
     borders = [_border(view.image) for view in views]
     colour = np.median(np.concatenate(borders), axis=0)
     for border in borders:
@@ -87,9 +91,7 @@ def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
 
 
 def silhouette(image: NDArray[np.uint8], background: NDArray[np.uint8]) -> Bool:
-    """Returns [H, W] true for pixels that differ from the background, and for small background islands inside the
-    object.
-    """
+    """Returns the [H, W] mask of pixels that differ from the background, including small islands of background."""
     other = np.abs(image.astype(np.int16) - background.astype(np.int16)).max(axis=-1) > TOLERANCE
     islands, count = label(~other)
     sizes = np.bincount(islands.ravel(), minlength=count + 1)

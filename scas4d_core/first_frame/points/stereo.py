@@ -1,4 +1,4 @@
-"""Dense stereo points, kept only if the depths of several cameras agree and few cameras see through them."""
+"""Computes dense stereo points on which the depths of several cameras agree and that few cameras see through."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved, pixels
 WIDTH = 320
 """Maximum image width, in pixels; wider images are halved repeatedly."""
 PACE_WIDTH = 80
-"""Image width for measuring the pace: a thirtieth of the work on one image."""
+"""Image width for measuring the pace, which takes a thirtieth of the work for one image."""
 PLANES_FIRST, PLANES_EACH = 3, 12
-"""Number of planes that each pixel tries initially and in each round (``patch_match``)."""
+"""Number of planes that are tried per pixel, initially and in each round (``patch_match``)."""
 NEIGHBOURS = 4
-"""Number of other cameras that each image is compared with."""
+"""Number of other cameras with which each image is compared."""
 MIN_NEIGHBOURS = 2
-"""Minimum number of neighbours of an image; a match in a single one is often wrong."""
+"""Minimum number of neighbours of an image; a match with only one neighbour is often wrong."""
 ITERATIONS = 4
 """Number of rounds of propagation and refinement."""
 MAX_COST = 0.35
 """Maximum cost 1 − NCC of an accepted match, before cameras are compared."""
 REPROJECTION = 1.0
-"""Maximum reprojection error, in pixels, of a point via another camera's depth."""
+"""Maximum reprojection error, in pixels, after projecting a point into another camera's depth map and back."""
 DEPTH_AGREEMENT = 0.01
-"""Maximum relative difference between two cameras' depths of one point."""
+"""Maximum relative difference between two cameras' depths of the same point."""
 MIN_ANGLE_DEG, MAX_ANGLE_DEG = 4.0, 50.0
-"""Limits on the angle between two cameras' rays to the scene centre: below, depth is uncertain; above, patches look
-different.
-"""
+"""Limits on the angle between two cameras' rays to the scene centre. If it is smaller, depth is uncertain; if it is
+larger, patches look different."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class DepthMap:
 
     Attributes:
         view: camera and image, at the size used for stereo.
-        depth: [H, W] along z, in world units, 0 if unknown.
+        depth: [H, W] depth along z, in world units; 0 if unknown.
         agreeing: [H, W] number of other cameras whose depth agrees.
     """
 
@@ -53,24 +52,27 @@ class DepthMap:
     agreeing: NDArray[np.intp]
 
     def trusted(self, others: int) -> Float:
-        """Returns the depth at pixels on which at least ``others`` other cameras agree, and 0 elsewhere."""
+        """Returns the depth of pixels on which at least ``others`` other cameras agree, and 0 elsewhere."""
         result: Float = np.where(self.agreeing >= others, self.depth, 0.0)
         return result
 
 
 @dataclass(frozen=True)
 class StereoBudget:
-    """Effort of stereo: maximum image width in pixels, and rounds of propagation and refinement."""
+    """Effort spent on stereo: maximum image width in pixels, and number of rounds of propagation and refinement."""
 
     width: int
     iterations: int
 
 
 def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> StereoBudget | None:
-    """Selects the effort that the time allows, from the pace on tiny images; None if there is no time for stereo.
+    """Selects the effort that the time limit allows, based on the pace on tiny images; None if stereo takes too long.
 
     Args:
-        views: at full size. middle: see ``depth_maps``. iterations: requested rounds. limit: time limit of frame 0.
+        views: views at full size.
+        middle: [3] scene centre; see ``depth_maps``.
+        iterations: requested number of rounds.
+        limit: time limit of frame 0.
     """
     efforts = [
         StereoBudget(width, rounds) for width in (WIDTH, WIDTH // 2) for rounds in (iterations, -(-iterations // 2))
@@ -97,13 +99,13 @@ def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, l
     if index:
         planned_effort = efforts[index]
         limit.shortened.append(
-            f"stereo on pictures of {planned_effort.width} pixels at most, {planned_effort.iterations} rounds"
+            f"stereo on images at most {planned_effort.width} pixels wide, {planned_effort.iterations} rounds"
         )
     return efforts[index]
 
 
 def load_stereo() -> None:
-    """Loads or compiles the kernel, so that this time does not distort the measured pace."""
+    """Loads or compiles the kernel in advance, so that the time for this does not distort the measured pace."""
     grey, planes = np.zeros((16, 16), np.float32), np.zeros((1, 16, 16), np.float32)
     patch_match(
         grey, np.ones((16, 16), bool), np.zeros((16, 16)), np.ones(4), planes, np.full((1, 2), 16), np.eye(3)[None],
@@ -112,7 +114,7 @@ def load_stereo() -> None:
 
 
 def _pixels(view: PosedPicture, width: int) -> int:
-    """Returns the number of pixels of a view after ``halved``."""
+    """Returns the number of pixels that ``halved`` leaves of a view."""
     columns, rows = view.camera.width, view.camera.height
     while columns > width:
         columns, rows = columns // 2, rows // 2
@@ -120,7 +122,7 @@ def _pixels(view: PosedPicture, width: int) -> int:
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
-    """Returns the views to compare one with: nearest in angle about ``middle`` [3], above a minimum angle."""
+    """Returns the views to compare a view with: the nearest in angle about ``middle`` [3], within the angle limits."""
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
@@ -141,19 +143,19 @@ def depth_maps(
     fewest: int = MIN_NEIGHBOURS,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[DepthMap]:
-    """Runs PatchMatch on every view with its neighbours, then compares all depths.
+    """Runs PatchMatch between every view and its neighbours, then compares all depths.
 
     Args:
         views: views of equal or different sizes; see ``halved``.
-        ranges: (near, far) of each view, in world units.
-        priors: [H, W] depth of each view to try first, 0 if unknown.
+        ranges: (near, far) depth limits of each view, in world units.
+        priors: [H, W] depths to try first in each view; 0 if unknown.
         active: [H, W] pixels to compute in each view.
         middle: [3] scene centre, about which angles between cameras are measured.
-        iterations: rounds of PatchMatch.
-        seed: for the random planes.
+        iterations: number of rounds of PatchMatch.
+        seed: random seed of the planes.
         hull: hull of the masks; depths of masked pixels outside of it are rejected.
         fewest: minimum number of neighbours of an image.
-        progress: called with (views done, views).
+        progress: called with (completed views, number of views).
     """
     greys = [_grey(view) for view in views]
     depths = []
@@ -169,7 +171,7 @@ def depth_maps(
 
 
 def _grey(view: PosedPicture) -> NDArray[np.float32]:
-    """Returns [H, W] luma in 0…1."""
+    """Returns the luma of the image in 0…1, [H, W]."""
     weights = np.array([0.299, 0.587, 0.114], np.float32)
     return np.ascontiguousarray(view.image.astype(np.float32) @ weights / np.float32(255))
 
@@ -215,7 +217,7 @@ def _match(
 
 
 def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Pads images to planes [V, H, W] of the largest size, each in the upper left corner; also returns sizes [V, 2]."""
+    """Returns images padded to the largest size, [V, H, W], each in the upper left corner, and their sizes [V, 2]."""
     sizes = np.array([picture.shape for picture in pictures], np.int64)
     planes = np.zeros((len(pictures), *sizes.max(axis=0)), np.float32)
     for plane, picture in zip(planes, pictures, strict=True):
@@ -224,7 +226,7 @@ def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.f
 
 
 def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
-    """Clears, in place, depths of masked pixels that are not near the hull, because no foreground is there."""
+    """Clears depths of masked pixels in place if they are not near the hull, because no foreground is there."""
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
         return
@@ -234,7 +236,7 @@ def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
 
 
 def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
-    """Returns the [H, W] number of other cameras whose depth maps a pixel's point back to it."""
+    """Returns how many other cameras' depth maps project each pixel's point back to that pixel, [H, W]."""
     camera, depth = views[index].camera, depths[index]
     rows, columns = np.nonzero(depth > 0)
     uv = np.stack([columns + 0.5, rows + 0.5], axis=-1)
@@ -258,8 +260,9 @@ def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: in
 def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
     """Returns [P, 3] points of all depth maps on which ``min_views`` cameras agree and that few see through.
 
-    A camera sees through a point if its trusted depth is clearly behind the point. A point is a floater if the cameras
-    that see through it are more than ``max_violations`` times those that agree on it (after Merrell et al. 2007).
+    A camera sees through a point if its trusted depth is clearly behind the point. A point is rejected as a floater if
+    the number of cameras that see through it exceeds ``max_violations`` times the number of cameras that agree on it
+    (after Merrell et al. 2007).
     """
     fused = [np.zeros((0, 3))]
     for index, one in enumerate(maps):
@@ -274,10 +277,10 @@ def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float
 def count_violations(
     maps: Sequence[DepthMap], points: Float, min_views: int, margin: float = 0.03, skip: int = -1
 ) -> NDArray[np.intp]:
-    """Returns the [P] number of cameras whose trusted depth is more than ``margin`` (relative) behind each point [P,
-    3].
+    """Returns the number of cameras that see through each of the points [P, 3], [P].
 
-    All 3 × 3 pixels around the point must agree, because at an outline the adjacent pixel sees past the point.
+    A camera sees through a point if its trusted depth is more than ``margin`` (relative) behind the point. All 3 × 3
+    pixels around the point must agree, because next to an outline, the adjacent pixel sees past the point.
     """
     through = np.zeros(len(points), dtype=np.intp)
     for index, one in enumerate(maps):

@@ -1,7 +1,7 @@
-"""Large smooth surfaces (walls, floors, domes) as planes and spheres that triangulated points support.
+"""Fits planes and spheres to triangulated points, for large smooth surfaces such as walls, floors and domes.
 
 Smooth walls have few features, and stereo produces floaters on them. A plane or sphere through many triangulated points
-gives the wall between them. The fit uses RANSAC (Fischler & Bolles 1981), refined by least squares.
+fills in the wall between them. The fit uses RANSAC (Fischler & Bolles 1981), refined by least squares.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from scipy.spatial import cKDTree
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture
 
 MAX_SURFACES = 3
-"""Maximum number of planes and spheres; walls, floor and a dome are rarely more."""
+"""Maximum number of planes and spheres; scenes rarely have more walls, floors and domes."""
 TOLERANCE = 0.012
 """Maximum distance of an inlier from a fitted surface, in rig radii."""
 TRIALS = 1500
 MIN_SHARE = 0.1
-"""Minimum share of the triangulated points that a surface explains."""
+"""Minimum fraction of the triangulated points that a surface must explain."""
 MIN_INLIERS = 30
 CAMERA_SLACK = 1.25
-"""Maximum distance of a camera from the centre of a dome, in dome radii; cameras are often mounted in it."""
+"""Maximum distance of a camera from the centre of a dome, in dome radii; cameras are often mounted in its surface."""
 MAX_BEHIND = 0.15
-"""Maximum share of the triangulated points behind a surface; almost nothing is behind a wall of a room."""
+"""Maximum fraction of the triangulated points behind a surface; almost nothing is behind a wall of a room."""
 MAX_RADIUS = 2.0
-"""Maximum radius of a dome, in rig radii; a larger one is a wall, which a plane describes with fewer parameters."""
+"""Maximum radius of a dome, in rig radii; a larger sphere is a wall, for which a plane needs fewer parameters."""
 GAP_PLANE = 0.5
 GAP_SPHERE = 1.5
 """Maximum distance, in rig radii, from a surface sample to the nearest triangulated point on the surface."""
@@ -42,7 +42,7 @@ class Surface(Protocol):
         """Returns the [P] signed distances of points [P, 3] along ``normals``."""
 
     def normals(self, points: Float) -> Float:
-        """Returns [P, 3] unit normals at the nearest surface points."""
+        """Returns the [P, 3] unit normals at the surface points nearest to points [P, 3]."""
 
     def hit(self, origin: Float, directions: Float) -> Float:
         """Returns the [R] ray parameters of the intersections from inside the room; infinity if there is none."""
@@ -61,7 +61,7 @@ class PatchPlane:
         return result
 
     def normals(self, points: Float) -> Float:
-        """Returns the normal for each point, [P, 3]."""
+        """Returns the plane's normal for each point, [P, 3]."""
         return np.broadcast_to(self.normal, points.shape)
 
     def hit(self, origin: Float, directions: Float) -> Float:
@@ -121,9 +121,9 @@ def fit_plane(points: Float) -> PatchPlane | None:
 
 
 def fit_sphere(points: Float) -> Sphere | None:
-    """Returns the sphere of points [P, 3], P ≥ 4; None if they are coplanar.
+    """Returns the least-squares sphere of points [P, 3], P ≥ 4; None if they are coplanar.
 
-    It solves |x|² = 2 x·c + (r² − |c|²), which is linear in c.
+    Solves |x|² = 2 x·c + (r² − |c|²), which is linear in c and r² − |c|².
     """
     middle = points.mean(0)
     local = points - middle
@@ -138,14 +138,15 @@ def fit_sphere(points: Float) -> Sphere | None:
 def fit_surfaces(
     points: Float, centres: Float, tolerance: float, *, most: int = MAX_SURFACES, seed: int = 0
 ) -> list[Support]:
-    """Returns planes and spheres that bound the cameras' room, with the best supported first.
+    """Returns planes and spheres that bound the room that contains the cameras, best supported first.
 
     Args:
-        points: [P, 3] triangulated, without the foreground if it is known.
-        centres: [V, 3] camera centres: all on one side of a plane, all within ``CAMERA_SLACK`` radii of a sphere.
-        tolerance: maximum distance of an inlier, in world units.
+        points: [P, 3] triangulated points, without the foreground if it is known.
+        centres: [V, 3] camera centres, which must be on the same side of a plane, or within ``CAMERA_SLACK`` radii of
+            the centre of a sphere.
+        tolerance: maximum distance of an inlier from a surface, in world units.
         most: maximum number of surfaces.
-        seed: for the RANSAC samples.
+        seed: random seed of RANSAC.
     """
     rng = np.random.default_rng(seed)
     rest = points
@@ -218,10 +219,10 @@ def _refined(surface: Surface, near: Float, tolerance: float) -> Surface | None:
 
 
 def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
-    """Returns the first intersections of the rays through pixels [R, 2] with the surfaces.
+    """Intersects the rays through pixels [R, 2] with the surfaces.
 
     Returns:
-        points [R, 3] (NaN if there is no intersection) and depths along z [R] (infinity in this case).
+        The first intersection of each ray [R, 3] and its depth along z [R]; NaN and infinity if there is none.
     """
     camera = view.camera
     ones = np.ones(len(uv))
@@ -236,14 +237,16 @@ def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) ->
 
 
 def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], stride: int, scale: float) -> Float:
-    """Returns [P, 3] surface points that the cameras see, one per ``stride``-th pixel outside the masks.
+    """Returns [P, 3] surface points that the cameras see, one for every ``stride``-th pixel outside the masks.
+
+    Samples far from every triangulated point of their surface (``GAP_…``) are skipped, unless they are inside a fitted
+    dome.
 
     Args:
-        views: views of the cameras; masked pixels show other objects.
+        views: views of the cameras; pixels inside the mask show other objects.
         supports: fitted surfaces.
-        stride: stride in pixels.
-        scale: radius of the rig. Samples far from every triangulated point of the surface (``GAP_…``) are left out,
-            unless they lie within a fitted dome.
+        stride: spacing of the sampled pixels.
+        scale: radius of the rig, in world units.
     """
     if not supports:
         return np.zeros((0, 3))
@@ -276,17 +279,17 @@ def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], 
 
 
 def snap_to_points(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
-    """Moves samples along the surface normal to the measured points around them.
+    """Moves surface samples along the surface normal towards the measured points around them.
 
     Domes consist of panels, and floors are not quite flat. The measured offsets are averaged over the neighbours of
     each sample, with the fitted surface itself as one more measurement.
 
     Args:
-        points: [P, 3] on the surfaces.
+        points: [P, 3] samples on the surfaces.
         supports: fitted surfaces.
         seen: [M, 3] measured points.
-        reach: in world units; measured points farther from the sample have little weight, and points farther from the
-            surface have none.
+        reach: distance in world units. Measured points farther from the sample have little weight, and points farther
+            from the surface have none.
     """
     if len(points) == 0 or len(seen) == 0:
         return points

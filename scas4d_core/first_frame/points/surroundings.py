@@ -1,4 +1,4 @@
-"""Surroundings: the image content beyond the scene, placed far behind it as coloured points."""
+"""Surroundings: image content beyond the scene, represented by coloured points far behind it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ ACROSS = 40
 BEHIND = 2.0
 """Distance of the points behind the scene centre, relative to the largest distance of a camera from the centre."""
 STAGE = 1.5
-"""Radius of the stage relative to the same distance; it contains all cameras and the shared volume."""
+"""Radius of the stage, relative to the largest distance of a camera from the scene centre. The stage contains all
+cameras and the shared volume."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,8 @@ class Stage:
     """The ball that contains the cameras and the shared volume.
 
     Attributes:
-        middle: [3] centre in the world. radius: radius in world units.
+        middle: [3] centre in the world.
+        radius: radius, in world units.
     """
 
     middle: Float
@@ -32,11 +34,11 @@ class Stage:
 
     @classmethod
     def of(cls, views: Sequence[PosedPicture], distances: Sequence[float]) -> Stage:
-        """Returns the stage of cameras with the given distances to what they look at, in world units."""
+        """Returns the stage of cameras with the given distances from the scene centre, in world units."""
         return cls(look_at_point(views), STAGE * max(distances))
 
     def holds(self, points: NDArray[np.floating]) -> Bool:
-        """Returns [P] true for points [P, 3] on the stage.
+        """Returns whether each of the points [P, 3] is on the stage, [P].
 
         >>> Stage(np.zeros(3), 2.0).holds(np.array([[1.0, 0, 0], [3.0, 0, 0]]))
         array([ True, False])
@@ -46,18 +48,18 @@ class Stage:
 
 
 def surroundings(views: Sequence[PosedPicture], distances: Sequence[float]) -> InitialPoints:
-    """Returns points far behind the scene on the rays of each camera's pixels.
+    """Returns points far behind the scene, along rays through the pixels of each camera.
 
-    If a few cameras are far apart, most of what one camera sees is invisible to the others, such as walls and the room
-    behind. Its depth is unknown. Nearby points would hide the scene from the other cameras. Points this far away are
-    rarely in another camera's image, and look like a backdrop if they are.
+    If the cameras are few and far apart, most of what one camera sees, such as walls, is invisible to the others. Its
+    depth is unknown. Points nearby would hide the scene from the other cameras. Points this far away are rarely visible
+    in another camera's image, and look like a backdrop if they are.
 
     Args:
-        views: with images; masked pixels show the scene and get no point.
-        distances: distances of each camera to the scene centre, in world units.
+        views: views of the cameras; pixels inside the mask show the scene and get no point.
+        distances: distance of each camera from the scene centre, in world units.
 
     Returns:
-        Points with the colours of their pixels; labelled as background if there are masks.
+        Points with the colours of their pixels, labelled as background if there are masks.
 
     >>> from scas4d_core.cameras import Camera
     >>> camera = Camera("a", np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.eye(4), 40, 40)

@@ -1,7 +1,7 @@
-"""Triangulates SIFT features that several calibrated cameras see (known poses, pycolmap).
+"""Triangulates SIFT features that several calibrated cameras see, using pycolmap with known poses.
 
 Because the poses are known, matches are searched only along epipolar lines. Compared with a search over the whole
-image, far fewer wrong candidates pass the ratio test, and wide baselines keep their matches.
+image, far fewer wrong candidates pass the ratio test, and matches across wide baselines are kept.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved
 RATIO = 0.8
 """Maximum ratio of best to second-best descriptor distance on the epipolar line (Lowe 2004, section 7.1)."""
 MAX_DESCRIPTOR_DISTANCE = 0.7
-"""COLMAP's maximum distance between two unit descriptors."""
+"""Maximum distance between two matching unit descriptors, as in COLMAP."""
 MAX_FEATURES = 4096
-"""Maximum number of SIFT features per image; matching a pair costs the product of their numbers."""
+"""Maximum number of SIFT features per image; matching time grows with the product of two images' numbers."""
 EPIPOLAR_ERROR = 2.0
-"""Maximum epipolar distance of a match and maximum reprojection error, in pixels; calibration residuals are near
-0.5."""
+"""Maximum epipolar distance of a match and maximum reprojection error, in pixels. Calibration residuals are typically
+near 0.5."""
 FEW_PAIRS = 10
-"""Minimum number of matched image pairs, which also measure the pace."""
+"""Minimum number of image pairs to match; these pairs also serve to measure the pace."""
 FAINT_CONTRAST = 0.0017
-"""A quarter of COLMAP's threshold: smooth walls have low contrast, and known poses reject wrong matches."""
+"""SIFT contrast threshold, a quarter of COLMAP's: smooth walls are faint, and known poses reject wrong matches."""
 MIN_ANGLE_DEG = 2.0
-"""Minimum triangulation angle; rays at smaller angles hardly determine depth."""
+"""Minimum triangulation angle in degrees; rays at smaller angles hardly constrain depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class Triangulation:
     """Triangulated points and the views that see them.
 
     Attributes:
-        positions: [P, 3] float64 in the world.
-        views: [P, V] bool, the inlier views of each point.
+        positions: [P, 3] float64 point positions in the world.
+        views: [P, V] bool, whether each view is an inlier of each point.
         error: [P] mean reprojection error in pixels.
     """
 
@@ -61,8 +61,10 @@ def extract_features(
     """Extracts SIFT keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128] of every view.
 
     Args:
-        limit: time limit of frame 0; if time is short, the images are downscaled to a half or less.
-        most: maximum features per image, largest first. contrast: minimum difference of Gaussians, for images in 0…1.
+        views: views whose images are searched.
+        limit: time limit of frame 0; if time is short, the images are downscaled by a factor of two or four.
+        most: maximum number of features per image, largest first.
+        contrast: minimum difference of Gaussians, for images in 0…1.
     """
     import pycolmap
 
@@ -83,7 +85,7 @@ def extract_features(
 def _all_features(
     views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """Runs ``extract_features`` with a function for grayscale images; the first image measures the pace."""
+    """Extracts the features of all views with a function for greyscale images; the first view measures the pace."""
     features_by_view: list[tuple[Float, NDArray[np.float32]]] = []
     size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
     for view in views:
@@ -92,7 +94,7 @@ def _all_features(
             index = limit.choose(FEATURES, [each * sum(size[1:]), *(each * sum(size) / n**2 for n in (2, 4))])
             if index:
                 divisor = 2 ** min(index, 2)
-                limit.shortened.append(f"features of pictures of a size of 1/{divisor}")
+                limit.shortened.append(f"features from images downscaled to 1/{divisor}")
                 features_by_view = [_features(views[0], extract, divisor)]
         features_by_view.append(_features(view, extract, divisor))
     return features_by_view
@@ -101,7 +103,7 @@ def _all_features(
 def _features(
     view: PosedPicture, extract: Callable[[NDArray[np.float32]], Any], divisor: int
 ) -> tuple[Float, NDArray[np.float32]]:
-    """Returns the features of a view, downscaled by ``divisor``, which is a power of two."""
+    """Returns the features of a view in full-size pixels; the image is downscaled by ``divisor``, a power of two."""
     image = view.image if divisor == 1 else halved(view, -(-view.camera.width // divisor)).image
     grey = image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     keypoints, raw = extract(np.ascontiguousarray(grey / np.float32(255)))
@@ -111,7 +113,7 @@ def _features(
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Float:
-    """Returns [3, 3] F with x₂ᵀ F x₁ = 0 for pixels x₁, x₂ (Hartley & Zisserman 2004, equation 9.1)."""
+    """Returns the [3, 3] matrix F with x₂ᵀ F x₁ = 0 for pixels x₁, x₂ (Hartley & Zisserman 2004, equation 9.1)."""
     rotation = second.rotation @ first.rotation.T
     x, y, z = second.translation - rotation @ first.translation
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -123,7 +125,12 @@ def guided_matches(
     first: tuple[Camera, Float, NDArray[np.float32]],
     second: tuple[Camera, Float, NDArray[np.float32]],
 ) -> NDArray[np.intp]:
-    """Returns [M, 2] mutual best matches of features within ``EPIPOLAR_ERROR`` pixels of the epipolar lines."""
+    """Returns the [M, 2] mutual best matches among features within ``EPIPOLAR_ERROR`` pixels of the epipolar lines.
+
+    Args:
+        first: camera, feature positions [A, 2] and unit descriptors [A, 128] of a view.
+        second: the same for the other view.
+    """
     (camera_a, uv_a, descriptors_a), (camera_b, uv_b, descriptors_b) = first, second
     if len(uv_a) == 0 or len(uv_b) == 0:
         return np.zeros((0, 2), dtype=np.intp)
@@ -145,10 +152,10 @@ def descriptor_distances(first: NDArray[np.float32], second: NDArray[np.float32]
 
 
 def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Returns [M, 2] rows and columns of mutual nearest neighbours that pass Lowe's ratio test.
+    """Returns the [M, 2] rows and columns of mutual nearest neighbours that pass Lowe's ratio test.
 
     Args:
-        distance: [A, B] between descriptors; A and B are at least 1.
+        distance: [A, B] distances between descriptors; A and B are at least 1.
 
     >>> mutual_best(np.float32([[0.1, 0.6, 0.6], [0.6, 0.5, 0.51]])).tolist()  # the second row is ambiguous
     [[0, 0]]
@@ -160,7 +167,7 @@ def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
     def runner_up(block: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.partition(block, 1, axis=1)[:, 1] if block.shape[1] > 1 else np.full(len(block), 2.0, np.float32)
 
-    # Few features have a mutual partner, so the second best is computed only for these.
+    # Few features are mutual nearest neighbours, so the second-best distance is computed only for these.
     good = np.flatnonzero((best_a[best_b] == rows) & (value < MAX_DESCRIPTOR_DISTANCE))
     good = good[value[good] < RATIO * runner_up(distance[good])]
     good = good[value[good] < RATIO * runner_up(distance[:, best_b[good]].T)]
@@ -172,7 +179,9 @@ class FeatureTracks:
     """SIFT features of all views, and tracks of matching features.
 
     Attributes:
-        pixels: [F, 2] of all features. owner: [F] view index of each. groups: feature indices of each track.
+        pixels: [F, 2] positions of all features.
+        owner: [F] view index of each feature.
+        groups: feature indices of each track.
     """
 
     pixels: Float
@@ -184,7 +193,8 @@ def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) 
     """Matches SIFT features over all pairs of views; masks are ignored.
 
     Args:
-        limit: time limit of frame 0; if time is short, pairs with different viewing directions are left out.
+        views: views of one frame.
+        limit: time limit of frame 0; if time is short, pairs whose viewing directions differ most are skipped.
     """
     limit = limit or TimeLimit(None)
     features_by_view = extract_features(views, limit)
@@ -201,7 +211,7 @@ def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) 
 
 
 def label_tracks(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Returns the [F] track of each of ``count`` features; the two features of an edge [E, 2] share a track.
+    """Returns the track index of each of ``count`` features; the two features of an edge [E, 2] share a track.
 
     >>> label_tracks(np.array([[0, 3], [3, 1]]), 4).tolist()
     [0, 0, 1, 0]
@@ -223,7 +233,7 @@ def group_by_track(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _affordable_pairs(
     found: Sequence[tuple[Camera, Float, NDArray[np.float32]]], limit: TimeLimit
 ) -> list[tuple[int, int]]:
-    """Returns the pairs of views that there is time to match: all, or those with similar viewing directions."""
+    """Returns the pairs of views that can be matched in time: all, or those with the most similar directions."""
     pairs = [(a, b) for a in range(len(found)) for b in range(a + 1, len(found))]
     if not limit.bounded or len(pairs) <= FEW_PAIRS:
         return pairs
@@ -237,7 +247,7 @@ def _affordable_pairs(
     most = int((each * np.cumsum(work) <= limit.seconds_left(MATCHES)).sum())
     if most < len(pairs):
         most = max(most, FEW_PAIRS)
-        limit.shortened.append(f"features matched in {most} of {len(pairs)} pairs of pictures")
+        limit.shortened.append(f"features matched in {most} of {len(pairs)} image pairs")
     return sorted(pairs[:most])
 
 
@@ -247,12 +257,14 @@ def triangulator(
     """Returns a function that triangulates one track with fixed poses (LO-RANSAC, pycolmap).
 
     Args:
-        cameras: calibrated. angle: minimum triangulation angle, in degrees. error: maximum reprojection error, in
-            pixels.
-        trials: maximum number of RANSAC trials. seed: for RANSAC.
+        cameras: calibrated cameras.
+        angle: minimum triangulation angle, in degrees.
+        error: maximum reprojection error, in pixels.
+        trials: maximum number of RANSAC trials.
+        seed: random seed of RANSAC.
 
     Returns:
-        A function of camera indices [n] and pixels [n, 2] that returns the point [3] and inliers [n], or None.
+        A function that takes camera indices [n] and pixels [n, 2], and returns the point [3] and inliers [n], or None.
     """
     import pycolmap
 
@@ -284,10 +296,10 @@ def triangulate(
     """Triangulates each feature track robustly (LO-RANSAC), with fixed poses.
 
     Args:
-        views: images of one frame.
-        tracks: result of ``match_tracks``, if it is already known.
+        views: views of one frame.
+        tracks: result of ``match_tracks``; computed if None.
         min_views: minimum number of inlier views of a point.
-        seed: for RANSAC.
+        seed: random seed of RANSAC.
     """
     tracks = tracks or match_tracks(views)
     pixels, owner = tracks.pixels, tracks.owner
@@ -312,7 +324,7 @@ def triangulate(
             for w, uv in zip(who[inlier], pixels[group][inlier], strict=True)
         ]
         error = float(np.mean(residuals))
-        if not error <= EPIPOLAR_ERROR:  # NaN: behind a camera
+        if not error <= EPIPOLAR_ERROR:  # NaN if the point is behind a camera
             continue
         positions.append(point)
         seen.append(row)

@@ -1,6 +1,6 @@
-"""The visual hull, the largest shape with the masks as silhouettes (Laurentini 1994), as an octree of voxels.
+"""The visual hull, the largest shape that agrees with the masks (Laurentini 1994), as an octree of voxels.
 
-Cameras are ignored for voxels outside their image; a voxel counts only if ``min_views`` cameras see it.
+A camera is ignored for voxels outside its image; a voxel is kept only if at least ``min_views`` cameras see it.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from scas4d_core.posed_pictures import (
 )
 
 SEEN_SHARE = 0.35
-"""Minimum share of the masked cameras that see a voxel: at the edges of the scene, few cameras would leave ghosts."""
+"""Minimum fraction of the masked cameras that must see a voxel, to avoid ghosts where few cameras see the scene."""
 VOXEL_PIXELS = 1.5
-"""Maximum edge of the smallest voxel, in pixels at the scene centre."""
+"""Maximum edge length of the smallest voxels, in pixels at the scene centre."""
 MISSES = 0.05
-"""Share of the cameras whose given masks may miss a voxel, because automatic masks are ragged. Silhouettes in front of
-a plain background are exact and use 0."""
+"""Fraction of the cameras whose masks may miss a voxel, because automatic masks are ragged. Silhouettes in front of a
+plain background are exact and use 0."""
 COARSE = 32
 """Number of voxels along an edge of the first, coarsest grid."""
 MAX_VOXELS = 4_000_000
-"""Maximum number of voxels in a level, to bound memory; refinement stops before it is exceeded."""
+"""Maximum number of voxels per level, to bound memory; refinement stops before it is exceeded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,9 @@ class VisualHull:
     """Voxels inside the silhouettes of all cameras that see them.
 
     Attributes:
-        cells: [M, 3] integer grid indices.
-        origin: [3] centre of the voxel with index 0.
-        voxel: edge length, in world units.
+        cells: [M, 3] integer grid indices of the voxels.
+        origin: [3] centre of the voxel with index (0, 0, 0).
+        voxel: edge length of a voxel, in world units.
     """
 
     cells: NDArray[np.int64]
@@ -57,11 +57,11 @@ class VisualHull:
 
     @property
     def volume(self) -> float:
-        """Volume in cubic world units."""
+        """Volume of the hull, in cubic world units."""
         return len(self.cells) * self.voxel**3
 
     def is_near(self, points: Float) -> Bool:
-        """Returns [P] true for points [P, 3] inside the hull or within two voxels of it (some slightly farther)."""
+        """Returns whether each of the points [P, 3] is inside the hull or within about two voxels of it, [P]."""
         low, size, strides, keys = self._surroundings
         at = np.floor((points - self.origin) / self.voxel + 0.5).astype(np.int64) // 2
         near = ((at > low) & (at < low + size - 1)).all(axis=1)
@@ -73,7 +73,7 @@ class VisualHull:
     def _surroundings(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """A grid at half resolution: lowest cell, size, strides, and sorted keys of the cells in or next to the hull.
 
-        It is cached, because stereo uses it for every image and the hull may have millions of voxels.
+        The grid is cached, because stereo uses it for every image and the hull may have millions of voxels.
         """
         halved = self.cells // 2
         low = halved.min(0) - 2
@@ -85,7 +85,7 @@ class VisualHull:
         return low, size, strides, keys
 
     def surface(self) -> Bool:
-        """Returns [M] true for voxels with at least one empty neighbour among the six."""
+        """Returns whether at least one of the six neighbours of each voxel is empty, [M]."""
         if len(self.cells) == 0:
             return np.zeros(0, dtype=bool)
         low = self.cells.min(0) - 1
@@ -101,9 +101,7 @@ class VisualHull:
 
 
 def pixel_size_at(views: Sequence[PosedPicture], point: Float) -> float:
-    """Returns the size of a pixel at ``point`` [3] in world units, median over cameras that have it in front; 1 if
-    none.
-    """
+    """Returns the pixel size at ``point`` [3] in world units, median over the cameras that face it; 1 if none do."""
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
     ]
@@ -116,11 +114,12 @@ def carve(
     """Carves the visual hull of the masks.
 
     Args:
-        views: those without a mask are ignored.
-        voxel_pixels: maximum edge of the smallest voxel, in pixels at the scene centre; voxels are halved until it is
-            reached.
-        misses: share of the cameras seeing a voxel whose mask may miss it.
-        min_views: minimum number of cameras that see a voxel; also at least ``SEEN_SHARE`` of the masked cameras.
+        views: views of the cameras; views without a mask are ignored.
+        voxel_pixels: maximum edge length of the smallest voxels, in pixels at the scene centre; voxels are halved until
+            it is reached.
+        misses: fraction of the cameras seeing a voxel whose masks may miss it.
+        min_views: minimum number of cameras that see a voxel; at least ``SEEN_SHARE`` of the masked cameras must see it
+            too.
     """
     masked = [view for view in views if view.mask is not None]
     middle = look_at_point(views)
@@ -150,13 +149,14 @@ def count_contradictions(
     """Returns the [P] number of masks that contradict each point [P, 3].
 
     A point within the silhouettes is foreground and is not contradicted. Any other point is background and must not lie
-    in front of the hull at a foreground pixel. Stereo produces such points next to outlines, where a patch covers both.
+    in front of the hull at a foreground pixel. Stereo produces such points next to outlines, where a patch covers both
+    foreground and background.
 
     Args:
-        views: those without a mask are ignored.
+        views: views of the cameras; views without a mask are ignored.
         hull: hull of the masks.
-        points: points in the world.
-        misses: share of the masks that may miss a foreground point.
+        points: [P, 3] points in the world.
+        misses: fraction of the masks that may miss a foreground point.
     """
     surface = hull.centres[hull.surface()]
     against, missed, seen = (np.zeros(len(points), dtype=np.intp) for _ in range(3))
@@ -189,17 +189,17 @@ def _inside_silhouettes(
     min_views: int,
     last: bool,
 ) -> Bool:
-    """Returns [M] true for voxels that at most a share ``misses`` of their cameras see outside the silhouette."""
+    """Returns whether at most a fraction ``misses`` of the cameras of each voxel see it outside the silhouette, [M]."""
     missed = np.zeros(len(centres), dtype=np.int32)
     seen = np.zeros(len(centres), dtype=np.int32)
     may_see = np.zeros(len(centres), dtype=np.int32)
     for view, distance in zip(views, distances, strict=True):
         camera = view.camera
         column, line, depth, inside = pixels_inside(camera, centres)
-        # Before the last level, a cell is kept if any part of it may be in the silhouette: the slack is its half
-        # diagonal plus a pixel. On the last level its centre decides, with a slack of half a voxel plus half a pixel
-        # diagonal: masks are sampled at pixel centres, and if all of many masks had to agree exactly, every rounding
-        # error would carve the hull.
+        # Before the last level, a voxel is kept if any part of it may be in the silhouette: the slack is half its
+        # diagonal plus 1.5 pixels. On the last level, its centre decides, with a slack of half a voxel plus half a
+        # pixel diagonal. Masks are sampled at pixel centres; if many masks had to agree exactly, rounding errors would
+        # carve into the hull.
         half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
         slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
         judged = inside & (depth > half)

@@ -1,4 +1,4 @@
-"""Points in the volume that cameras share: the last resort for initial points, without confirmation."""
+"""Samples unconfirmed points in the volume that cameras share, as a last resort for initial points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scas4d_core.posed_pictures import (
 SAMPLES = 60_000
 """Number of sampled points: about one per four pixels of the stereo images."""
 KEPT = 0.25
-"""Share of the points that are kept: those whose colour differs least between cameras."""
+"""Fraction of the points that are kept: those whose colour differs least between cameras."""
 NEAR, FAR = 0.3, 1.7
 """Range of sampled depths, relative to the distance of the camera from the scene centre."""
 FEW = 10
@@ -33,9 +33,9 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
     The points are not known to lie on surfaces; the fit of frame 0 moves, removes and adds Gaussians.
 
     Args:
-        views: with images; points lie in all masks.
-        distances: distances of each camera to the scene centre, in world units.
-        seed: for the samples.
+        views: views of the cameras; points outside the mask of any view that sees them are removed.
+        distances: distance of each camera from the scene centre, in world units.
+        seed: random seed of the samples.
 
     Raises:
         InitialPointsError: no two cameras look at the same place.
@@ -67,12 +67,12 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
             break
     else:
         raise InitialPointsError(
-            "images: no two cameras see the same place; check that the calibration belongs to the pictures, and that "
-            "its poses are the way round that its format has them (world to camera; transforms.json: camera to world)"
+            "images: no two cameras see the same place; check that the calibration matches the images, and that its "
+            "poses have the direction that its format requires (world to camera; transforms.json: camera to world)"
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
-    # Points outside any mask have been removed, so the rest lie in the masks of all cameras that see them.
+    # Points outside any mask have been removed, so the others are in the masks of all cameras that see them.
     masked = any(view.mask is not None for view in views)
     labels = np.ones(len(best), np.float32) if masked else None
     return InitialPoints(points[shared][best], seen.colours[best], labels)
@@ -88,8 +88,9 @@ def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) 
     """Returns each camera's distance to the scene: to known points, or else to the intersection of the optical axes.
 
     Args:
-        views: of the cameras. known: [P, 3] triangulated points, may be empty. radius: of the rig; the distance if the
-            viewing directions are parallel.
+        views: views of the cameras.
+        known: [P, 3] triangulated points; may be empty.
+        radius: radius of the rig, which is used as the distance if the viewing directions are parallel.
     """
     middle = look_at_point(views)
     distances = []

@@ -1,1 +1,1 @@
-"""Kernels of the appearance effects; the only other kernel module that they use is ``jit``."""
+"""Kernels for appearance effects, which are independent of all other kernel modules except ``jit``."""

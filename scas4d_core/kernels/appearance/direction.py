@@ -1,17 +1,17 @@
-"""View-dependent colours of Gaussians whose gloss reflects an environment, and their backward pass.
+"""View-dependent colours of glossy Gaussians that reflect an environment, and their backward pass.
 
-Pixel values are roughly the square root of light (a gamma of 2), and light is additive. With c the colour of a
-Gaussian, s its gloss, n its normal, v the direction to the camera, μ = n·v and r = 2μn − v the reflected direction, for
-μ > 0:
+Light is additive, and pixel values are approximately its square root (a gamma of 2). Let c be the colour of a Gaussian,
+s its gloss, n its normal, v the direction to the camera, μ = n·v, and r = 2μn − v the reflected direction. For μ > 0:
 
     T = c|c| (1 − FALL f min(s, 1)) + s (E(r + k (x − x₀)) + sheen f),    f = (1 − μ)⁴,    colour = T / √|T|
 
-E is the environment: an RGB grid over directions (octahedral map, Cigolle et al. 2014), sampled bilinearly. It is fixed
-to the world while objects rotate. The direction to a nearby light depends on the position: k is its inverse distance,
-x₀ the middle of the scene. The sheen is the reflection at grazing angles, where less light comes from inside.
+E is the environment, an RGB grid over directions (octahedral map, Cigolle et al. 2014) that is sampled bilinearly. It
+stays fixed in the world while objects rotate. The direction to a nearby light depends on the position of the Gaussian.
+The lookup accounts for this with the inverse distance k of the light and the centre x₀ of the scene. The sheen is the
+reflection at grazing angles, where diffuse light decreases.
 
-Reference: ``engines.torch.gloss``. Gradients to positions and rotations are omitted: the direction to a camera hardly
-changes within an update, and rotations are determined by texture and outline.
+Reference implementation: ``engines.torch.gloss``. Gradients to positions and rotations are omitted. The direction to
+a camera hardly changes during an update, and rotations are determined by texture and silhouettes.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from numpy.typing import NDArray
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, parallel_kernel
 
 SIDE = 16
-"""Cells along a side of the grid: 12 degrees each, about the width of a lamp's highlight on a glazed surface."""
+"""Cells per side of the grid. A cell covers 12 degrees, about the width of a lamp's highlight on a glazed surface."""
 CELLS = SIDE * SIDE
 SHEEN, MIDDLE, NEARNESS = CELLS, CELLS + 1, CELLS + 2
-"""Rows of an environment after the cells: RGB of the sheen; x₀; (k, 0, 0)."""
+"""Rows of an environment that follow the cells: RGB of the sheen, x₀, and (k, 0, 0)."""
 ROWS = CELLS + 3
 FALL = np.float32(0.9)
-"""Share of the diffuse light that is lost at grazing angles."""
+"""Fraction of the diffuse light that is lost at grazing angles."""
 DARK = np.float32(1e-4)
-"""Light below which the square root is replaced by a line, because its slope is unbounded at 0."""
+"""Light level below which the square root is replaced by a linear function, because its slope is unbounded at 0."""
 OVER = np.float32(0.05)
-"""Slope of colours above 1; a picture saturates at white, and a small gradient keeps the direction to darker values."""
+"""Slope of colours above 1. Images saturate at white, but a small gradient still allows colours to become darker."""
 DULL = np.float32(1e-4)
-"""Gloss below which a Gaussian has no normal, and its colour is independent of the direction."""
+"""Gloss strength below which a Gaussian has no normal and its colour does not depend on the view."""
 CHUNK = 4096
 _STEP = np.float32((SIDE - 1) / 2)
 _LAST = SIDE - 2
@@ -54,8 +54,14 @@ def shade(
     """Fills the first three columns of ``shown`` [N, 4] with the colours that a camera sees.
 
     Args:
-        means: [N, 3] metres. gloss: [M, 3], M ≤ N: normal times strength, before rotation; other Gaussians have none.
-        turns: [N, 4] unit quaternions (w, x, y, z). colours: [N, 3]. environment: [ROWS, 3]. centre: [3] of the camera.
+        means: [N, 3] means, in metres.
+        gloss: [M, 3] unrotated normals of the first M ≤ N Gaussians, scaled by gloss strength. All other Gaussians are
+            not glossy.
+        turns: [N, 4] rotations of the normals, as unit quaternions (w, x, y, z).
+        colours: [N, 3] RGB colours without gloss.
+        environment: [ROWS, 3] environment.
+        centre: [3] camera centre, in metres.
+        shown: [N, 4] output.
     """
     shade_rows(means, gloss, turns, colours, environment, centre, shown)
 
@@ -70,10 +76,15 @@ def shade_backward(
     g_shown: NDArray[np.float32],
     g_gloss: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Converts the gradient of ``shown`` [N, 4] to that of the colours, in place, and fills that of ``gloss`` [M, 3].
+    """Converts the gradient of ``shown`` to the gradient of ``colours`` in place, and fills the gradient of ``gloss``.
+
+    Args:
+        means, gloss, turns, colours, environment, centre: see ``shade``.
+        g_shown: [N, 4] gradient of ``shown``, replaced by the gradient of ``colours``.
+        g_gloss: [M, 3] output, gradient of ``gloss``.
 
     Returns:
-        [ROWS, 3] gradient of the environment; that of x₀ is 0.
+        [ROWS, 3] gradient of the environment; the row of x₀ is 0.
     """
     sums = np.zeros((-(-len(means) // CHUNK), ROWS, 3), np.float32)
     shade_rows_backward(means, gloss, turns, colours, environment, centre, g_shown, g_gloss, sums)
@@ -83,7 +94,7 @@ def shade_backward(
 
 @parallel_kernel
 def shade_rows(means, gloss, turns, colours, environment, centre, shown):
-    """Runs ``shade`` in parallel tasks."""
+    """Implements ``shade`` with parallel tasks."""
     count, glossy = means.shape[0], gloss.shape[0]
     k = environment[NEARNESS, 0]
     for task in prange((count + CHUNK - 1) // CHUNK):
@@ -133,7 +144,7 @@ def shade_rows(means, gloss, turns, colours, environment, centre, shown):
 
 @parallel_kernel
 def shade_rows_backward(means, gloss, turns, colours, environment, centre, g_shown, g_gloss, sums):
-    """Runs ``shade_backward`` in parallel tasks, which add to ``sums`` [tasks, ROWS, 3], initially zero."""
+    """Implements ``shade_backward`` with parallel tasks, which add to ``sums`` [tasks, ROWS, 3], initially zero."""
     count, glossy = means.shape[0], gloss.shape[0]
     k = environment[NEARNESS, 0]
     for task in prange((count + CHUNK - 1) // CHUNK):

@@ -1,4 +1,4 @@
-// Accuracy and seconds over the frames, as two small charts that share their frames. SVG, so that it stays sharp.
+// Chart of a figure over the frames, drawn as SVG so that it stays sharp.
 
 const NS = "http://www.w3.org/2000/svg";
 const [LEFT, RIGHT, TOP, BOTTOM] = [38, 8, 8, 16];
@@ -10,7 +10,7 @@ export function element(name, attributes, parent) {
   return made;
 }
 
-/** 1, 2 or 5 times a power of ten: about `count` steps over a span. */
+/** Step of 1, 2 or 5 times a power of ten that divides a span into about `count` steps. */
 export function step(span, count) {
   const rough = span / count;
   const power = 10 ** Math.floor(Math.log10(rough));
@@ -19,10 +19,10 @@ export function step(span, count) {
 
 export class Chart {
   /**
-   * @param svg where it is drawn
+   * @param svg element to draw into
    * @param kind "line" or "bars"
-   * @param unit of the values
-   * @param pick called with a frame's index when it is clicked
+   * @param unit unit of the values
+   * @param pick called with the index of a frame that is clicked
    */
   constructor(svg, kind, unit, pick) {
     Object.assign(this, { svg, kind, unit, points: [], chosen: null });
@@ -43,7 +43,7 @@ export class Chart {
     return value === null ? "not measured" : `${value.toFixed(value < 10 ? 2 : 1)} ${this.unit}`;
   }
 
-  /** @param points [{index, value or null, fault, rejected, change}] by index: the reason for a mark, or nothing */
+  /** @param points [{index, value, fault, rejected, change}] in order; a value may be null, and the last three are reasons for marks, if any */
   set(points) {
     this.points = points;
     this.draw();
@@ -86,7 +86,7 @@ export class Chart {
     let clipped = () => false;
     if (this.kind === "bars") {
       low = 0;
-      // One frame that had to wait for a compiler would make all others invisible: it leaves the chart at the top.
+      // A frame that had to wait for a compiler would make all others invisible, so its bar is cut off at the top.
       const median = [...values].sort((a, b) => a - b)[values.length >> 1];
       const usual = Math.max(...values.filter((value) => value <= 5 * median));
       clipped = (value) => value > 5 * median;

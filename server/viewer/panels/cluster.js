@@ -1,23 +1,23 @@
-// The dialog of the cluster: its nodes, what scenes take of each, and what waits for one. Not there on a single machine.
+// Dialog with the cluster's nodes, the resources that scenes reserve on each, and waiting processes. Hidden on a single machine.
 
 import { $, node, sentence } from "../page.js";
 import { call, token } from "../service.js";
 import { counted } from "../states.js";
 
 const LOOK_MS = 3000;
-const STARTS_S = 5; // a process that waits no longer is about to start
-const ROLES = { worker: "worker", views: "reader of views", bulk: "reader of tracks and parts", exporter: "export", replayer: "replay" };
+const STARTS_S = 5; // a process that has waited for less than this is about to start
+const ROLES = { worker: "worker", views: "reader for views", bulk: "reader for tracks and parts", exporter: "export", replayer: "replay" };
 
 const number = new Intl.NumberFormat("en", { maximumFractionDigits: 2 });
 const gigabytes = (mb) => (mb / 1000).toFixed(1);
 
-/** Seconds for a person: 12 s, 3 min, 2 h. */
+/** Formats a duration in seconds, such as 12 s, 3 min or 2 h. */
 const since = (seconds) => (seconds < 90 ? `${Math.round(seconds)} s` : seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`);
 
 export class ClusterView {
   /**
-   * @param called the name of a scene, by its id
-   * @param choose opens a scene, by its id
+   * @param called returns the name of a scene, given its id
+   * @param choose opens a scene, given its id
    */
   constructor(called, choose) {
     Object.assign(this, { called, choose, timer: 0, known: false });
@@ -27,7 +27,7 @@ export class ClusterView {
     this.dialog.addEventListener("close", () => clearTimeout(this.timer));
   }
 
-  /** Offers the dialog where scenes run on a cluster; asks for that once. A link to one scene shows nothing else. */
+  /** Offers the dialog if scenes run on a cluster, which is requested only once; with a link to one scene, it stays hidden. */
   async appear() {
     if (this.known || token.readsOne()) return;
     this.known = true;
@@ -43,13 +43,13 @@ export class ClusterView {
     this.look();
   }
 
-  /** Looks again and again while the dialog is open. */
+  /** Updates the dialog periodically while it is open. */
   async look() {
     clearTimeout(this.timer);
     try {
       if (!document.hidden) this.show(await call("GET", "/v1/cluster"));
     } catch (error) {
-      this.say(`${error.message} What is below was so when it last answered.`);
+      this.say(`${error.message} The list below is from its last response.`);
     }
     if (this.dialog.open) this.timer = setTimeout(() => this.look(), LOOK_MS);
   }
@@ -58,8 +58,8 @@ export class ClusterView {
     const alive = nodes.filter((one) => one.alive).length;
     const lost = nodes.length > alive ? `, ${nodes.length - alive} lost` : "";
     const late = waiting.filter((one) => one.seconds >= STARTS_S).length;
-    const waits = late ? `${counted(late, "process waits", "processes wait")} for a node.` : "No process waits for a node.";
-    const silent = headResponds ? "" : "The head of the cluster does not answer; the nodes are those of its last answer. ";
+    const waits = late ? `${counted(late, "process is waiting", "processes are waiting")} for a node.` : "No process is waiting for a node.";
+    const silent = headResponds ? "" : "The head of the cluster does not respond; the nodes are from its last response. ";
     this.say(`${silent}${counted(alive, "node")} alive${lost}. ${waits}`);
     const order = (one) => `${one.alive ? 1 : 0}${one.host}`;
     this.fill($("cluster-nodes"), [...nodes].sort((a, b) => order(a).localeCompare(order(b))), (one) => this.card(one));
@@ -67,7 +67,7 @@ export class ClusterView {
     this.fill($("cluster-waits"), waiting, (one) => this.waits(one));
   }
 
-  /** Fills a list anew where it changed; a button of it that has the focus keeps it. */
+  /** Rebuilds a list if it has changed; a focused button in it keeps the focus. */
   fill(list, content, item) {
     const said = JSON.stringify(content.map((one) => [one, this.called(one.scene ?? ""), ...(one.scenes ?? []).map(this.called)]));
     if (list.dataset.said === said) return;
@@ -92,7 +92,7 @@ export class ClusterView {
   }
 
   waits({ scene, role, needs, seconds }) {
-    const how = seconds < STARTS_S ? "is about to start." : `has waited for ${since(seconds)}. It needs ${needs}.`;
+    const how = seconds < STARTS_S ? "is about to start." : `has been waiting for ${since(seconds)}. It needs ${needs}.`;
     return node("li", {}, this.button(scene), " ", node("span", {}, `The ${ROLES[role] ?? role} ${how}`));
   }
 
@@ -103,14 +103,14 @@ export class ClusterView {
     } }, this.called(scene));
   }
 
-  /** Said anew only where it changed: a screen reader reads it out. */
+  /** Sets the text only if it has changed, because a screen reader reads it out each time. */
   say(words) {
     const text = sentence(words);
     if ($("cluster-words").textContent !== text) $("cluster-words").textContent = text;
   }
 }
 
-/** A part of something: its name, a bar, and words. */
+/** Share of a resource, with its name, a bar and a text. */
 function share(name, taken, all, words) {
   const bar = node("span", { class: "meter", "aria-hidden": "true" }, node("span"));
   bar.firstChild.style.width = `${Math.min(100, (100 * taken) / all)}%`;

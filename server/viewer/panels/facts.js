@@ -1,10 +1,10 @@
-// The panels beside the view: facts, warnings, effects, the queue, the cameras' health.
+// Panels beside the view: facts, warnings, effects, queue, and the health of the cameras.
 
 import { node, sentence } from "../page.js";
 
 const number = new Intl.NumberFormat("en");
 
-/** The reason why a committed frame does not show its pictures, or only in part; empty if it does. */
+/** Reason why a committed state does not, or only partly, show the pictures of its frame; empty if it does. */
 export function reasonOf(report) {
   if (!report?.degraded) return "";
   return report.degraded[0].toUpperCase() + report.degraded.slice(1);
@@ -30,13 +30,13 @@ export function showFacts(list, status) {
 const WARNINGS_SHOWN = 3;
 
 /**
- * Lists the warnings of the scene: they are the same in each frame, or for as long as cameras are out of step; the button says
- * how many there are.
- * They are in another place than the alarms of a frame, and not in their colour: nothing of a frame is wrong by them.
+ * Lists the warnings of the scene, and shows their number on the button. They persist over all frames, or for as long as
+ * cameras are out of step.
+ * Alarms of a frame have another place and colour, because a warning does not mean that a frame is faulty.
  */
 export function showWarnings(box, button, warnings) {
   const said = JSON.stringify(warnings);
-  if (box.dataset.said === said) return; // status comes several times a second: nothing is read out again, and what is open stays so
+  if (box.dataset.said === said) return; // the status arrives several times a second; nothing must be read out again, and the list must stay open
   box.dataset.said = said;
   box.hidden = button.hidden = !warnings.length;
   button.textContent = `${number.format(warnings.length)} to check`;
@@ -52,7 +52,7 @@ export function showWarnings(box, button, warnings) {
 
 const called = (name) => name[0].toUpperCase() + name.slice(1).replaceAll("_", " ");
 
-/** Lists the effects that evidence or the settings have switched; the words name all others, on or off. */
+/** Lists the effects that evidence or settings have switched; the text names all others, on or off. */
 export function showEffects(list, words, effects) {
   const all = Object.entries(effects);
   const first = Math.min(...all.map(([, one]) => one.since));
@@ -69,27 +69,27 @@ export function showEffects(list, words, effects) {
   ].join(" ");
 }
 
-/** Draws one box for each place in the queue; the words say the same. */
+/** Draws a box for each place in the queue, and describes the queue in words. */
 export function showQueue(box, words, status) {
   const places = Math.min(status.queue_limit, 24);
   const taken = Math.ceil(places * status.queued / status.queue_limit);
   box.replaceChildren(...Array.from({ length: places }, (_, i) => node("span", { class: i < taken ? "taken" : "free" })));
   const full = status.queued >= status.queue_limit;
   words.textContent = status.queued
-    ? `${status.queued} of ${status.queue_limit} waiting or at work${full ? ": full, senders are asked to wait" : ""}`
+    ? `${status.queued} of ${status.queue_limit} waiting or in progress${full ? "; the queue is full, so senders must wait" : ""}`
     : `Empty; frame ${status.next_frame} is next`;
   box.classList.toggle("full", full);
 }
 
-/** When a camera takes its pictures, where it is clearly out of step: a lasting fault, which the scene's warnings name. */
-const outOfStep = (one) => (one?.out_of_step ? `, whose pictures are taken ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others'` : "");
+/** Time offset of a camera if it is clearly out of step, which is a lasting fault that the scene's warnings also report. */
+const outOfStep = (one) => (one?.out_of_step ? `, which takes its pictures ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others` : "");
 
-/** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
+/** Evidence of the alarms about a camera, which the worker raised when it reconstructed the frame. */
 export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
 
 const IN_THE_REASON = ["frame_rejected", "frame_in_part"];
 
-/** Alarms in sentences, but for those that the reason of the frame states already. */
+/** Alarms as sentences, except for those that the reason of the frame already states. */
 function sentences(report) {
   return (report?.alarms ?? []).filter((one) => !IN_THE_REASON.includes(one.kind)).map((one) => {
     const words = one.camera === null ? called(one.evidence) : `Camera ${one.camera}: ${one.evidence}`;
@@ -97,10 +97,10 @@ function sentences(report) {
   });
 }
 
-/** Fills a row for each camera: PSNR of its picture, shift of its colours, and faults. */
+/** Fills a row for each camera: PSNR of its picture, colour shift, and faults. */
 export function showCameras(body, summary, names, report, lookFrom) {
   const said = JSON.stringify([names, report?.index, report?.cameras, report?.alarms]);
-  if (body.dataset.said === said) return; // a row that has the focus keeps it
+  if (body.dataset.said === said) return; // a focused row must keep the focus
   body.dataset.said = said;
   const fits = report?.cameras ?? {};
   const known = Object.values(fits).map((fit) => fit.psnr).filter((value) => value !== null);
@@ -113,7 +113,7 @@ export function showCameras(body, summary, names, report, lookFrom) {
     meter.firstChild.style.width = `${100 * share}%`;
     const shift = fit?.colour_shift;
     const swatch = node("span", { class: "swatch", title: shift ? `red, green, blue: ${shift.map((v) => `${(100 * v).toFixed(1)} %`).join(", ")}` : "not measured" });
-    // Around middle grey and ten times stronger: a shift of one hundredth can be seen.
+    // Shown around middle grey and ten times amplified, so that a shift of one hundredth is visible.
     if (shift) swatch.style.background = `rgb(${shift.map((v) => Math.round(128 + 1280 * v)).join(" ")})`;
     const words = found.length ? found.join("; ") : "";
     return node("tr", { class: found.length ? "bad" : null },
@@ -124,12 +124,12 @@ export function showCameras(body, summary, names, report, lookFrom) {
       node("td", { class: "figure" }, shift ? `${(100 * Math.max(...shift.map(Math.abs))).toFixed(1)} %` : "–"),
       node("td", { class: "words", title: words },
         (found.length ? "⚠ " : "") + (name in (report?.dropped_cameras ?? {}) ? "left out" : fit?.health != null ? `${Math.round(100 * fit.health)} %`
-          : found.length ? "look" : fit ? "good" : "no figures")));
+          : found.length ? "check" : fit ? "good" : "no data")));
   });
   body.replaceChildren(...rows);
   const lines = sentences(report);
   summary.textContent = lines.length ? lines.slice(0, 3).join(" ") + (lines.length > 3 ? ` … and ${lines.length - 3} more.` : "")
-    : !report || !known.length ? "Figures come with the first update."
-    : `All ${names.length} cameras look as they did before.`;
+    : !report || !known.length ? "Available after the first update."
+    : `All ${names.length} cameras look as before.`;
   summary.classList.toggle("warning", lines.length > 0);
 }

@@ -1,4 +1,4 @@
-// Accuracy and time of the frames: two charts, and the figures below them.
+// Accuracy and time of the frames, as two charts with figures below them.
 
 import { Chart } from "./charts.js";
 import { reasonOf } from "./facts.js";
@@ -9,7 +9,7 @@ export class Figures {
   constructor(pick) {
     this.psnr = new Chart($("psnr"), "line", "dB", pick);
     this.seconds = new Chart($("seconds"), "bars", "s", pick);
-    this.updates = []; // reports of all frames but the first
+    this.updates = []; // reports of all frames except the first
   }
 
   choose(index) {
@@ -21,7 +21,7 @@ export class Figures {
     const reports = inOrder();
     const fault = (one) => (one.state === "committed" ? "" : one.error ?? one.state);
     this.psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), rejected: reasonOf(one) })));
-    // The first frame takes minutes and would flatten all others; it is written below the chart.
+    // The first frame takes minutes and would flatten all others, so its time is written below the chart.
     const first = reports.find((one) => one.state === "committed");
     this.updates = reports.filter((one) => one !== first);
     const budgets = this.updates.filter((one) => one.budget);
@@ -35,9 +35,9 @@ export class Figures {
   }
 }
 
-/** A change of budget since the frame before, in words. */
+/** Description of a budget change since the previous frame. */
 function change(before, now) {
   if (JSON.stringify(before) === JSON.stringify(now)) return "";
-  if (now.budget_ms !== null) return `from here on ${now.budget_ms} ms`;
-  return now.iterations !== null ? `from here on ${now.iterations} iterations` : "from here on another budget";
+  if (now.budget_ms !== null) return `${now.budget_ms} ms from here on`;
+  return now.iterations !== null ? `${now.iterations} iterations from here on` : "another budget from here on";
 }

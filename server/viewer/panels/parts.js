@@ -1,15 +1,15 @@
-// The list of parts: each shown or hidden, or one of them alone.
+// List of parts, each of which can be shown, hidden, or shown alone.
 
 import { node } from "../page.js";
 import { partColour } from "../splats/rig.js";
 
 export class PartList {
-  /** @param changed takes the labels of the parts that are hidden; −1 is what belongs to none */
+  /** @param changed called with the labels of the hidden parts; −1 stands for Gaussians that belong to no part */
   constructor(list, words, changed) {
     Object.assign(this, { list, words, changed, hidden: new Set(), labels: [] });
   }
 
-  /** Lists so many parts, and what belongs to none; of none, nothing. All are shown where there were others before. */
+  /** Lists `count` parts and the rest, or nothing if there are none; if the number has changed, all parts are shown. */
   show(count) {
     const labels = count ? [...Array(count).keys(), -1] : [];
     if (labels.length !== this.labels.length) this.hidden.clear();
@@ -33,7 +33,7 @@ export class PartList {
     this.describe();
   }
 
-  /** One part alone; all again where it is alone already. */
+  /** Shows one part alone, or all parts if it is already shown alone. */
   alone(label) {
     const alone = this.isAlone(label);
     this.hidden = new Set(alone ? [] : this.labels.filter((one) => one !== label));

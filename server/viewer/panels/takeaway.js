@@ -1,17 +1,17 @@
-// Files for other tools: asks the service for exports, shows how far they are, saves them.
+// Files for other tools: requests exports from the service, shows their progress, and saves them.
 
 import { $, node, page, sentence } from "../page.js";
 import { call, fetched, scenePath, token } from "../service.js";
 
 const LOOK_MS = 700;
-const SELDOM_MS = 30_000; // at most so long after an error; doubled by each
+const SELDOM_MS = 30_000; // maximum delay after errors, each of which doubles it
 const UNDER_WAY = ["waiting", "running"];
 const NAMES = {
   ply: "3DGS .ply", splat: ".splat", spz: "SPZ", spz4: "SPZ 4", glb: "glTF", "glb-parts": "glTF, moving parts",
   usd: "USD", tracks: "Tracks", poses: "Poses of parts", s4d: "Compact 4D file",
 };
 
-/** Bytes for a person: 3.1 MB. */
+/** Formats a number of bytes, such as 3.1 MB. */
 function size(bytes) {
   const step = bytes < 1e6 ? ["kB", 1e3] : bytes < 1e9 ? ["MB", 1e6] : ["GB", 1e9];
   const value = bytes / step[1];
@@ -46,7 +46,7 @@ export class TakeAway {
     $("take").hidden = true;
   }
 
-  /** What can be asked for now; the status comes with every change. */
+  /** Updates which exports can be requested; called whenever the status changes. */
   show() {
     const committed = page.status?.committed > 0;
     $("take").hidden = token.reads() && !this.known.size;
@@ -83,7 +83,7 @@ export class TakeAway {
     this.look();
   }
 
-  /** Asks how far the exports are, again and again while one is under way. */
+  /** Requests the progress of the exports, periodically while one is unfinished. */
   async look() {
     clearTimeout(this.timer);
     const { scene } = this;
@@ -91,8 +91,8 @@ export class TakeAway {
     let refused = false;
     try {
       found = (await call("GET", `${scenePath(scene)}/exports`)).exports;
-    } catch (error) { // the page says elsewhere that the service does not answer
-      refused = error.status >= 400 && error.status < 500 && error.status !== 429; // the next time, too
+    } catch (error) { // the page reports elsewhere that the service does not respond
+      refused = error.status >= 400 && error.status < 500 && error.status !== 429; // would be refused again
     }
     if (this.scene !== scene || scene === null) return;
     if (found) this.took(found);
@@ -112,7 +112,7 @@ export class TakeAway {
     this.known = new Map(found.map((one) => [one.id, one]));
     const list = $("take-list");
     const here = new Map([...list.children].map((row) => [row.dataset.id, row]));
-    for (const one of found) { // rows stay, so that what has the focus keeps it
+    for (const one of found) { // rows are kept, so that a focused button keeps the focus
       const said = JSON.stringify(one);
       const row = here.get(one.id) ?? list.appendChild(node("li", { "data-id": one.id }));
       here.delete(one.id);
@@ -131,7 +131,7 @@ export class TakeAway {
   }
 
   words(one) {
-    if (one.state === "waiting") return "waits for its turn";
+    if (one.state === "waiting") return "waiting for its turn";
     if (one.state === "running") return `${one.done} of ${frames(one.frames)} · ${size(one.bytes)}`;
     if (one.state === "done") return `${frames(one.frames)} · ${size(one.bytes)} · until ${new Date(one.expires).toLocaleString([], { weekday: "short", hour: "2-digit", minute: "2-digit" })}`;
     return one.state === "failed" ? sentence(one.error) : "cancelled";
@@ -150,7 +150,7 @@ export class TakeAway {
     return parts;
   }
 
-  /** A plain link where no token is needed: a browser sends none with a link. */
+  /** A plain link if no token is needed, since browsers do not send a token with a link; otherwise a button. */
   link(one, what) {
     const named = { "aria-label": `Save ${what}, ${size(one.bytes)}`, class: "save" };
     if (!token.get()) return node("a", { ...named, href: one.file, download: one.name }, "Save");
@@ -170,8 +170,8 @@ export class TakeAway {
         setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
       }
     } catch (error) {
-      await place?.abort().catch(() => {}); // leaves no half of a file
-      if (error.name !== "AbortError") this.say(error.message); // else nobody wants it
+      await place?.abort().catch(() => {}); // leaves no incomplete file
+      if (error.name !== "AbortError") this.say(error.message); // otherwise, the user has cancelled
     }
     button.disabled = false;
   }
@@ -179,7 +179,7 @@ export class TakeAway {
   async remove(one) {
     try {
       await call("DELETE", `${scenePath(this.scene)}/exports/${one.id}`);
-      $("take-format").focus(); // the button that had the focus goes
+      $("take-format").focus(); // the focused button is removed
     } catch (error) {
       this.say(error.message);
     }

@@ -1,16 +1,16 @@
-// Time: which frame is shown, the slider with its marks, and playing at the recorded rate.
+// Timeline: the chosen frame, the slider with its marks, and playback at the recorded rate.
 
 import { isRejected } from "./facts.js";
 import { $, node, page, readable } from "../page.js";
 
-const SHORTEST_MS = 20; // no screen shows more pictures
-const END_MS = 400; // the last frame stays before it begins again
+const SHORTEST_MS = 20; // displays show no more pictures than this
+const END_MS = 400; // how long the last frame is shown before playback restarts
 
 export class Timeline {
   /**
    * @param shown called when another frame is chosen
-   * @param stopped called when playing ends
-   * @param between { smooth(index, next), set(next, share) }: whether moments between frames can be shown, and shows one
+   * @param stopped called when playback ends
+   * @param between { smooth(index, next), set(next, share) }: returns whether moments between frames can be shown, and shows one
    */
   constructor(shown, stopped, between) {
     Object.assign(this, { shown, stopped, between, playing: null, speed: 1 });
@@ -49,7 +49,7 @@ export class Timeline {
     if (page.frame !== null) this.choose(null);
   }
 
-  /** Plays from the frame shown on, by the times of the frames: where pictures take longer, frames are left out. */
+  /** Plays from the current frame according to the frames' times; frames are skipped if pictures take longer. */
   play() {
     if (this.playing) return this.stop();
     const frames = readable();
@@ -87,7 +87,7 @@ export class Timeline {
     $("play").setAttribute("aria-label", "Play");
   }
 
-  /** Draws the slider, its marks, and the words beside it; returns the report of the frame that is shown. */
+  /** Draws the slider, its marks and the text beside it, and returns the report of the current frame. */
   draw() {
     const reports = readable();
     const slider = $("time");
@@ -107,10 +107,10 @@ export class Timeline {
     return report;
   }
 
-  /** Marks frames on the slider whose state is not what their pictures show. */
+  /** Marks the frames on the slider whose state does not show their pictures. */
   mark(reports) {
     const said = JSON.stringify([reports.length, reports.filter((report) => report.degraded).map((report) => [report.index, report.degraded])]);
-    if ($("marks").dataset.said === said) return; // a mark that is being pressed stays
+    if ($("marks").dataset.said === said) return; // a mark that is being pressed must stay
     $("marks").dataset.said = said;
     const last = Math.max(reports.length - 1, 1);
     $("marks").replaceChildren(...reports.flatMap((report, at) => {

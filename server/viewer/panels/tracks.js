@@ -1,4 +1,4 @@
-// Tracks: points that were clicked, and their list.
+// Tracks of clicked points, with their list.
 
 import { TRACKS } from "../view/colours.js";
 import { $, node, note, page } from "../page.js";
@@ -6,7 +6,7 @@ import { $, node, note, page } from "../page.js";
 const MOST_TRACKS = 12;
 const PICK_PX = 320;
 
-/** The same view in a smaller picture: visibility is computed from depth pictures of this size. */
+/** Camera of the same view with a smaller picture, since visibility is computed from depth maps of this size. */
 function smaller(camera) {
   const ratio = Math.min(1, PICK_PX / Math.max(camera.width, camera.height));
   const [width, height] = [Math.round(camera.width * ratio), Math.round(camera.height * ratio)];
@@ -17,28 +17,28 @@ function smaller(camera) {
 }
 
 export class Tracks {
-  /** @param view draws them */
+  /** @param view live view that draws the tracks */
   constructor(view) {
     this.view = view;
     this.picks = 0;
     $("clear").addEventListener("click", () => [...page.tracks].forEach((track) => this.forget(track)));
   }
 
-  /** Follows the point at a pixel of a picture. */
+  /** Tracks the point at a pixel of a picture. */
   pick(u, v, camera, frame) {
     if (!page.stream) return;
     if (page.tracks.length >= MOST_TRACKS) this.forget(page.tracks[0]);
     const id = `track-${++this.picks}`;
     const used = new Set(page.tracks.map((track) => track.colour));
     const colour = TRACKS.find((one) => !used.has(one)) ?? TRACKS[this.picks % TRACKS.length];
-    const where = `frame ${frame}, ${Math.round(100 * u / camera.width)} % right, ${Math.round(100 * v / camera.height)} % down`;
+    const where = `frame ${frame}, ${Math.round(100 * u / camera.width)} % from the left, ${Math.round(100 * v / camera.height)} % from the top`;
     page.tracks.push({ id, colour, where, name: this.picks, positions: new Map(), confidence: new Map() });
     const small = smaller(camera);
     page.stream.subscribe(id, "tracks", { pixels: [[u * small.sx, v * small.sy]], camera: small.camera, at: frame }, this.picks);
     this.show();
   }
 
-  /** Adds what came of a track. */
+  /** Adds received positions to a track. */
   grow(head, model) {
     const track = page.tracks.find((one) => one.id === head.id);
     if (!track) return;

@@ -1,32 +1,32 @@
-// The trade-off panel: error over milliseconds per frame, and the budget.
+// Trade-off panel: error over milliseconds per frame, and the budget.
 
 import { element, step } from "./charts.js";
 import { call, scenePath } from "../service.js";
 
-// Points with a time but no error have a strip of their own below the plot, so that the two are not confused.
+// Points with a time but no error are in a separate strip below the plot, so that the two are not confused.
 const [LEFT, RIGHT, TOP, STRIP, BOTTOM] = [56, 20, 36, 34, 18];
 const EFFECT_FRAMES = 16;
-// Under a budget in time every frame has iterations of its own: measured points of about the same time and not too
-// different iterations are one.
+// Under a time budget, every frame has a different number of iterations. Measured points with about the same time and
+// similar iterations are therefore merged.
 const [ALIKE_TIME, ALIKE_ITERATIONS] = [1.06, 1.5];
 const EVERY_MS = 3000;
 const REPLAY_EVERY_MS = 700;
 const REPLAYED = [25, 50, 200];
 const STEPS = 1000;
-// From and to of the slider, which is logarithmic.
+// Ends of the logarithmic slider.
 const RANGES = { iterations: [5, 1000], budget_ms: [20, 20000] };
 const UNITS = { iterations: "iterations", budget_ms: "ms" };
-const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated: only its time" };
+const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated, time only" };
 
-/** Writes milliseconds in the usual unit. */
+/** Formats a time in milliseconds as ms or s. */
 const spoken = (time) => (time < 1000 ? `${short(time)} ms` : `${short(time / 1000)} s`);
 
 const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1];
 
-/** Rounds to three significant digits: enough to choose by. */
+/** Rounds to three significant digits, or two below 100, which is enough for a choice. */
 const short = (value) => Number(value.toPrecision(value < 100 ? 2 : 3));
 
-/** The points, with the measured ones that took about as long as one: means by frames. */
+/** Merges the measured points that took about the same time into their mean, weighted by frames. */
 function grouped(points) {
   const groups = [];
   for (const point of points.filter((one) => one.kind === "measured").sort((a, b) => a.milliseconds - b.milliseconds)) {
@@ -53,7 +53,7 @@ function grouped(points) {
 }
 
 export class Tradeoff {
-  /** @param $ finds an element by its id */
+  /** @param $ returns the element with an id */
   constructor($) {
     Object.assign(this, { $, opened: 0, scene: null, model: null, asked: null, effective: null, timer: null, due: 0, moving: false, putting: false, updates: [] });
     $("budget-kind").addEventListener("change", () => this.place(true));
@@ -63,7 +63,7 @@ export class Tradeoff {
       this.draw();
     });
     $("budget").addEventListener("change", () => this.put());
-    // Released where it was: that is no change, and no event comes.
+    // If the slider is released where it was, there is no change event.
     $("budget").addEventListener("pointerup", () => setTimeout(() => this.putting || this.rest(), 50));
     $("measure").addEventListener("click", () => this.measure());
     new ResizeObserver(() => this.draw()).observe($("tradeoff"));
@@ -77,20 +77,20 @@ export class Tradeoff {
 
   close() {
     clearTimeout(this.timer);
-    this.opened++; // what was asked before is not shown: a scene that begins anew has the same id
+    this.opened++; // discards answers to earlier requests, since a restarted scene has the same id
     Object.assign(this, { scene: null, model: null, asked: null, effective: null, timer: null, moving: false, updates: [] });
     this.say("");
     this.draw();
     this.place();
   }
 
-  /** Reads again soon after a frame or another change, but not for every frame of a fast rig. */
+  /** Reloads the data soon after a frame or another change, but not for every frame of a fast rig. */
   refresh(soonest = 0) {
     if (!this.scene || this.timer) return;
     this.timer = setTimeout(() => this.load(), Math.max(soonest, this.due - performance.now(), 0));
   }
 
-  /** @param updates reports of the frames after the first, by index */
+  /** @param updates reports of all frames except the first, in order */
   follow(updates) {
     this.updates = updates.filter((one) => one.seconds?.total !== undefined);
     this.describe();
@@ -106,7 +106,7 @@ export class Tradeoff {
       this.timer = null;
       this.show(model, budget);
     } catch {
-      if (this.opened === opened) this.timer = null; // the page says elsewhere that the service does not answer
+      if (this.opened === opened) this.timer = null; // the page reports elsewhere that the service does not respond
     }
   }
 
@@ -126,7 +126,7 @@ export class Tradeoff {
     } else if (replay.state === "failed") this.say(`The replay is incomplete: ${replay.error}.`, true);
     else if (replay.state === "done") {
       const which = replay.frames.length > 1 ? `frames ${replay.frames[0]} to ${replay.frames.at(-1)}` : `frame ${replay.frames[0]}`;
-      this.say(`Replayed ${which} on ${replay.threads === 1 ? "one thread" : `${replay.threads} threads`}: compare replayed times with each other.`);
+      this.say(`Replayed ${which} on ${replay.threads === 1 ? "one thread" : `${replay.threads} threads`}; replayed times are comparable only with each other.`);
     } else this.say("");
   }
 
@@ -142,7 +142,7 @@ export class Tradeoff {
     return this.kind === "iterations" ? Math.round(short(value)) : short(value);
   }
 
-  /** Sets the control to the budget that holds; `chosen`: by the kind that was just chosen. */
+  /** Sets the control to the current budget, or to its value for the kind that was just chosen if `chosen` is true. */
   place(chosen = false) {
     const slider = this.$("budget");
     const [kind, effective] = [this.$("budget-kind"), this.effective];
@@ -166,47 +166,47 @@ export class Tradeoff {
     return model ? model.fixed + model.per_iteration * iterations : null;
   }
 
-  /** Writes the value of the control, and its cost or effect. */
+  /** Displays the value of the control and its cost or effect. */
   describe() {
     const words = this.$("budget-words");
     const effective = this.effective;
     this.$("budget-value").textContent = effective && this.kind ? `${this.value} ${UNITS[this.kind]}` : "";
     this.$("budget-effect").textContent = effective ? this.effect() : "";
     if (!effective) return words.textContent = "";
-    const own = effective.budget_ms === null ? `${effective.iterations} iterations a frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
+    const own = effective.budget_ms === null ? `${effective.iterations} iterations per frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
     const now = `Now: ${own}${this.requested.iterations === null && this.requested.budget_ms === null ? ", as the scene was created" : `, from frame ${this.since} on`}.`;
     const model = this.model?.model;
     let then = "";
     if (this.moving && model) {
-      then = this.kind === "iterations" ? ` Then: about ${spoken(this.milliseconds(this.value))} a frame.`
-        : ` Then: about ${Math.max(1, Math.round((this.value - model.fixed) / model.per_iteration))} iterations a frame.`;
+      then = this.kind === "iterations" ? ` Then: about ${spoken(this.milliseconds(this.value))} per frame.`
+        : ` Then: about ${Math.max(1, Math.round((this.value - model.fixed) / model.per_iteration))} iterations per frame.`;
     }
     else if (this.kind && this.kind !== this.effectiveKind) then = " Move the slider to change it.";
     words.textContent = now + then;
   }
 
-  /** The kind of budget that holds: time or iterations; empty if it is the scene's own. */
+  /** Kind of the current budget, time or iterations; empty if it is the one with which the scene was created. */
   get effectiveKind() {
     return this.effective.budget_ms !== null ? "budget_ms" : this.requested.iterations !== null ? "iterations" : "";
   }
 
-  /** The effect of the last change: the frames since, compared with those before. */
+  /** Effect of the last change: the frames since then compared with those before. */
   effect() {
     if (!this.updates.length || this.since === null || this.since === undefined) return "";
     const after = this.updates.filter((one) => one.index >= this.since).slice(-EFFECT_FRAMES);
     const before = this.updates.filter((one) => one.index < this.since).slice(-EFFECT_FRAMES);
     if (!before.length) return "";
-    if (!after.length) return `No frame since; the ${before.length === 1 ? "one" : before.length} before: ${this.brought(before)}.`;
+    if (!after.length) return `No frames since then; the ${before.length === 1 ? "one" : before.length} before: ${this.brought(before)}.`;
     return `Since then, ${after.length === 1 ? "one frame" : `${after.length} frames`}: ${this.brought(after)}; before: ${this.brought(before)}.`;
   }
 
   brought(updates) {
     const psnr = updates.map((one) => one.psnr).filter((value) => value !== null && value !== undefined);
     const time = spoken(1000 * median(updates.map((one) => one.seconds.total)));
-    return psnr.length ? `${time}, ${median(psnr).toFixed(1)} dB a frame` : `${time} a frame`;
+    return psnr.length ? `${time}, ${median(psnr).toFixed(1)} dB per frame` : `${time} per frame`;
   }
 
-  /** Sets the control back to the budget that holds. */
+  /** Resets the control to the current budget. */
   rest() {
     this.moving = false;
     this.place();
@@ -231,7 +231,7 @@ export class Tradeoff {
     }
   }
 
-  /** Begins a replay, or ends the one that is running. */
+  /** Starts a replay, or stops the running one. */
   async measure() {
     const { opened } = this;
     const running = this.model?.replay.state === "running";
@@ -257,10 +257,10 @@ export class Tradeoff {
     const { clientWidth, clientHeight } = svg;
     svg.replaceChildren();
     const points = grouped(this.model?.points.filter((point) => point.iterations > 0) ?? []);
-    // Settings without validation have no probe views: then the PSNR stands for the accuracy.
+    // Without validation there are no probe views, so PSNR is used as the accuracy.
     const by = points.some((point) => point.error !== null) ? "error" : "psnr";
     const known = points.filter((point) => point[by] !== null);
-    this.$("tradeoff-unit").textContent = by === "error" ? "error against time a frame" : "PSNR against time per frame";
+    this.$("tradeoff-unit").textContent = by === "error" ? "error against time per frame" : "PSNR against time per frame";
     this.$("tradeoff-key").hidden = !known.length;
     if (!clientWidth) return;
     svg.setAttribute("viewBox", `0 0 ${clientWidth} ${clientHeight}`);
@@ -311,7 +311,7 @@ export class Tradeoff {
     const place = (point) => [x(point.milliseconds), point[by] === null ? base - 3 : y(point[by])];
     const taken = points.map((point) => place(point)).map(([px, py]) => [px - 4, px + 4, py - 4, py + 4]);
     if (chosen) taken.push([x(chosen) - 1, x(chosen) + 1, TOP, base]);
-    /** Writes a label beside its point if it hides nothing; else the point has it as a title only. */
+    /** Places a label beside its point if it covers nothing; otherwise, the point has it only as a title. */
     const label = (px, places, words) => {
       const half = 3.4 * words.length + 1;
       for (const [side, at] of places) {
@@ -333,7 +333,7 @@ export class Tradeoff {
       };
       const made = element(shapes[point.kind][0], { ...shapes[point.kind][1], class: `point ${point.kind}` }, svg);
       element("title", {}, made).textContent = this.words(point);
-      // Below what was measured, above the others: the same number of iterations is often in both.
+      // Labels of measured points go below, the others above, since both often have the same number of iterations.
       const above = { measured: 8, replayed: 9, extrapolated: 12 }[point.kind];
       const [over, under, beside] = [[0, py - above], [0, py + 16], py + 4];
       const places = { measured: [under, over], replayed: [over, under], extrapolated: [over] }[point.kind];
@@ -350,7 +350,7 @@ export class Tradeoff {
   }
 
   words(point) {
-    const figures = [point.from < point.to ? `${point.from} to ${point.to} iterations` : `${point.iterations} iterations`, `${spoken(point.milliseconds)} a frame`];
+    const figures = [point.from < point.to ? `${point.from} to ${point.to} iterations` : `${point.iterations} iterations`, `${spoken(point.milliseconds)} per frame`];
     if (point.error !== null) figures.push(`error ${point.error.toFixed(4)}`);
     if (point.psnr !== null) figures.push(`${point.psnr.toFixed(1)} dB`);
     const from = point.frames ? `, ${point.frames} ${point.frames === 1 ? "frame" : "frames"}` : "";

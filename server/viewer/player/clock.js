@@ -1,9 +1,9 @@
-// Time of a sequence: plays at any speed, in circles, and says which place among the frames a time is.
+// Clock of a sequence, which plays in a loop at any speed and converts times to places among the frames.
 
-const END_S = 0.4; // the last frame stays before it begins again
+const END_S = 0.4; // how long the last frame is shown before the loop restarts
 
 export class Clock {
-  /** @param times of the frames, seconds, rising */
+  /** @param times times of the frames in seconds, ascending */
   constructor(times) {
     this.times = times;
     this.speed = 1;
@@ -15,13 +15,13 @@ export class Clock {
     return this.times.length - 1;
   }
 
-  /** Goes to a time, seconds. */
+  /** Sets the time in seconds. */
   set(time) {
     this.time = Math.max(this.times[0], Math.min(this.times[this.last], time));
     this.rest = 0;
   }
 
-  /** Place among the frames: 1.25 is a quarter of the way from the second to the third. */
+  /** Fractional place among the frames: 1.25 is a quarter of the way from the second frame to the third. */
   get place() {
     const { times, time } = this;
     let [low, high] = [0, this.last];
@@ -31,17 +31,17 @@ export class Clock {
       else high = middle;
     }
     const gap = times[high] - times[low];
-    return gap > 0 ? low + Math.min(1, (time - times[low]) / gap) : high; // none where both have the same time
+    return gap > 0 ? low + Math.min(1, (time - times[low]) / gap) : high; // frames with equal times
   }
 
-  /** Goes to the next frame or the one before, and stops. */
+  /** Goes to the next or previous frame and stops. */
   step(count) {
     this.playing = false;
     const at = count > 0 ? Math.floor(this.place + 1e-6) : Math.ceil(this.place - 1e-6);
     this.set(this.times[Math.max(0, Math.min(this.last, at + count))]);
   }
 
-  /** Lets seconds of the wall pass. */
+  /** Advances by seconds of wall-clock time. */
   pass(seconds) {
     if (!this.playing) return;
     const end = this.times[this.last];

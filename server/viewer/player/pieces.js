@@ -1,6 +1,6 @@
-// The compact files in the page: base64 in pieces, each decoded and then taken out, so that neither is in memory twice.
+// Compact files embedded in the page as pieces of base64, each of which is removed once decoded, so that none is in memory twice.
 
-/** Bytes of base64. */
+/** Decodes base64 into bytes. */
 function decoded(text) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
   const raw = atob(text);
@@ -10,7 +10,7 @@ function decoded(text) {
 }
 
 /**
- * Hands out the files, one after the other.
+ * Passes the files on, one after the other.
  *
  * @param take (bytes, number)  @param progress (share) 0…1
  */
@@ -29,7 +29,7 @@ export async function takeFiles(take, progress) {
       progress((done += part.length) / total);
       await new Promise((next) => setTimeout(next));
     }
-    if (at !== bytes.length) throw new Error("the file is cut: export it again, or copy it whole");
+    if (at !== bytes.length) throw new Error("the file is truncated: export it again, or copy it completely");
     box.remove();
     take(bytes, number);
   }

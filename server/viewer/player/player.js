@@ -1,4 +1,4 @@
-// The player of a file that `scas4d export --player` wrote: it has the compact files in it, and asks nothing of a network.
+// Player in a page written by `scas4d export --player`, which contains the compact files and makes no network requests.
 
 import { Clock } from "./clock.js";
 import { PartList } from "../panels/parts.js";
@@ -10,24 +10,24 @@ import { Orbit, project, readCamera } from "../view/geometry.js";
 import { listenToPointer, moveByKey } from "../view/gestures.js";
 import { drawTracks } from "../view/overlay.js";
 
-const SETTLE_MS = 220; // at rest for so long, the picture is drawn sharp
+const SETTLE_MS = 220; // time at rest after which the picture is drawn sharp
 const NOTE_MS = 6000;
-const TRAIL_S = 1; // seconds of the past
+const TRAIL_S = 1; // length of trails in seconds
 const FOLLOWED = "#e69f00";
 const LONE = { intrinsics: [[800, 0, 400], [0, 800, 300], [0, 0, 1]], width: 800, height: 600,
-  world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]] }; // for a file without cameras
+  world_to_camera: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]] }; // camera for a file without cameras
 
 const pace = new Pace();
 let [splats, clock, orbit, rig] = [null, null, null, null];
-let scene = null; // what the worker reported of the files
-let shown = null; // { camera, place } of the picture that is seen
+let scene = null; // what the worker reported about the files
+let shown = null; // { camera, place } of the current picture
 let followed = null; // { row, positions, at }
 let [dirty, movedAt, tick, pictures] = [true, -Infinity, 0, 0];
 
 // Opening.
 
 async function open() {
-  if (!Splats.possible()) return fail("This browser cannot draw it", "It has no WebGL2 in workers. Use a newer Firefox, Chrome, Edge or Safari 17.");
+  if (!Splats.possible()) return fail("This browser is not supported", "It has no WebGL2 in workers. Use a recent Firefox, Chrome or Edge, or Safari 17.");
   const source = new Blob([$("worker").textContent], { type: "text/javascript" });
   const worker = new Worker(URL.createObjectURL(source));
   splats = new Splats($("picture"), worker, { ready, frames, drawn, picked, track, failed, trails: () => draw(true) }, Infinity);
@@ -44,7 +44,7 @@ function ready({ floats }) {
   if (floats) return;
   const depth = $("modes").querySelector("[data-mode=depth]");
   depth.disabled = true;
-  depth.title = "This browser cannot blend depths";
+  depth.title = "This browser cannot draw depth";
 }
 
 function fail(title, words) {
@@ -71,7 +71,7 @@ function frames(message) {
   named.disabled = parts === 0;
   if (!parts) named.title = "This file has no parts";
   trails();
-  if (message.damage) say(`Only a part can be read: ${message.damage}`);
+  if (message.damage) say(`Only part of the file can be read: ${message.damage}`);
   draw();
 }
 
@@ -93,7 +93,7 @@ function frame(now) {
   clock.pass(Math.min(passed, 0.5));
   if ((dirty || clock.playing) && !splats.busy) {
     const moves = moving();
-    dirty = moves && pace.share < 1 && !clock.playing; // once more, sharp, when it rests
+    dirty = moves && pace.share < 1 && !clock.playing; // draws a sharp picture once at rest
     if (!dirty || performance.now() - movedAt < SETTLE_MS / 2 || !shown) request(moves);
   }
   measure("script", performance.now() - began);
@@ -164,7 +164,7 @@ function drawOverlay() {
 }
 
 function failed({ during, words }) {
-  if (during === "file" || during === "begin" || (during === "draw" && !shown)) return fail("It cannot be shown", words);
+  if (during === "file" || during === "begin" || (during === "draw" && !shown)) return fail("The scene cannot be shown", words);
   say(words);
 }
 

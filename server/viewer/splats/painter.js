@@ -1,17 +1,17 @@
-// Paints a picture with WebGL2: ellipses, back to front, depth in colours, trails over them.
+// Painting with WebGL2: ellipses from back to front, depth in colours, and trails on top.
 
 import { ROW, programs } from "./programs.js";
 import { STRIDE } from "./project.js";
 import { joined } from "./trails.js";
 import { DEPTH_RAMP } from "../view/colours.js";
 
-const FEWEST = 4096; // ellipses that there is room for at least
-const FRAMES_MORE = 32; // of trails, that there is room for at once: frames come one by one, live
+const FEWEST = 4096; // minimum capacity in ellipses
+const FRAMES_MORE = 32; // spare capacity for frames of trails, since live frames arrive one by one
 
 export class Painter {
   /**
-   * @param canvas of the page or of a worker
-   * @throws Error where the browser has no WebGL2
+   * @param canvas canvas of the page or of a worker
+   * @throws Error if the browser has no WebGL2
    */
   constructor(canvas) {
     this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
@@ -21,7 +21,7 @@ export class Painter {
     this.begin();
   }
 
-  /** Makes all objects; once more after the browser has taken them away. */
+  /** Creates all WebGL objects; called again after the context was lost. */
   begin() {
     const { gl } = this;
     this.floats = gl.getExtension("EXT_color_buffer_float") !== null && gl.getExtension("EXT_float_blend") !== null;
@@ -63,7 +63,7 @@ export class Painter {
     if (count <= this.room) return;
     const { gl } = this;
     const rows = Math.ceil(1.25 * Math.max(count, FEWEST) / ROW);
-    if (rows > this.most) throw new Error(`this browser draws at most ${ROW * this.most} Gaussians`);
+    if (rows > this.most) throw new Error(`this browser can draw at most ${ROW * this.most} Gaussians`);
     this.room = rows * ROW;
     gl.deleteTexture(this.table ?? null);
     this.table = this.texture(gl.RGBA32F, 3 * ROW, rows);
@@ -86,7 +86,7 @@ export class Painter {
     this.ellipses(ellipses, count);
   }
 
-  /** Paints depth: z stands for red in the ellipses; `range` of the colours, `nothing` where less than half is covered. */
+  /** Paints depth, which is in place of red in the ellipses; `range` of the colours, `nothing` where coverage is below half. */
   depth(ellipses, count, range, nothing) {
     const { gl } = this;
     if (!this.target) {
@@ -145,9 +145,9 @@ export class Painter {
   }
 
   /**
-   * Takes the centres of trails in the frames of a sequence, those that it does not have; a row of a texture has a frame.
+   * Uploads the centres of trails in the frames of a sequence that are not uploaded yet; each texture row is a frame.
    *
-   * @param ways { rows, hues, centres }  @param frames of the sequence, { index, reader }
+   * @param ways { rows, hues, centres }  @param frames frames of the sequence, { index, reader }
    */
   placeTrails(ways, frames) {
     const { gl } = this;
@@ -162,8 +162,8 @@ export class Painter {
       const row = known ? `${index} ${follows[place]}` : "";
       if ((placed[place] ?? "") === row) continue;
       placed[place] = row;
-      const texels = known ? known.slice() : new Float32Array(4 * count); // what is not gathered is not there
-      if (follows[place]) for (let i = 3; i < texels.length; i += 4) texels[i] *= 2; // joined with the one before
+      const texels = known ? known.slice() : new Float32Array(4 * count); // frames that are not gathered yet have no points
+      if (follows[place]) for (let i = 3; i < texels.length; i += 4) texels[i] *= 2; // 2: connected to the previous frame
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, place, count, 1, gl.RGBA, gl.FLOAT, texels);
     }
   }
@@ -180,7 +180,7 @@ export class Painter {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, count, 1, gl.RGBA, gl.UNSIGNED_BYTE, texels);
   }
 
-  /** Paints the trails of `span` frames up to a place in time, over what is painted. */
+  /** Paints the trails of the `span` frames before a place in the sequence, over the picture. */
   paintTrails(camera, now, span) {
     if (!this.trails || now <= 0 || Math.ceil(now) >= this.trails.room) return;
     const { gl } = this;
@@ -204,7 +204,7 @@ export class Painter {
     gl.disable(gl.BLEND);
   }
 
-  /** Waits until the picture is there: one pixel is read back. */
+  /** Waits until the picture is finished, by reading back one pixel. */
   finish() {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);

@@ -1,4 +1,4 @@
-// Planes and sections of a compact 4D file (docs/format.md): integers packed to some bits each, then zstandard.
+// Planes and sections of a compact 4D file (docs/format.md): bit-packed integers, compressed with Zstandard.
 
 import { decompress } from "../vendor/fzstd.js";
 import { FileError } from "./records.js";
@@ -6,7 +6,7 @@ import { FileError } from "./records.js";
 const WIDE = 16;
 const LARGEST_ARRAY = 1 << 24; // bytes
 
-/** Goes through the body of a record, section by section. */
+/** Reads the body of a record, section by section. */
 export class Sections {
   /** @param bytes Uint8Array */
   constructor(bytes, at = 0) {
@@ -16,7 +16,7 @@ export class Sections {
   }
 
   take(count) {
-    if (!(this.at + count <= this.bytes.length)) throw new FileError(`a record ends within a section, at byte ${this.at}`);
+    if (!(this.at + count <= this.bytes.length)) throw new FileError(`a record ends within the section at byte ${this.at}`);
     this.at += count;
     return this.at - count;
   }
@@ -37,7 +37,7 @@ export class Sections {
     if (this.at !== this.bytes.length) throw new FileError(`${this.bytes.length - this.at} bytes follow the last section`);
   }
 
-  /** The bytes in a frame of zstandard that takes `length` bytes; `size` are expected. */
+  /** Decompresses a Zstandard frame of `length` bytes and checks that the result has `size` bytes. */
   inflated(length, size) {
     const at = this.take(length);
     let found;
@@ -46,7 +46,7 @@ export class Sections {
     } catch (error) {
       throw new FileError(`zstandard: ${error.message}`);
     }
-    if (found.length !== size) throw new FileError(`${found.length} bytes where ${size} belong`);
+    if (found.length !== size) throw new FileError(`a section has ${found.length} bytes instead of ${size}`);
     return found;
   }
 
@@ -54,7 +54,7 @@ export class Sections {
     return this.inflated(this.word(), size);
   }
 
-  /** [count] integers with sign. */
+  /** [count] signed integers. */
   plane(count) {
     const values = this.unsigned(count, 4);
     for (let i = 0; i < count; i++) values[i] = (values[i] >>> 1) ^ -(values[i] & 1);
@@ -65,7 +65,7 @@ export class Sections {
     const [mode, escapes, size] = [this.byte(), this.word(), this.word()];
     const values = new Int32Array(count);
     if (mode === 0) return values;
-    if (![2, 4, 8, WIDE].includes(mode) || escapes > count || !wider) throw new FileError(`a plane of ${mode} bits cannot be`);
+    if (![2, 4, 8, WIDE].includes(mode) || escapes > count || !wider) throw new FileError(`a plane of ${mode} bits is invalid`);
     if (mode === WIDE) {
       const low = this.inflated(size, count);
       const high = this.unsigned(count, wider - 1);
@@ -84,11 +84,11 @@ export class Sections {
     for (let i = 0; i < count; i++) {
       if (values[i] === most) values[i] = next < escapes ? words.getInt32(4 * next, true) : 0, next++;
     }
-    if (next !== escapes) throw new FileError(`a plane has ${next} escapes, its head says ${escapes}`);
+    if (next !== escapes) throw new FileError(`a plane has ${next} escapes instead of ${escapes}`);
     return values;
   }
 
-  /** Residuals: [components] planes of [rows] integers; null where all are zero. */
+  /** Residuals as [components] planes of [rows] integers; null if all are zero. */
   residuals(components, rows) {
     const kind = this.byte();
     if (kind === 0) return null;
@@ -102,7 +102,7 @@ export class Sections {
     });
   }
 
-  /** Rows whose bit is set in a mask. */
+  /** Indices of the rows whose bit is set in a mask. */
   marked(rows) {
     const bits = this.sized((rows + 7) >> 3);
     const chosen = [];
@@ -110,7 +110,7 @@ export class Sections {
     return chosen;
   }
 
-  /** [rows] Uint8Array of 0 and 1; null where it is unchanged. */
+  /** [rows] Uint8Array of 0 and 1; null if the mask is unchanged. */
   mask(rows) {
     if (this.byte() === 0) return null;
     const mask = new Uint8Array(rows);
@@ -118,26 +118,26 @@ export class Sections {
     return mask;
   }
 
-  /** { rows, values [width × rows] } that are coded exactly; null where none are. */
+  /** { rows, values [width × rows] } of the exactly coded rows; null if there are none. */
   exact(most, width) {
     if (this.byte() === 0) return null;
     const count = this.word();
-    if (!count || count > most) throw new FileError(`${count} of ${most} rows cannot be coded exactly`);
+    if (!count || count > most) throw new FileError(`${count} exact rows of ${most} are invalid`);
     const data = this.sized(4 * count * (1 + width));
     const numbers = new DataView(data.buffer, data.byteOffset);
     const rows = Uint32Array.from({ length: count }, (_, i) => numbers.getUint32(4 * i, true));
-    if (rows.some((row) => row >= most)) throw new FileError("a row that does not exist is coded");
+    if (rows.some((row) => row >= most)) throw new FileError("an exact row is out of range");
     const values = Float32Array.from({ length: count * width }, (_, i) => numbers.getFloat32(4 * (count + i), true));
     return { rows, values };
   }
 
-  /** Passes over an array of floats. */
+  /** Skips an array of floats. */
   skipArray() {
     if (this.byte() === 0) return;
     const dimensions = this.byte();
     let size = 4;
     for (let i = 0; i < dimensions; i++) size *= this.word();
-    if (size > LARGEST_ARRAY) throw new FileError(`an array of ${size} bytes is none of a state`);
+    if (size > LARGEST_ARRAY) throw new FileError(`an array of ${size} bytes is too large`);
     this.take(this.word());
   }
 }

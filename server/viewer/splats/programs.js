@@ -1,11 +1,11 @@
-// Programs of WebGL2, each as its two shaders.
+// WebGL2 programs, each with its two shaders.
 
 import { FLOOR } from "./project.js";
 
-export const ROW = 512; // ellipses in a row of their texture, three texels each
+export const ROW = 512; // ellipses per row of their texture, three texels each
 const FLOOR_TEXT = FLOOR.toFixed(8);
 
-// Without instances: software WebGL takes as long for an instance as for a draw.
+// No instancing, because software WebGL takes as long for an instance as for a draw call.
 const ELLIPSE = `#version 300 es
 precision highp float;
 precision highp sampler2D;
@@ -51,8 +51,8 @@ void main() {
   painted = vec4(found.a < 0.5 ? nothing : texelFetch(ramp, ivec2(int(level * 255.0), 0), 0).rgb, 1.0);
 }`;
 
-// A segment of a trail is two vertices; a texture has the centres, a trail a column, a frame a row, and whether
-// one is there: 1, or 2 where the frame before is the one in the row before.
+// A trail segment has two vertices. The texture has the centres, with one column per trail and one row per frame. Its
+// alpha is 1 if the point exists, or 2 if it also continues the previous row.
 const TRAIL = `#version 300 es
 precision highp float;
 precision highp sampler2D;
@@ -87,7 +87,7 @@ in vec4 shade;
 out vec4 painted;
 void main() { painted = shade; }`;
 
-/** Compiles all programs: { gaussians, depth, trails }, each { use(), uniforms by name }. */
+/** Compiles all programs: { gaussians, depth, trails }, each { program, places }, with uniform locations keyed by name. */
 export function programs(gl) {
   return { gaussians: made(gl, ELLIPSE, GAUSSIAN), depth: made(gl, SCREEN, DEPTH), trails: made(gl, TRAIL, LINE) };
 }

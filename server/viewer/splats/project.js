@@ -1,18 +1,18 @@
-// Gaussians as ellipses of a picture, farthest first: EWA splatting with the conventions of scas4d_core/rasterize.
+// Projection of Gaussians to ellipses, farthest first: EWA splatting with the conventions of scas4d_core/rasterize.
 
-export const STRIDE = 12; // floats of an ellipse: centre, half axis (pixels); short by long axis, log2 of the opacity; colour; spare ones
-export const FLOOR = Math.log2(255); // a Gaussian ends where its alpha is 1/255
-const LOW_PASS = 0.3; // pixels²: nothing is thinner than about a pixel
-const MARGIN = 0.3; // of half the picture's size, beyond which the projection's slope is clamped
+export const STRIDE = 12; // floats per ellipse: centre, half axis (pixels); short/long axis ratio, log2 opacity; colour; padding
+export const FLOOR = Math.log2(255); // a Gaussian is cut off where its alpha is 1/255
+const LOW_PASS = 0.3; // pixels², so that nothing is thinner than about a pixel
+const MARGIN = 0.3; // margin as a share of half the picture's size, beyond which the slope of the projection is clamped
 const REACH = 2 * Math.LN2;
 const DIGIT = 11;
 const BUCKETS = 1 << DIGIT;
 
-/** Holds buffers that grow with the scene: one for each canvas. */
+/** Projector with buffers that grow with the scene; each canvas has its own. */
 export class Projector {
   constructor() {
     this.capacity = 0;
-    this.count = 0; // of the last picture
+    this.count = 0; // ellipses in the last picture
     this.histogram = new Uint32Array(3 * BUCKETS);
   }
 
@@ -22,17 +22,17 @@ export class Projector {
     this.found = new Float32Array(STRIDE * this.capacity);
     this.ellipses = new Float32Array(STRIDE * this.capacity); // sorted
     this.depths = new Float32Array(this.capacity);
-    this.rows = new Uint32Array(this.capacity); // of the Gaussians, as found
+    this.rows = new Uint32Array(this.capacity); // rows of the Gaussians, unsorted
     this.order = new Uint32Array(this.capacity);
     this.spare = new Uint32Array(this.capacity);
   }
 
   /**
-   * Projects a moment of a scene; `ellipses` has `count` of them then, farthest first.
+   * Projects a moment of a scene into the first `count` entries of `ellipses`, farthest first.
    *
-   * @param moment { from, to, share }: states of frames before and after it, `to` null at a frame, share 0…1 of the way
-   * @param camera of the inside world: rows, t, fx, fy, cx, cy, width, height, near in metres
-   * @param look { colours [3 N] of each Gaussian, or null for its own; depth: whether z stands for red; hidden [N] or null }
+   * @param moment { from, to, share }: states of the frames before and after it (`to` is null at a frame), and share 0…1 of the way
+   * @param camera camera in the internal world: rows, t, fx, fy, cx, cy, width, height, near in metres
+   * @param look { colours [3 N] of the Gaussians, or null for their own; depth: whether z is in place of red; hidden [N] or null }
    */
   project({ from, to, share }, camera, look) {
     const last = to ?? from;
@@ -54,7 +54,7 @@ export class Projector {
     for (let i = 0; i < count; i++) {
       if (hidden !== null && hidden[i]) continue;
       let opacity = opacities[i];
-      // What is born or leaves between two frames fades.
+      // Gaussians that are born or retired between two frames fade in or out.
       const before = i < known && !from.retired[i];
       const after = !last.retired[i];
       if (!before && !after) continue;
@@ -102,7 +102,7 @@ export class Projector {
       const halfX = Math.sqrt(reach * sxx) + 0.5;
       const halfY = Math.sqrt(reach * syy) + 0.5;
       if (!(x + halfX > 0 && x - halfX < width && y + halfY > 0 && y - halfY < height)) continue;
-      // Half axes: eigenvectors times how far the Gaussian reaches along them.
+      // Half axes: eigenvectors times the extent of the Gaussian along them.
       const middle = (sxx + syy) / 2;
       const spread = Math.sqrt(((sxx - syy) / 2) ** 2 + sxy * sxy);
       const long = Math.sqrt(reach * (middle + spread));
@@ -138,7 +138,7 @@ export class Projector {
     this.sort();
   }
 
-  /** Orders by depth, ties by row: a radix sort of the floats' bits, which rise with them. */
+  /** Sorts by depth, then by row, with a radix sort of the bits of the floats, which have the same order. */
   sort() {
     const { count, histogram } = this;
     const keys = new Uint32Array(this.depths.buffer, 0, count);
@@ -173,7 +173,7 @@ export class Projector {
     }
   }
 
-  /** The Gaussian that weighs most at a place of the picture: { row, z }; null where less than half is covered. */
+  /** Gaussian with the largest weight at a point of the picture: { row, z }; null if coverage is below half. */
   at(u, v) {
     let [rest, best, most] = [1, -1, 0];
     for (let i = 0; i < this.count && rest > 1e-3; i++) {
@@ -184,7 +184,7 @@ export class Projector {
     return rest > 0.5 || best < 0 ? null : { row: this.rows[best], z: this.depths[best] };
   }
 
-  /** Depths, metres, between which all but a hundredth at either end lies. */
+  /** 1st and 99th percentile of the depths, in metres. */
   range() {
     const nth = (share) => this.depths[this.order[Math.min(this.count - 1, Math.floor(share * this.count))]];
     return this.count ? [nth(0.01), nth(0.99)] : [0, 1];

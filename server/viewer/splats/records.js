@@ -1,4 +1,4 @@
-// Records of a compact 4D file (docs/format.md): heads with checksums, bodies with checksums, and the file's own head.
+// Records of a compact 4D file (docs/format.md): heads and bodies with checksums, and the head of the file.
 
 const MAGIC = 0x52643473; // "s4dR", little-endian
 const HEAD_SIZE = 36;
@@ -9,9 +9,9 @@ export const KEY = 3;
 export const DELTA = 4;
 export const PARTS = 5;
 export const INDEX = 6;
-const NOTE = 7; // about a frame; passed over
+const NOTE = 7; // information about a frame; skipped
 
-/** A file that cannot be read, or not from some place on; the message is a sentence for a person. */
+/** Error for a file that cannot be read, or only up to some position; the message is human-readable. */
 export class FileError extends Error {}
 
 const TABLE = new Int32Array(256).map((_, i) => {
@@ -19,7 +19,7 @@ const TABLE = new Int32Array(256).map((_, i) => {
   return i;
 });
 
-/** CRC-32 of bytes, unsigned. */
+/** CRC-32 of bytes as an unsigned integer. */
 export function crc32(bytes) {
   let crc = -1;
   for (let i = 0; i < bytes.length; i++) crc = TABLE[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
@@ -27,10 +27,10 @@ export function crc32(bytes) {
 }
 
 /**
- * Lists the whole records of a file; a rest that is not whole is not there yet.
+ * Lists the complete records of a file; an incomplete record at the end is ignored.
  *
  * @param bytes Uint8Array
- * @returns { records, damage }: { kind, frame, time, offset, size, checksum } each, and what is damaged after them, or null
+ * @returns { records, damage }: records { kind, frame, time, offset, size, checksum }, and the damage after them, or null
  */
 export function list(bytes) {
   const records = [];
@@ -38,9 +38,9 @@ export function list(bytes) {
   for (let at = 0; at + HEAD_SIZE <= bytes.length;) {
     const kind = bytes[at + 4];
     if (view.getUint32(at, true) !== MAGIC || view.getUint32(at + 32, true) !== crc32(bytes.subarray(at, at + 32))) {
-      return { records, damage: `no record begins at byte ${at}; the file is damaged there` };
+      return { records, damage: `the file is damaged at byte ${at}, where a record should start` };
     }
-    if (kind < HEAD || kind > NOTE) return { records, damage: `a record of kind ${kind} is at byte ${at}; a later version of scas4d wrote it` };
+    if (kind < HEAD || kind > NOTE) return { records, damage: `the record at byte ${at} has the unknown kind ${kind}; it was written by a later version of scas4d` };
     const record = { kind, frame: Number(view.getBigInt64(at + 8, true)), time: view.getFloat64(at + 16, true),
       offset: at + HEAD_SIZE, size: view.getUint32(at + 24, true), checksum: view.getUint32(at + 28, true) };
     at = record.offset + record.size;
@@ -51,7 +51,7 @@ export function list(bytes) {
   return { records, damage: null };
 }
 
-/** The body of a record, once its checksum holds. */
+/** Body of a record, after verifying its checksum. */
 export function bodyOf(bytes, record) {
   const body = bytes.subarray(record.offset, record.offset + record.size);
   if (crc32(body) !== record.checksum) {
@@ -60,7 +60,7 @@ export function bodyOf(bytes, record) {
   return body;
 }
 
-/** What holds for a whole file: world, bounds, background, cameras; numbers are checked, as much depends on them. */
+/** Head of the file, with world, bounds, background and cameras; checks the numbers on which everything else depends. */
 export function readHead(bytes, record) {
   let head = null;
   if (record?.kind === HEAD) {
@@ -70,13 +70,13 @@ export function readHead(bytes, record) {
       head = null;
     }
   }
-  if (head?.format !== "scas4d") throw new FileError("this is no compact 4D file, or its head is damaged or cut");
+  if (head?.format !== "scas4d") throw new FileError("this is not a compact 4D file, or its head is damaged or truncated");
   if (head.version > VERSION) {
-    throw new FileError(`version ${head.version} of the format; this player reads up to ${VERSION}, take a later one`);
+    throw new FileError(`the file has format version ${head.version}, but this player reads only up to ${VERSION}; use a later one`);
   }
   const numbers = [...head.world.origin, head.world.metres_per_unit, ...head.background];
   if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !(head.world.metres_per_unit > 0)) {
-    throw new FileError("the head of the file lacks something or is wrong");
+    throw new FileError("the head of the file is incomplete or invalid");
   }
   return head;
 }

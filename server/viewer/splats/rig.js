@@ -1,11 +1,11 @@
-// Cameras of the user's world in that of the states, and colours of parts.
+// Conversion of cameras from the user's world to the world of the states, and the colours of parts.
 
-const NEAR_SHARE = 0.1; // of the rig's radius; what is nearer to a camera is not drawn (scas4d_core/rasterize/limits.py)
-const WIDER = 1.1; // a rig's radius by its farthest camera (scas4d_core/cameras.py)
-const LONE_RADIUS = 3; // metres, of cameras at one place
-const NEAREST = 0.01; // metres, without a rig
+const NEAR_SHARE = 0.1; // near plane, as a share of the rig's radius (scas4d_core/rasterize/limits.py)
+const WIDER = 1.1; // rig radius relative to the distance of the farthest camera (scas4d_core/cameras.py)
+const LONE_RADIUS = 3; // rig radius in metres if all cameras are at one place
+const NEAREST = 0.01; // near plane in metres if there is no rig
 
-/** Metres before a camera that are not drawn, by the head of a file. */
+/** Distance of the near plane in metres, derived from the head of a file. */
 export function nearOf(head) {
   const centres = (head.cameras ?? []).map(({ world_to_camera: m }) =>
     [0, 1, 2].map((k) => -(m[0][k] * m[0][3] + m[1][k] * m[1][3] + m[2][k] * m[2][3])));
@@ -16,7 +16,7 @@ export function nearOf(head) {
   return NEAR_SHARE * (radius > 1e-8 ? radius : LONE_RADIUS);
 }
 
-/** A camera as the service takes it (world_to_camera, intrinsics, width, height), in the world of the states. */
+/** Converts a camera in the service's format (world_to_camera, intrinsics, width, height) to the world of the states. */
 export function inside(model, head, near) {
   const { origin, metres_per_unit: metres } = head.world;
   const pose = model.world_to_camera;
@@ -26,12 +26,12 @@ export function inside(model, head, near) {
   return { rows, t, fx: k[0][0], fy: k[1][1], cx: k[0][2], cy: k[1][2], width: model.width, height: model.height, near };
 }
 
-/** A point of the states in the user's world. */
+/** Converts a point from the world of the states to the user's world. */
 export const outside = (point, head) => point.map((value, k) => value / head.world.metres_per_unit + head.world.origin[k]);
 
 const GOLDEN = 0.618033988749895;
 
-/** RGB, 0…255, of a part: as the service paints it (client/wire/parts.py). */
+/** RGB colour of a part, 0…255, equal to the service's (client/wire/parts.py). */
 export function partColour(label) {
   const hue = 6 * ((0.58 + label * GOLDEN) % 1);
   const [saturation, value] = [[0.65, 0.45, 0.85][label % 3], [0.95, 0.8][label % 2]];

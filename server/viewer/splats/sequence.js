@@ -1,23 +1,23 @@
-// The frames of one compact file or of several, in the order of their indices; decoded ones are kept within a bound.
+// Frames of one or more compact files, ordered by index, with a bounded cache of decoded states.
 
-const MOST_BYTES = 256e6; // of decoded states
-const PER_GAUSSIAN = 88; // bytes of a state, where nothing is shared
+const MOST_BYTES = 256e6; // maximum bytes of decoded states
+const PER_GAUSSIAN = 88; // bytes of a state per Gaussian if nothing is shared
 const MOST_FILES_BYTES = 384e6;
-const READY = 3; // files that keep what they need for their next frame
+const READY = 3; // number of files that keep the data needed to decode their next frame
 
 export class Sequence {
-  /** @param most bytes of files that are kept; Infinity where none can be fetched again */
+  /** @param most maximum bytes of files to keep; Infinity if files cannot be fetched again */
   constructor(most = MOST_FILES_BYTES) {
     this.most = most;
-    this.frames = []; // { index, time, reader, place }, rising
-    this.kept = new Map(); // decoded states by index, the one used last at the end
-    this.ready = new Set(); // readers, the one used last at the end
-    this.used = new Set(); // readers of files, the one that came or was shown last at the end
-    this.shown = new Set(); // readers of what is shown
+    this.frames = []; // { index, time, reader, place }, in ascending order
+    this.kept = new Map(); // decoded states keyed by index, least recently used first
+    this.ready = new Set(); // readers, least recently used first
+    this.used = new Set(); // readers of files, least recently added or shown first
+    this.shown = new Set(); // readers of the frames that are shown
     this.head = null;
   }
 
-  /** Takes the frames of a file; frames that are known already are read from it from now on. */
+  /** Adds the frames of a file; frames that are already known are read from this file from now on. */
   add(reader) {
     this.head ??= reader.head;
     const fresh = reader.frames.map((index, place) => ({ index, time: reader.times[place], reader, place }));
@@ -28,7 +28,7 @@ export class Sequence {
     this.bound(reader);
   }
 
-  /** Forgets files beyond a bound of memory, those first that were shown longest ago; never the newest, nor what is shown. */
+  /** Removes files beyond the memory limit, least recently shown first, except the newest one and those that are shown. */
   bound(newest) {
     const inUse = new Set(this.frames.map((frame) => frame.reader));
     for (const reader of this.used) if (!inUse.has(reader)) this.drop(reader);
@@ -48,7 +48,7 @@ export class Sequence {
     this.frames = this.frames.filter((frame) => frame.reader !== reader);
   }
 
-  /** Whether the state of a frame, by its place, is decoded. */
+  /** Whether the state of the frame at a place is decoded. */
   has(place) {
     return this.kept.has(this.frames[place]?.index);
   }
@@ -56,7 +56,7 @@ export class Sequence {
   state(place) {
     const { index, reader, place: inFile } = this.frames[place];
     let state = this.kept.get(index);
-    if (state) this.kept.delete(index); // and in again, as the last used
+    if (state) this.kept.delete(index); // inserted again as the most recently used
     else state = this.decoded(reader, inFile);
     this.kept.set(index, state);
     const most = Math.max(3, Math.floor(MOST_BYTES / (PER_GAUSSIAN * state.count)));
@@ -75,14 +75,14 @@ export class Sequence {
     return reader.state(place);
   }
 
-  /** The place of a moment on the way from a frame to the next one; null where the frame is not there. */
+  /** Place of a moment between a frame and the next one; null if the frame is not available. */
   placeOf(index, next, share) {
     const place = this.frames.findIndex((frame) => frame.index === index);
     if (place < 0) return null;
     return next !== null && this.frames[place + 1]?.index === next ? place + share : place;
   }
 
-  /** The moment at a place between frames: 1.25 is a quarter of the way from the second to the third. */
+  /** Moment at a fractional place: 1.25 is a quarter of the way from the second frame to the third. */
   moment(place) {
     const last = this.frames.length - 1;
     const at = Math.max(0, Math.min(last, place));

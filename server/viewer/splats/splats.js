@@ -1,22 +1,22 @@
-// Gaussians that the browser draws itself: the page's side of the worker.
+// Drawing of Gaussians in the browser: the page's side of the worker.
 
-/** Draws into a canvas by a worker; of what is asked for while it draws, the newest is drawn next. */
+/** Draws into a canvas with a worker; of the requests that arrive while it is drawing, only the newest is drawn next. */
 export class Splats {
   /**
-   * @param canvas given to the worker for good
-   * @param worker runs worker.js
+   * @param canvas canvas that is permanently transferred to the worker
+   * @param worker worker that runs worker.js
    * @param on { frames(message), drawn(message), picked(message), track(message), trails(message), failed(message) }
-   * @param mostBytes of files that are kept; Infinity where none can be fetched again, undefined for a bound
+   * @param mostBytes maximum bytes of files to keep; Infinity if files cannot be fetched again, undefined for the default
    */
   constructor(canvas, worker, on, mostBytes) {
     Object.assign(this, { worker, on, busy: null, next: null });
     const offscreen = canvas.transferControlToOffscreen();
     worker.onmessage = ({ data }) => this.receive(data);
-    worker.onerror = (event) => on.failed({ during: "begin", words: event.message || "the worker does not run" });
+    worker.onerror = (event) => on.failed({ during: "begin", words: event.message || "the worker cannot run" });
     worker.postMessage({ kind: "canvas", canvas: offscreen, mostBytes }, [offscreen]);
   }
 
-  /** Whether this browser can: WebGL2 in a worker. */
+  /** Whether this browser supports WebGL2 in a worker. */
   static possible() {
     try {
       const gl = typeof OffscreenCanvas === "undefined" ? null : new OffscreenCanvas(1, 1).getContext("webgl2");
@@ -38,17 +38,17 @@ export class Splats {
     this.on[message.kind]?.(message);
   }
 
-  /** Takes a compact file; its bytes are the worker's then. */
+  /** Adds a compact file, whose bytes are transferred to the worker. */
   add(bytes, name) {
     this.worker.postMessage({ kind: "file", bytes, name }, [bytes.buffer]);
   }
 
   /**
-   * Draws, or does so after what is being drawn; of several such the last.
+   * Draws a picture, now or after the current one; of several pending requests, only the last is drawn.
    *
-   * @param request { place, camera, ahead }: place among the frames, camera as the service takes it, place to decode next; or
-   *   { index, next, share, camera }: the index of a frame, of the next one or null, and the share 0…1 of the way between them
-   * @param asked comes back with what was drawn
+   * @param request { place, camera, ahead }: place among the frames, camera in the service's format, and place to decode next; or
+   *   { index, next, share, camera }: index of a frame, index of the next one or null, and the share 0…1 of the way between them
+   * @param asked returned with the picture
    */
   draw(request, asked = {}) {
     if (this.busy) {

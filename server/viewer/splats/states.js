@@ -1,6 +1,6 @@
-// States of a compact 4D file, decoded: Gaussians without a reference, and states by their reference (docs/format.md).
+// Decoding of a compact 4D file: newborn Gaussians without a reference, and states relative to a reference (docs/format.md).
 // A state is { count, means [3 N], factors [9 N], rotations [4 N], colours [3 N], foreground [N], opacities [N], retired [N], ids [N] },
-// component by component. Its arrays are shared with others and never written to. Gloss is passed over: highlights are not drawn.
+// component by component. Its arrays are shared between states and must not be modified. Gloss is skipped, so highlights are not drawn.
 
 import { FileError } from "./records.js";
 import { Sections } from "./planes.js";
@@ -16,20 +16,20 @@ const turnStep = (bounds) => 2 * bounds.rotation / Math.sqrt(3);
 const levelOf = (label) => Math.max(0, Math.min(LABELS - 1, Math.ceil(LABELS * label) - 1));
 const label = (level) => (Math.max(0, Math.min(LABELS - 1, level)) + 0.5) / LABELS;
 
-/** Fills an array by a function of another's values: several times as fast as `from`. */
+/** Fills an array with a function of another array's values; several times as fast as `from`. */
 function each(found, values, of) {
   for (let i = 0; i < found.length; i++) found[i] = of(values[i]);
   return found;
 }
 
-/** Gaussians without a reference, of a record's body after its count: { state, clusters, gloss }, so many with gloss, −1 for none sections. */
+/** Decodes newborn Gaussians after the count in a record: { state, clusters, gloss }; gloss is the number with gloss, −1 without gloss sections. */
 export function decodeBorn(body, at, count, bounds) {
   const sections = new Sections(body, at);
   const ids = new Float64Array(count);
   const steps = sections.plane(count);
   for (let i = 0, id = 0; i < count; i++) ids[i] = id += steps[i];
   const clusters = sections.plane(count);
-  if (clusters.some((one) => one < 0 || one > MOST_CLUSTERS)) throw new FileError("a cluster cannot be");
+  if (clusters.some((one) => one < 0 || one > MOST_CLUSTERS)) throw new FileError("a cluster is out of range");
   const planes = (components) => sections.residuals(components, count) ?? Array.from({ length: components }, () => new Int32Array(count));
   const [lengths, axes, centres, turns, shades] = [planes(3), planes(9), planes(3), planes(3), planes(3)];
   const [levels, opaque] = [planes(1)[0], planes(1)[0]];
@@ -60,7 +60,7 @@ export function decodeBorn(body, at, count, bounds) {
   return { state, clusters, gloss };
 }
 
-/** Reads the end of a body: exact rows, who is retired; of the born, gloss, whose number is returned; what is mirrored. */
+/** Reads the end of a body: exact rows, retired Gaussians, gloss (only for newborn ones; its number is returned) and mirrored ones. */
 function finish(sections, state, born) {
   const { count } = state;
   const exact = sections.exact(count, 12);
@@ -80,7 +80,7 @@ function finish(sections, state, born) {
   let gloss = -1;
   if (born) {
     gloss = sections.plane(1)[0] - 1;
-    if (gloss < -1 || gloss > count) throw new FileError(`${gloss} of ${count} Gaussians cannot have gloss`);
+    if (gloss < -1 || gloss > count) throw new FileError(`the number of Gaussians with gloss, ${gloss}, is not between 0 and ${count}`);
     if (gloss >= 0) sections.residuals(3, gloss);
   }
   sections.skipArray();
@@ -88,7 +88,7 @@ function finish(sections, state, born) {
   return gloss;
 }
 
-/** A state with those of `born` that come after its own. */
+/** State extended by the Gaussians of `born` that follow its own. */
 export function extended(state, born) {
   const found = { ...born };
   for (const [name, components] of CHANGING) {
@@ -98,7 +98,7 @@ export function extended(state, born) {
   return found;
 }
 
-/** Gaussians, and more of them after these. */
+/** Concatenates two states. */
 export function appended(state, more) {
   const count = state.count + more.count;
   const found = { count };
@@ -112,12 +112,12 @@ export function appended(state, more) {
   return found;
 }
 
-/** The state that a body encodes against a reference; `gloss` of the first Gaussians may have that, −1 where the file has none. */
+/** Decodes a state relative to a reference; the first `gloss` Gaussians may have gloss, −1 if the file has no gloss. */
 export function decodeState(body, at, reference, clusters, bounds, gloss) {
   const sections = new Sections(body, at);
   const { count } = reference;
   const [linear, shift] = [sections.double(), sections.double()];
-  if (!Number.isFinite(linear) || !Number.isFinite(shift)) throw new FileError("the steps of a state cannot be");
+  if (!Number.isFinite(linear) || !Number.isFinite(shift)) throw new FileError("the step sizes of a state are not finite");
   let most = 0;
   for (let i = 0; i < count; i++) if (clusters[i] > most) most = clusters[i];
   const motion = Array.from({ length: 12 }, () => sections.plane(most));
@@ -173,7 +173,7 @@ function sizesOf({ factors, count }) {
   return sizes;
 }
 
-/** Moves a state with its clusters: centres, axes and rotations; what has no cluster stands. */
+/** Moves the centres, axes and rotations of a state with its clusters; Gaussians without a cluster stay in place. */
 function carry(state, clusters, most, motion, linear, shift) {
   const { count, means: before, factors: axes, rotations: turns } = state;
   const centres = new Float64Array(3 * (most + 1));

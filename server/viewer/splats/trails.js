@@ -1,22 +1,22 @@
-// Trails: where many Gaussians are in each frame, gathered frame by frame beside the drawing.
+// Trails: positions of many Gaussians in each frame, gathered frame by frame while pictures are drawn.
 
 import { CompactReader } from "./reader.js";
 
 const MOST = 4096;
 
-/** Rows of Gaussians for trails: of those that move, so many, evenly over their order; the same ones each time. */
+/** Rows of up to `count` moving Gaussians for trails, evenly spread over their order; deterministic. */
 export function chosen(state, count, hidden) {
   const moving = [];
   for (let i = 0; i < state.count; i++) if (state.foreground[i] > 0.5 && !state.retired[i] && !hidden?.[i]) moving.push(i);
   const wanted = Math.min(count, moving.length, MOST);
-  // Rows beside each other are often neighbours: a step of the golden ratio spreads them.
+  // Adjacent rows are often neighbours in space; steps of the golden ratio spread them.
   const step = 0.618033988749895 * moving.length;
   const rows = new Set();
   for (let k = 0; rows.size < wanted; k++) rows.add(moving[Math.floor((k * step) % moving.length)]);
   return Uint32Array.from(rows).sort();
 }
 
-/** [3 × rows] 0…255: a hue by the direction from the middle of all, so that neighbours have like ones. */
+/** [3 × rows] colours 0…255 by direction from the common centre, so that neighbours have similar hues. */
 export function huesOf(state, rows) {
   const { count, means } = state;
   const middle = [0, 1, 2].map((k) => rows.reduce((sum, row) => sum + means[k * count + row], 0) / Math.max(rows.length, 1));
@@ -29,7 +29,7 @@ export function huesOf(state, rows) {
   return hues;
 }
 
-/** Where the Gaussians with trails are in each frame that was gathered, by its index. */
+/** Positions of the Gaussians with trails in each gathered frame, keyed by frame index. */
 export class Ways {
   constructor() {
     this.clear();
@@ -41,7 +41,7 @@ export class Ways {
     this.centres = new Map();
   }
 
-  /** Chooses the Gaussians, by the state of a frame. */
+  /** Chooses the Gaussians from the state of a frame. */
   begin(state, count, hidden) {
     this.rows = chosen(state, count, hidden);
     this.hues = huesOf(state, this.rows);
@@ -61,21 +61,21 @@ export class Ways {
     this.centres.set(index, texels);
   }
 
-  /** Forgets the frames that are not among these. */
+  /** Removes all frames except these. */
   keep(frames) {
     const wanted = new Set(frames.map(({ index }) => index));
     for (const index of this.centres.keys()) if (!wanted.has(index)) this.centres.delete(index);
   }
 }
 
-/** Whether each frame follows the one before without a gap: in the same file, or no farther than is usual among these. */
+/** Whether each frame follows the previous one without a gap: in the same file, or at most the median step away. */
 export function joined(frames) {
   const steps = frames.slice(1).map(({ index }, k) => index - frames[k].index);
   const usual = [...steps].sort((a, b) => a - b)[Math.floor(steps.length / 2)];
   return frames.map(({ reader }, place) => place > 0 && (reader === frames[place - 1].reader || steps[place - 1] <= usual));
 }
 
-/** Goes through all frames of a sequence, one a turn, so that pictures come between; a later walk ends an earlier one. */
+/** Visits all frames of a sequence, one per task, so that pictures are drawn in between; a new walk ends the previous one. */
 export class Walk {
   constructor() {
     this.number = 0;
@@ -86,13 +86,13 @@ export class Walk {
   }
 
   /**
-   * @param each (state, place) of every frame  @param done called after the last
-   * @param failed (error) of the first frame that cannot be read; those that can are gone on with
-   * @param known (place) whether a frame is passed over
+   * @param each (state, place) called for every frame  @param done called after the last frame
+   * @param failed (error) called for the first frame that cannot be read; the walk continues
+   * @param known (place) returns whether to skip a frame
    */
   begin(sequence, each, done, failed, known = () => false) {
     const number = ++this.number;
-    const readers = new Map(); // of its own: one that goes from frame to frame is not thrown back by what is drawn
+    const readers = new Map(); // own reader, so that decoding in order is not disturbed by the frames that are drawn
     let place = 0;
     let whole = true;
     const step = () => {

@@ -1,6 +1,6 @@
-// Rotations of many Gaussians at once, component by component, and the rotations of clusters.
+// Rotations of many Gaussians at once, component by component, and rotations of clusters.
 
-/** Turns in place: rotations [4, N] by the quaternions of 2 tan(θ/2) vectors; factors [9, N] too, where given. */
+/** Rotates in place: rotations [4, N], and factors [9, N] if given, by the rotations with vectors 2 tan(θ/2). */
 export function turnBy(vectors, step, rotations, factors) {
   const [vx, vy, vz] = vectors;
   const count = vx.length;
@@ -31,7 +31,7 @@ function turnColumns(factors, count, i, w, x, y, z) {
   }
 }
 
-/** Quaternion (w, x, y, z), w ≥ 0, of the rotation nearest to a matrix [9], rows first: the largest eigenvector of Horn's table. */
+/** Quaternion (w, x, y, z), w ≥ 0, of the rotation closest to a row-major matrix [9]: the dominant eigenvector of Horn's matrix. */
 export function nearestTurn(m) {
   const t = [
     [m[0] + m[4] + m[8], m[7] - m[5], m[2] - m[6], m[3] - m[1]],
@@ -47,7 +47,7 @@ export function nearestTurn(m) {
   return first < 0 ? found.map((value) => -value) : found;
 }
 
-/** Diagonalizes a symmetric 4×4 table in place; returns its eigenvectors, in columns. */
+/** Diagonalizes a symmetric 4×4 matrix in place and returns its eigenvectors as columns. */
 function jacobi(t) {
   const v = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
   for (let round = 0; round < 24; round++) {

@@ -1,5 +1,5 @@
-// A worker that decodes compact files and paints their Gaussians: the thread of the page has neither to do.
-// It receives messages { kind, … }, and answers with such; see `Splats`, which is the page's side of it.
+// Worker that decodes compact files and paints their Gaussians, to keep both off the page's thread.
+// It receives and sends messages { kind, … }; see `Splats`, which is the page's side.
 
 import { Painter } from "./painter.js";
 import { Projector } from "./project.js";
@@ -8,7 +8,7 @@ import { inside, nearOf, outside, partColour } from "./rig.js";
 import { Sequence } from "./sequence.js";
 import { Ways, Walk } from "./trails.js";
 
-const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // of depth, where nothing is
+const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // colour in depth pictures where there is nothing
 const NO_PART = [90, 96, 104];
 const post = (kind, message = {}) => self.postMessage({ kind, ...message });
 
@@ -17,12 +17,12 @@ const [trailWalk, trackWalk] = [new Walk(), new Walk()];
 const ways = new Ways();
 let painter = null;
 let sequence = new Sequence();
-let most; // bytes of files that are kept, where the page says so
+let most; // maximum bytes of files to keep, if the page sets it
 let near = 0;
 let labels = null; // part of each Gaussian
-let shown = null; // what was drawn last: { camera, moment }
+let shown = null; // last picture: { camera, moment }
 let look = { mode: "colour", background: null, hiddenParts: [], trails: 0, span: 20 };
-let cover = null; // hidden Gaussians, from `hiddenParts`
+let cover = null; // mask of hidden Gaussians, from `hiddenParts`
 let paints = { labels: null, ones: null };
 let followed = -1;
 
@@ -34,7 +34,7 @@ const actions = {
     post("ready", { floats: painter.floats });
   },
 
-  /** Begins anew, without any frame. */
+  /** Resets the worker, removing all frames. */
   clear() {
     trackWalk.stop();
     forgetTrails();
@@ -54,8 +54,8 @@ const actions = {
       actions.look({});
     }
     if (look.trails) {
-      if (found && look.hiddenParts.length) forgetTrails(); // others are hidden now
-      guarded("trails", gatherTrails); // places have moved
+      if (found && look.hiddenParts.length) forgetTrails(); // the hidden Gaussians have changed
+      guarded("trails", gatherTrails); // the places of frames have changed
     }
     const parts = labels ? Math.max(-1, ...new Set(labels)) + 1 : 0;
     post("frames", { name, frames: sequence.frames.map(({ index, time }) => [index, time]), head: sequence.head, count: reader.count,
@@ -75,7 +75,7 @@ const actions = {
   draw({ camera: model, ...asked }) {
     const began = performance.now();
     const place = asked.place ?? sequence.placeOf(asked.index, asked.next, asked.share);
-    if (place === null) return post("failed", { during: "draw", gone: true, words: `frame ${asked.index} is not at hand any more` });
+    if (place === null) return post("failed", { during: "draw", gone: true, words: `frame ${asked.index} is no longer loaded` });
     const ahead = asked.index === undefined ? asked.ahead : asked.next === null ? undefined : Math.floor(place) + 2;
     const { head } = sequence;
     const camera = inside(model, head, near);
@@ -100,7 +100,7 @@ const actions = {
     setTimeout(() => guarded("ahead", () => sequence.frames[ahead] && sequence.state(ahead)));
   },
 
-  /** Follows what is seen at a place of the last picture. */
+  /** Follows the Gaussian at a point of the last picture. */
   pick({ u, v }) {
     if (!shown) return;
     const found = projector.at(u, v);
@@ -134,12 +134,12 @@ function whereIs(row) {
 
 function covering(count) {
   if (!cover || cover.length >= count) return cover;
-  const all = new Uint8Array(count); // those born after the parts were seen
+  const all = new Uint8Array(count); // includes Gaussians born after the parts were computed
   all.set(cover);
   return (cover = all);
 }
 
-/** [3 N] colours in place of the Gaussians' own. */
+/** [3 N] colours that replace the Gaussians' own. */
 function coloursOf(mode, count) {
   if (mode === "parts" && labels) {
     if (paints.labels?.length !== 3 * count) {
@@ -164,7 +164,7 @@ function forgetTrails() {
   painter?.endTrails();
 }
 
-/** Gathers the centres of the Gaussians with trails, frame by frame; those that are known already are kept. */
+/** Gathers the centres of the Gaussians with trails, frame by frame, skipping known frames. */
 function gatherTrails() {
   trailWalk.stop();
   if (!sequence.frames.length || !painter || !look.trails) return;
@@ -185,7 +185,7 @@ function failed(during, error, name) {
   post("failed", { during, name, words: error.message });
 }
 
-/** Acts; errors are reported, and end nothing else. */
+/** Runs an action; errors are reported and affect nothing else. */
 function guarded(during, action, name) {
   try {
     action();

@@ -1,20 +1,20 @@
-// Beside the live view: one camera's own picture of the frame that is shown, its rendering, or how the two differ.
+// Picture beside the live view: a camera's picture of the current frame, its rendering, or the difference between them.
 
 import { DEPTH_RAMP } from "./colours.js";
 import { fetched, scenePath } from "../service.js";
 import { page } from "../page.js";
 
-const STRONGER = 3; // times that a difference is shown, about grey
-const HOTTEST = 0.25; // of the range, where the heat map ends
+const STRONGER = 3; // amplification of differences, which are shown around grey
+const HOTTEST = 0.25; // upper end of the heat map, as a share of the range
 const WORDS = {
-  picture: "as it was sent",
+  picture: "as sent",
   render: "rendered",
-  difference: `rendered minus sent, ${STRONGER} times, about grey`,
+  difference: `rendered minus sent, amplified ${STRONGER} times around grey`,
   heat: `difference, 0 (dark) to ${100 * HOTTEST} % (bright) of the range`,
 };
 
 export class Beside {
-  /** @param box has a canvas and a caption */
+  /** @param box element with a canvas and a caption */
   constructor(box) {
     this.box = box;
     this.canvas = box.querySelector("canvas");
@@ -25,14 +25,14 @@ export class Beside {
     this.wanted = this.shown = "";
   }
 
-  /** Chooses what is shown: "" for nothing, or a key of `WORDS`. */
+  /** Chooses what to show: "" for nothing, or a key of `WORDS`. */
   choose(what) {
     this.what = what;
     this.box.hidden = !what;
     this.draw(this.frame);
   }
 
-  /** Chooses the camera, by its place in the rig. */
+  /** Chooses the camera, given its index in the rig. */
   look(camera) {
     this.camera = camera;
     this.draw(this.frame);
@@ -46,7 +46,7 @@ export class Beside {
     this.caption.textContent = "";
   }
 
-  /** Draws a frame; while one is on its way, only the newest wish is kept. */
+  /** Draws a frame; while one is being loaded, only the newest request is kept. */
   async draw(frame) {
     this.frame = frame;
     if (!this.what || frame === undefined || !page.rig) return;

@@ -8,7 +8,7 @@ export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * 
 export const length = (a) => Math.hypot(...a);
 export const unit = (a) => scale(a, 1 / (length(a) || 1));
 
-/** Rows of the rotation, centre and field of view of a camera as the service gives it. */
+/** Converts a camera from the service's format into rotation rows, centre and intrinsics. */
 export function readCamera(model) {
   const pose = model.world_to_camera;
   const rows = [0, 1, 2].map((i) => pose[i].slice(0, 3));
@@ -19,20 +19,20 @@ export function readCamera(model) {
     width: model.width, height: model.height };
 }
 
-/** Pixel and depth of a world point; null behind the camera. */
+/** Pixel and depth of a world point; null if it is behind the camera. */
 export function project(camera, point) {
   const [x, y, z] = camera.rows.map((row, i) => dot(row, point) + camera.t[i]);
   return z > 1e-9 ? [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, z] : null;
 }
 
-/** The world point at a pixel and a depth along z. */
+/** World point at a pixel and a depth along z. */
 export function unproject(camera, u, v, z) {
   const seen = [(u - camera.cx) / camera.fx * z - camera.t[0], (v - camera.cy) / camera.fy * z - camera.t[1],
     z - camera.t[2]];
   return [0, 1, 2].map((k) => camera.rows[0][k] * seen[0] + camera.rows[1][k] * seen[1] + camera.rows[2][k] * seen[2]);
 }
 
-/** Solves a symmetric 3x3 system by Cramer's rule; null where it is (nearly) singular. */
+/** Solves a symmetric 3x3 system with Cramer's rule; null if it is (nearly) singular. */
 function solve(m, b) {
   const det = (a) => dot(a[0], cross(a[1], a[2]));
   const d = det(m);
@@ -41,15 +41,15 @@ function solve(m, b) {
   return [0, 1, 2].map((k) => det(m.map((row, i) => row.map((value, j) => (j === k ? b[i] : value)))) / d);
 }
 
-/** Finds from the rig the point that it looks at, its up direction and its distance. */
+/** Estimates the point that a rig looks at, its up direction and its distance. */
 export function fitRig(cameras) {
   const n = cameras.length;
   const forward = cameras.map((camera) => unit(camera.rows[2]));
   const mean = scale(cameras.reduce((sum, camera) => add(sum, camera.centre), [0, 0, 0]), 1 / n);
-  // A picture's "down" is the mean of the cameras' y axes: rigs stand upright, whatever the world's axes are called.
+  // Down is the mean of the cameras' y axes, since rigs are upright no matter how the world's axes are named.
   const down = cameras.reduce((sum, camera) => add(sum, camera.rows[1]), [0, 0, 0]);
   const up = length(down) > 0.05 * n ? scale(unit(down), -1) : [0, -1, 0];
-  // The point nearest to all optical axes: sum of (I - f fT) (p - c) = 0.
+  // The point closest to all optical axes: sum of (I - f fT) (p - c) = 0.
   const m = [[0, 0, 0], [0, 0, 0], [0, 0, 0]];
   const b = [0, 0, 0];
   cameras.forEach((camera, i) => {
@@ -63,18 +63,18 @@ export function fitRig(cameras) {
   let target = n > 1 ? solve(m, b) : null;
   const inFront = (point) => cameras.filter((camera, i) => dot(sub(point, camera.centre), forward[i]) > 0).length;
   if (!target || inFront(target) < n / 2 || length(sub(target, mean)) > 20 * spread) {
-    target = add(mean, scale(unit(forward.reduce(add, [0, 0, 0])), 2 * spread)); // parallel or outward: before them
+    target = add(mean, scale(unit(forward.reduce(add, [0, 0, 0])), 2 * spread)); // parallel or diverging axes: a point in front of the cameras
   }
   const radius = cameras.map((camera) => length(sub(camera.centre, target))).sort((x, y) => x - y)[Math.floor(n / 2)];
   return { target, up, radius: radius || 1 };
 }
 
 const POLE = 88 * Math.PI / 180;
-// Distances of the orbit in radii of the rig: nearer is inside what is seen, farther it is a dot.
+// Limits of the orbit's distance in radii of the rig: closer would be inside the scene, farther would make it a dot.
 const [NEAREST, FARTHEST] = [0.05, 5];
 const FILLED = 0.85;
 
-/** A camera that turns about a target with "up" fixed. */
+/** Camera that orbits a target with a fixed up direction. */
 export class Orbit {
   constructor(cameras) {
     this.cameras = cameras;
@@ -86,7 +86,7 @@ export class Orbit {
     this.from(cameras[0]);
   }
 
-  /** Takes the position and direction of a camera of the rig. */
+  /** Adopts the position and direction of a camera of the rig. */
   from(camera) {
     const ahead = unit(camera.rows[2]);
     const distance = Math.max(dot(sub(this.rig.target, camera.centre), ahead), 0.1 * this.rig.radius);
@@ -95,7 +95,7 @@ export class Orbit {
     const back = scale(ahead, -1);
     this.yaw = Math.atan2(dot(back, this.axes[1]), dot(back, this.axes[0]));
     this.pitch = Math.max(-POLE, Math.min(POLE, Math.asin(Math.max(-1, Math.min(1, dot(back, this.rig.up))))));
-    // Half the picture's sides at distance 1: the whole of it fits into any window.
+    // Half the sides of the picture at distance 1, so that all of it fits into any window.
     this.tangentX = camera.width / camera.fx / 2;
     this.tangentY = camera.height / camera.fy / 2;
   }
@@ -107,7 +107,7 @@ export class Orbit {
     return add(this.target, scale(out, this.distance));
   }
 
-  /** Returns the camera as the service takes it, for a picture of a size. */
+  /** Returns the camera in the service's format, for a picture of the given size. */
   camera(width, height) {
     const eye = this.eye();
     const z = unit(sub(this.target, eye));
@@ -129,7 +129,7 @@ export class Orbit {
     this.pitch = Math.max(-POLE, Math.min(POLE, this.pitch + pitch));
   }
 
-  /** Moves the target by a share of the picture's height, to the right and down. */
+  /** Moves the target to the right and down, by shares of the picture's height. */
   pan(right, down) {
     const camera = readCamera(this.camera(100, 100));
     const size = 2 * this.tangentY * this.distance;
@@ -140,10 +140,10 @@ export class Orbit {
     this.distance = Math.max(NEAREST * this.rig.radius, Math.min(FARTHEST * this.rig.radius, this.distance * factor));
   }
 
-  /** Brings a box of pixels of a picture, { left, top, right, bottom }, into the middle, and lets it fill most of the view. */
+  /** Centres a box of pixels of a picture, { left, top, right, bottom }, and makes it fill most of the view. */
   fit(box, picture) {
     const camera = readCamera(picture);
-    const unit = this.distance / camera.fx; // of the world a pixel, at the target
+    const unit = this.distance / camera.fx; // world units per pixel at the target
     const right = (box.left + box.right + 1 - camera.width) / 2 * unit;
     const down = (box.top + box.bottom + 1 - camera.height) / 2 * unit;
     this.target = add(this.target, add(scale(camera.rows[0], right), scale(camera.rows[1], down)));

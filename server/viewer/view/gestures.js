@@ -1,12 +1,12 @@
-// Fingers, pointer and keys that move a camera about a scene.
+// Touch, pointer and keyboard control of a camera.
 
 const CLICK_PX = 4;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 /**
- * Listens on a canvas: drag turns, shift-drag or another button pans, wheel zooms; two fingers pan and zoom.
+ * Listens on a canvas: drag turns, shift-drag or another button pans, the wheel zooms; two fingers pan and zoom.
  *
- * @param orbit () => the Orbit that is moved, null where there is none yet
+ * @param orbit () => the Orbit to move, or null if there is none yet
  * @param on { moved(), click(event) }
  */
 export function listenToPointer(canvas, orbit, on) {
@@ -56,7 +56,7 @@ function pinch(orbit, fingers, event, height) {
   orbit.pan(-(now[0] - before[0]) / 2 / height, -(now[1] - before[1]) / 2 / height);
 }
 
-/** Moves by a key: arrows turn, with shift they pan, plus and minus zoom, Home goes back; answers whether it is one of these. */
+/** Handles a key: arrows turn, shift-arrows pan, plus and minus zoom, Home resets; returns whether the key is one of these. */
 export function moveByKey(orbit, event, first) {
   if (ARROWS[event.key]) {
     const [x, y] = ARROWS[event.key];

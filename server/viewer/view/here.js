@@ -1,38 +1,38 @@
-// Views that the page draws itself, from compact files of the service: to turn, play and scrub costs the service nothing then.
+// Views that the page draws itself from the service's compact files, so that turning, playing and scrubbing cost the service nothing.
 
 import { fetched, scenePath } from "../service.js";
 import { node, note, readable } from "../page.js";
 import { Pace } from "../splats/pace.js";
 import { Splats } from "../splats/splats.js";
 
-const CHUNK = 24; // frames that are asked for at once, for scrubbing and playing
-const AHEAD = 8; // frames before the end of a chunk, at which the next one is asked for
-const SLOW_MS = 250; // a picture: fewer than four a second
-const SLOWER = 1.5; // times as long as the service takes
-const WARM = 3; // pictures before times count: shaders are compiled in the first
-const AGAIN_MS = 20_000; // after a failure
-const SPAN = 30; // frames of a trail
-const BESIDE = ["ahead", "trails", "track"]; // what fails there costs no picture
-const KINDS = ["colour", "depth", "alpha"]; // parts come from the service: it says whose weight is largest in a pixel
+const CHUNK = 24; // frames per request, for scrubbing and playing
+const AHEAD = 8; // number of frames before the end of a chunk at which the next chunk is requested
+const SLOW_MS = 250; // time per picture that counts as slow: fewer than four per second
+const SLOWER = 1.5; // factor over the service's time from which the browser counts as slower
+const WARM = 3; // pictures before times are measured, since the first ones compile shaders
+const AGAIN_MS = 20_000; // delay before another attempt after a failure
+const SPAN = 30; // number of frames in a trail
+const BESIDE = ["ahead", "trails", "track"]; // operations whose failure does not affect the picture
+const KINDS = ["colour", "depth", "alpha"]; // parts come from the service, which finds the Gaussian with the largest weight in each pixel
 
 export class Here {
-  /** @param picture the canvas that this one lies over  @param on { drawn(asked, message), arrived(), parts(count) } */
+  /** @param picture canvas below this one  @param on { drawn(asked, message), arrived(), parts(count) } */
   constructor(picture, on) {
     Object.assign(this, { picture, on, how: "auto", extras: { trails: 0, hiddenParts: [] }, withParts: false, pace: new Pace(), splats: null, scene: null, serial: 0, opened: 0 });
     this.possible = Splats.possible();
-    this.times = { here: 0, service: 0 }; // milliseconds a picture, smoothed
+    this.times = { here: 0, service: 0 }; // milliseconds per picture, smoothed
     this.forget();
   }
 
   forget() {
-    this.frames = new Set(); // indices of those that the worker has
-    this.asked = new Map(); // what is being drawn, by tag
+    this.frames = new Set(); // indices of the frames that the worker has
+    this.asked = new Map(); // pictures that are being drawn, keyed by tag
     this.wish = null;
     this.failedAt = -Infinity;
     this.drawn = 0;
     this.slow = false;
     this.said = "";
-    this.labelled = 0; // parts that are known
+    this.labelled = 0; // number of known parts
   }
 
   open(scene) {
@@ -41,7 +41,7 @@ export class Here {
 
   close() {
     this.scene = null;
-    this.opened++; // what is on its way belongs to another scene
+    this.opened++; // pending answers belong to another scene
     this.abort?.abort();
     this.abort = null;
     this.splats?.clear();
@@ -52,14 +52,14 @@ export class Here {
     this.on.parts(0);
   }
 
-  /** Chooses who draws: "auto" by measured speed, "here" or "service". */
+  /** Chooses the renderer: "auto" by measured speed, "here" or "service". */
   choose(how) {
     this.how = how;
     this.slow = false;
     this.failedAt = -Infinity;
   }
 
-  /** Shows trails, or hides parts, which the service's pictures do not: while it does, pictures at rest are from here. */
+  /** Shows trails or hides parts, which the service cannot; in the meantime, pictures at rest are drawn here, too. */
   show(extras) {
     Object.assign(this.extras, extras);
     this.splats?.look({ ...this.extras, span: SPAN });
@@ -70,7 +70,7 @@ export class Here {
     return this.how === "here" || this.extras.trails > 0 || this.extras.hiddenParts.length > 0;
   }
 
-  /** Asks for the parts of all Gaussians, once, with the frames about one. */
+  /** Requests the parts of all Gaussians, once, together with the frames around the given one. */
   askParts(index) {
     const begin = this.beginOf(index);
     if (this.withParts || begin === undefined) return;
@@ -78,7 +78,7 @@ export class Here {
     this.get(begin, CHUNK, true);
   }
 
-  /** Whether pictures of a mode are drawn here, once their frame is. */
+  /** Whether pictures of a mode are drawn here once their frame is loaded. */
   draws(mode) {
     return this.possible && this.how !== "service" && KINDS.includes(mode) && !(this.how === "auto" && this.slow)
       && performance.now() - this.failedAt > AGAIN_MS;
@@ -88,7 +88,7 @@ export class Here {
     return this.frames.has(index);
   }
 
-  /** Asks the service for a frame: alone where it is the newest, else with those about it. */
+  /** Requests a frame from the service: alone if it is the newest, otherwise with the frames around it. */
   fetch(index, alone) {
     if (alone) return this.get(index, 1);
     const frames = readable();
@@ -100,14 +100,14 @@ export class Here {
     }
   }
 
-  /** The first frame of the chunk of a frame; undefined where the frame cannot be read. */
+  /** First frame of the chunk that contains a frame; undefined if the frame is not readable. */
   beginOf(index) {
     const frames = readable();
     const at = frames.findIndex((report) => report.index === index);
     return frames[at - (at % CHUNK)]?.index;
   }
 
-  /** One request at a time; of the wishes meanwhile, the newest is next. */
+  /** Requests frames, one request at a time; only one further request is kept in the meantime. */
   async get(first, limit, parts = false) {
     if (first === undefined) return;
     const wanted = JSON.stringify([first, limit, parts]);
@@ -120,7 +120,7 @@ export class Here {
     abort.wanted = wanted;
     try {
       const frames = readable().filter((report) => report.index >= first).slice(0, limit).map((report) => report.index);
-      for (let from = first, left = limit; left > 0;) { // an answer ends where a file of the service does
+      for (let from = first, left = limit; left > 0;) { // a response ends at the end of one of the service's files
         const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${from}&limit=${left}&parts=${parts}`, undefined, abort.signal);
         const bytes = new Uint8Array(await answer.arrayBuffer());
         if (this.abort !== abort) return;
@@ -161,8 +161,8 @@ export class Here {
   }
 
   failed({ during, gone, words }) {
-    if (gone || BESIDE.includes(during)) return gone && this.on.arrived(); // asked for again, or seen by nobody
-    if (!this.labelled) this.withParts = false; // may be asked for again
+    if (gone || BESIDE.includes(during)) return gone && this.on.arrived(); // the frame is requested again, or the failure is not visible
+    if (!this.labelled) this.withParts = false; // may be requested again
     this.failedAt = performance.now();
     this.said = words;
     if (this.how === "here") note(`The view cannot be drawn here: ${words}`);
@@ -175,7 +175,7 @@ export class Here {
   }
 
   /**
-   * Draws a moment; `on.drawn` is called when it is there.
+   * Draws a moment and calls `on.drawn` when it is finished.
    *
    * @param asked { index, next, share, camera, mode, background, moving }: share 0…1 of the way from one frame to the next
    */
@@ -202,7 +202,7 @@ export class Here {
     this.on.drawn(asked, message);
   }
 
-  /** Takes the milliseconds of a picture, drawn here or by the service. */
+  /** Records the milliseconds that a picture took, here or at the service. */
   measure(who, milliseconds) {
     this.times[who] = this.times[who] ? 0.8 * this.times[who] + 0.2 * milliseconds : milliseconds;
   }

@@ -1,4 +1,4 @@
-// The live view: a picture for the camera that the user moves, rendered by the service, or drawn here while it moves.
+// Live view from a camera that the user moves, rendered by the service or drawn by the browser while the camera moves.
 
 import { Orbit, project, readCamera } from "./geometry.js";
 import { paintDepth } from "./colours.js";
@@ -9,12 +9,12 @@ import { readable } from "../page.js";
 import { fetched, scenePath } from "../service.js";
 
 const SETTLE_MS = 220;
-const TOUCHED_MS = 15_000; // for so long after a person moved something, frames are kept at hand to be drawn here
+const TOUCHED_MS = 15_000; // how long after a user action new frames are loaded, so that they can be drawn here
 const SLOW_MS = 1000;
 const TARGET_MS = 90;
 const EMPTY = [16, 19, 24];
 const FIT_PX = 200;
-const COVERED = 40; // of 255, from which a pixel shows something
+const COVERED = 40; // minimum alpha, of 255, of a pixel that shows something
 const MODES = {
   colour: { kinds: ["colour"], format: "jpeg" },
   depth: { kinds: ["depth"], format: "float32" },
@@ -31,7 +31,7 @@ export class LiveView {
     this.mode = "colour";
     this.parts = null;
     this.frame = null;
-    this.background = null; // the scene's
+    this.background = null; // null selects the scene's own
     this.showFrusta = false;
     this.tracks = [];
     this.largest = 8e6;
@@ -41,7 +41,7 @@ export class LiveView {
     new ResizeObserver(() => this.moved()).observe(canvas.parentElement);
   }
 
-  /** Begins with a scene: its rig, its stream. */
+  /** Opens a scene, given its stream and rig. */
   open(stream, rig) {
     this.stream = stream;
     this.scene = stream.scene;
@@ -73,14 +73,14 @@ export class LiveView {
     for (const canvas of [this.canvas, this.overlay]) canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
   }
 
-  /** Another kind of picture; the one that is shown is not taken for it meanwhile. */
+  /** Sets the kind of picture; until the new picture arrives, the current one is marked as stale. */
   setMode(mode) {
     this.mode = mode;
     if (this.shown) this.on.stale(this.shown.mode !== mode);
     this.moved(true);
   }
 
-  /** @param background [red, green, blue] in 0…1, null for the scene's */
+  /** @param background [red, green, blue] in 0…1, or null for the scene's own */
   setBackground(background) {
     this.background = background;
     this.moved(true);
@@ -91,7 +91,7 @@ export class LiveView {
     if (this.mode === "parts") this.moved(true);
   }
 
-  /** @param touched whether a person chose it */
+  /** @param touched whether the user chose the frame */
   setFrame(frame, touched = false) {
     this.frame = frame;
     this.between = { next: null, share: 0 };
@@ -104,32 +104,32 @@ export class LiveView {
     return this.here.draws(this.mode) && this.here.has(frame) && this.here.has(next);
   }
 
-  /** A moment on the way from the frame that is chosen to the next one. */
+  /** Sets a moment between the chosen frame and the next one. */
   setBetween(next, share) {
     this.between = { next, share };
     this.touchedAt = performance.now();
     this.moved();
   }
 
-  /** Who draws: "auto", "here" or "service". */
+  /** Sets the renderer: "auto", "here" or "service". */
   setDrawn(how) {
     this.here.choose(how);
     this.touch();
   }
 
-  /** Trails of Gaussians, or parts that are hidden: drawn here alone. */
+  /** Sets trails and hidden parts, which only the browser draws. */
   setExtras(extras) {
     this.here.show(extras);
     this.touch();
   }
 
-  /** The parts are to be listed. */
+  /** Requests the parts, so that they can be listed. */
   askParts() {
     this.here.askParts(this.frame ?? readable().at(-1)?.index);
     this.touch();
   }
 
-  /** A frame was committed. */
+  /** Handles a newly committed frame. */
   committed(index) {
     if (this.stream && this.frame === null && this.isTouched() && this.here.draws(this.mode)) this.here.fetch(index, true);
   }
@@ -140,7 +140,7 @@ export class LiveView {
     this.touch();
   }
 
-  /** A person moves the view. */
+  /** Handles a user action on the view. */
   touch() {
     this.touchedAt = performance.now();
     this.moved();
@@ -150,7 +150,7 @@ export class LiveView {
     return this.here.alone || performance.now() - this.touchedAt < TOUCHED_MS;
   }
 
-  // Asking.
+  // Requesting pictures.
 
   size(share) {
     const box = this.canvas.parentElement.getBoundingClientRect();
@@ -161,7 +161,7 @@ export class LiveView {
     return [Math.round(width), Math.round(height)];
   }
 
-  /** Draws or asks after a change of camera, size or mode: a quick picture now, a sharp one when it rests. */
+  /** Draws or requests a picture after a change of camera, size or mode: a quick one now, a sharp one at rest. */
   moved(sharp = false) {
     if (!this.stream) return;
     clearTimeout(this.settle);
@@ -174,12 +174,12 @@ export class LiveView {
     this.on.turned?.();
   }
 
-  /** At rest: the service's exact picture, or a sharp one from here. */
+  /** Shows the picture at rest: the service's exact one, or a sharp one drawn here. */
   rest() {
     if (!this.here.alone || !this.drawHere(false)) this.request(1);
   }
 
-  /** Draws the view in the page; answers whether it is or will be, else the service is to be asked. */
+  /** Draws the view in the page; returns false if it cannot, so that the service must render it. */
   drawHere(moving = false) {
     const { here } = this;
     const index = this.frame ?? readable().at(-1)?.index;
@@ -187,7 +187,7 @@ export class LiveView {
     here.fetch(index, this.frame === null && !here.has(index));
     if (!here.has(index)) return here.alone && !here.said;
     if (here.alone) this.stream.unsubscribe("view");
-    this.overtaken = this.tag; // pictures that are on their way show another view
+    this.overtaken = this.tag; // pictures that have not arrived yet show another view
     clearTimeout(this.slow);
     const camera = this.orbit.camera(...here.size(this.canvas.parentElement.getBoundingClientRect(), moving));
     here.draw({ index, ...this.between, camera, mode: this.mode, background: this.background, moving });
@@ -204,7 +204,7 @@ export class LiveView {
     this.on.shown({ ...this.shown, width: asked.camera.width, height: asked.camera.height, near, far, here: true });
   }
 
-  /** Frames have come that can be drawn here. */
+  /** Handles the arrival of frames that can be drawn here. */
   arrived(all = false) {
     if (this.stream && (all || this.here.alone || performance.now() - this.movedAt < SETTLE_MS)) this.moved();
   }
@@ -223,7 +223,7 @@ export class LiveView {
     else this.stream.subscribe("view", "render", request, this.tag);
   }
 
-  // Showing.
+  // Showing pictures.
 
   async receive(head, bytes) {
     const asked = this.asked.get(head.tag);
@@ -233,7 +233,7 @@ export class LiveView {
     const number = this.latest = (this.latest || 0) + 1;
     const { stream } = this;
     const painted = await this.decode(asked, head, bytes);
-    // Decoding takes turns: a newer picture may have been painted meanwhile, or another scene opened.
+    // Decoding is asynchronous: in the meantime, a newer picture may have been painted or another scene opened.
     if (number < (this.painted || 0) || this.stream !== stream || asked.mode !== this.mode || head.tag <= this.overtaken) return;
     this.painted = number;
     this.exact = this.here.serial;
@@ -264,13 +264,13 @@ export class LiveView {
     return { bitmap: await createImageBitmap(new Blob([bytes], { type: head.media_type })) };
   }
 
-  /** The size of pictures while the camera moves follows from how long they take. */
+  /** Adapts the size of pictures while the camera moves to the time that they take. */
   adapt(milliseconds, share) {
     const wanted = share * Math.sqrt(TARGET_MS / Math.max(milliseconds, 1));
     this.coarse = Math.max(0.3, Math.min(1, 0.6 * this.coarse + 0.4 * wanted));
   }
 
-  /** Tracks and the rig, over the picture that is shown and with its camera. */
+  /** Draws the tracks and the rig over the current picture, with its camera. */
   draw() {
     const box = this.canvas.parentElement.getBoundingClientRect();
     const dense = window.devicePixelRatio || 1;
@@ -296,7 +296,7 @@ export class LiveView {
     listenToPointer(this.overlay, () => (this.stream ? this.orbit : null), { moved: () => this.touch(), click: (event) => this.click(event) });
   }
 
-  /** Moves the camera by a key; answers whether it is one of those that do. */
+  /** Handles a key that moves the camera or follows a point; returns whether it is one of these. */
   key(event) {
     if (!this.stream) return false;
     if (event.key.toLowerCase() === "t") {
@@ -308,7 +308,7 @@ export class LiveView {
     return true;
   }
 
-  /** Moves nearer or farther until what is in the scene fills the view, and into its middle. */
+  /** Centres the contents of the scene and changes the distance so that they fill the view. */
   async fit() {
     if (!this.shown) return;
     const { stream } = this;
@@ -316,7 +316,7 @@ export class LiveView {
     const small = FIT_PX / Math.max(box.width, box.height);
     const camera = this.orbit.camera(Math.round(box.width * small), Math.round(box.height * small));
     const bitmap = await createImageBitmap(await this.rendered({ camera, kinds: ["alpha"], format: "png" }));
-    if (this.stream !== stream) return; // another scene was opened meanwhile
+    if (this.stream !== stream) return; // another scene was opened in the meantime
     const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d", { willReadFrequently: true });
     context.drawImage(bitmap, 0, 0);
     const { data, width, height } = context.getImageData(0, 0, bitmap.width, bitmap.height);
@@ -330,7 +330,7 @@ export class LiveView {
     this.touch();
   }
 
-  /** A picture of the view as it is, sharp, as a file. */
+  /** Returns a sharp picture of the current view as a file. */
   snapshot() {
     const { camera, mode } = this.shown;
     return this.rendered({ camera, kinds: MODES[mode].kinds, format: "png", background: this.background, parts: mode === "parts" ? this.parts : null });

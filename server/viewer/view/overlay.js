@@ -1,8 +1,8 @@
-// Draws tracks and the rig over the picture.
+// Drawing of tracks and the rig over the picture.
 
 import { add, scale } from "./geometry.js";
 
-/** Draws each trajectory: frames before the one shown are solid, later ones faint. */
+/** Draws each trajectory, with earlier frames as a solid line and later ones as a faint line. */
 export function drawTracks(context, place, tracks, frame, dense) {
   context.lineJoin = context.lineCap = "round";
   for (const track of tracks) {
@@ -43,7 +43,7 @@ export function drawTracks(context, place, tracks, frame, dense) {
   context.globalAlpha = 1;
 }
 
-/** Tracks with where their points are on the way from a frame to the next one, at `frame + share * (next - frame)`. */
+/** Tracks with interpolated points between a frame and the next one, at `frame + share * (next - frame)`. */
 export function between(tracks, frame, next, share) {
   return tracks.map((track) => {
     const [begin, end] = [track.positions.get(frame), track.positions.get(next)];
@@ -53,7 +53,7 @@ export function between(tracks, frame, next, share) {
   });
 }
 
-/** Draws the rig's cameras as pyramids with their names. */
+/** Draws the cameras of the rig as pyramids with their names. */
 export function drawFrusta(context, place, cameras, radius, dense) {
   const depth = 0.07 * radius;
   context.font = `${11 * dense}px system-ui, sans-serif`;

@@ -62,7 +62,7 @@ def test_push_as_a_rig_scenes_and_going_on(service, capture_folder):
     done = scas4d("push", str(capture_folder), "--url", service.url, *rig)
     assert done.returncode == 0, done.stderr
     assert "6 of 6 frames committed, ready" in done.stdout
-    assert re.search(r"sent 6 frames, those after frame 0 at [\d.]+ of 20 a second", done.stdout), done.stdout
+    assert re.search(r"sent 6 frames, those after frame 0 at [\d.]+ of 20 per second", done.stdout), done.stdout
     id = re.search(r"scene (\w+):", done.stdout)[1]
     listed = scas4d("scenes", "--url", service.url)
     assert re.search(rf"{id}\s+tiny\s+ready\s+2\s+6\s+0\s+6", listed.stdout), listed.stdout
@@ -96,7 +96,7 @@ def test_a_link_is_printed(tmp_path):
         given = ("scenes", "share", "all", "--url", running.url, "--token", token)
         link, until = scas4d(*given, "--hours", "2").stdout.splitlines()
         assert link.startswith(f"{running.url}/#token=scas4d.read.*.")
-        assert until.startswith("holds until 20")
+        assert until.startswith("valid until 20")
         reader = scas4d(*given, "--only-token").stdout.strip()
         with Client(running.url, token=reader) as client:
             assert client.scenes() == []
@@ -127,7 +127,7 @@ def test_scenes_are_managed(service):
         assert "asleep" in scenes("sleep", id).stdout
         assert "archived" in scenes("archive", id).stdout
         assert id not in scenes().stdout
-        assert "1 archived; scas4d scenes --all" in scenes().stdout
+        assert "1 archived; to include them: scas4d scenes --all" in scenes().stdout
         assert id in scenes("--all").stdout
         scenes("restore", id)
         assert id in scenes().stdout
@@ -173,7 +173,7 @@ def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path)
     folder = write_rig(tmp_path / "mixed")
     done = scas4d("push", str(folder), "--url", service.url, "--test", "c8", COLUMNS="200")
     assert "2 of 2 frames committed" in done.stdout, done.stderr
-    assert "camera 'c2': its pictures have 16 bits; they are rounded to 8" in done.stdout
+    assert "camera 'c2': its 16-bit images are rounded to 8 bits" in done.stdout
     with Client(service.url) as client:
         (status,) = client.scenes()
         assert status.cameras == [f"c{number}" for number in range(COUNT - 1)]
@@ -211,12 +211,12 @@ def test_a_budget_is_told_set_and_taken_back(service):
         scene = client.create_scene(make_rig(2)).id
         try:
             made = said()
-            assert made.startswith("100 iterations a frame")
-            assert "fit into 500 ms a frame, or fewer: stop gain 0.02" in said(
+            assert made.startswith("100 iterations per frame")
+            assert "fit in 500 ms per frame, or fewer: stop gain 0.02" in said(
                 "--milliseconds", "500", "--stop-gain", "0.02"
             )
             assert client.budget(scene).requested.budget_ms == 500
-            assert said("--iterations", "50").startswith("50 iterations a frame")
+            assert said("--iterations", "50").startswith("50 iterations per frame")
             assert said("--reset") == made
             refused = scas4d("budget", scene, "--reset", "--iterations", "5", "--url", service.url)
             assert (refused.returncode, "leave one out" in refused.stderr) == (1, True)
@@ -250,7 +250,7 @@ def test_a_scene_begins_again(service, tmp_path):
                 "--points",
                 str(tmp_path / "cloud.npz"),
             )
-            assert said(*given) == f"scene {scene} begins anew with frame 1, reconstruction 1; 1 queued"
+            assert said(*given) == f"scene {scene} restarts at frame 1, reconstruction 1; 1 queued"
             assert client.wait(scene, 1).state == "committed"
             status = client.scene(scene)
             assert (status.gaussians, status.settings["update"]["iterations"]) == (4, 9)
@@ -270,9 +270,9 @@ def test_serve_refuses_to_listen_beyond_this_machine():
         (("push", "nowhere"), "nowhere: no such folder"),
         (("push", "TINY", "--url", "http://127.0.0.1:9"), "start one with: scas4d serve"),
         (("push", "TINY", "--set", "iterations"), "update.iterations=200"),
-        (("push", "TINY", "--node", "stage-a"), "write it as rig=stage-a"),
+        (("push", "TINY", "--node", "stage-a"), "use the form rig=stage-a"),
         (("push", "TINY", "--node", "rig=a", "--node", "rig=b"), "'rig' has two values"),
-        (("push", "TINY", "--node", "rig=a", "--scene", "x"), "--node is only for new scenes"),
+        (("push", "TINY", "--node", "rig=a", "--scene", "x"), "--node applies only to new scenes"),
     ],
 )
 def test_what_a_user_can_mend_is_one_line(capture_folder, arguments, said):

@@ -53,7 +53,7 @@ def done(capture_folder, tmp_path_factory):
 
 def test_it_waits_for_the_kernels_and_leaves_pictures(done):
     out, said = done
-    assert said.startswith("making the kernels ready\n")
+    assert said.startswith("preparing the kernels\n")
     assert "http://127.0.0.1:" in said
     assert "dB PSNR" in said
     pictures = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.png"))
@@ -114,7 +114,7 @@ def test_a_service_that_ends_is_told_with_its_reason(capture_folder, tmp_path):
     ended = demo(capture_folder, tmp_path / "out")
     lock.release()
     assert ended.returncode == 1
-    assert ended.stderr.startswith("scas4d: the service has ended: another service uses ")
+    assert ended.stderr.startswith("scas4d: the service exited: another service is using ")
     assert ended.stderr.count("\n") == 1
 
 

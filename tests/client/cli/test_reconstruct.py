@@ -60,7 +60,7 @@ def test_scores_are_printed_and_not_measured_twice(capture_folder, tmp_path):
         assert picture.size == (3 * truth.width, truth.height)
     table = said[-1]
     assert evaluate(capture_folder, tmp_path, frames=2, changes=CHANGES, report=said.append) == row
-    assert said[-2].endswith("measured already")
+    assert said[-2].endswith("already measured")
     assert said[-1] == table
 
 
@@ -95,7 +95,7 @@ def test_a_capture_without_test_cameras_is_measured_on_those_it_has_and_says_so(
     said: list[str] = []
     row = evaluate(folder, tmp_path / "out", frames=2, changes=CHANGES, report=said.append)
     assert row["measured_on"] == "training cameras"
-    assert "    no test cameras: the scores are those of the training cameras (--test holds some out)" in said
+    assert "    no test cameras: scoring the training cameras instead (use --test to hold some out)" in said
     assert "static.iterations=2, training cameras |" in said[-1]
     held = CaptureOptions(test=("1",))
     other = evaluate(folder, tmp_path / "out", options=held, frames=2, changes=CHANGES, report=said.append)
@@ -124,9 +124,9 @@ def test_a_calibration_that_is_refined_is_said_and_measured_with(tmp_path, capsy
     said: list[str] = []
     row = evaluate(folder, tmp_path / "out", frames=1, changes=few, report=said.append)
     assert row["measured_on"] == "training cameras"
-    assert any("the calibration was refined, as asked" in line for line in said)
+    assert any("the calibration was refined, as requested" in line for line in said)
     reconstruct(open_source(folder), tmp_path / "shown", frames=1, preset="scas4d", changes=few)
-    assert "the calibration was refined, as asked" in " ".join(capsys.readouterr().out.split())
+    assert "the calibration was refined, as requested" in " ".join(capsys.readouterr().out.split())
 
 
 def test_unlike_cameras_are_reconstructed_straight_from_their_folder(tmp_path):

@@ -77,7 +77,7 @@ def test_a_folder_with_frames_of_a_longer_export_is_refused(compact: Path, tmp_p
     out = tmp_path / "frames"
     export(str(compact), "ply", out, **NOBODY)
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"holds 2 files .* frame_000002.ply"):
+    with pytest.raises(InputError, match=r"contains 2 files .* frame_000002.ply"):
         export(str(compact), "ply", out, "0:1", **NOBODY)
     assert len(list(out.glob("frame_*.ply"))) == FRAMES
     export(str(compact), "ply", out, **NOBODY)  # the same again
@@ -114,5 +114,5 @@ def test_states_of_any_source_have_the_same_scores(compact: Path, capture_folder
     background = of_path(tmp_path / "frames.zip").of.head.background
     assert background == (0, 0, 0)  # glTF has none: the scores differ by it
     assert two["psnr"] != one["psnr"]
-    with pytest.raises(InputError, match="there is no"):
+    with pytest.raises(InputError, match="does not exist"):
         evaluate_states(tmp_path / "none.s4d", capture_folder, tmp_path / "x", report=said.append)

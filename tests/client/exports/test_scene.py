@@ -70,7 +70,7 @@ def test_what_is_not_there_is_told(tmp_path):
         assert tracks.present.tolist() == [[True, True, False], [False, True, False], [False, True, True]]
         assert given.rig is None
         assert (given.parts() == -1).all()
-        with pytest.raises(InputError, match="no Gaussian of the first frame belongs to one"):
+        with pytest.raises(InputError, match="no Gaussian of the first frame belongs to a part"):
             given.part_poses()
 
 
@@ -94,10 +94,10 @@ def test_faults_have_remedies(source, tmp_path):
     given = Scene.open(source)
     for ask, said in (
         (lambda: given.tracks(ids=[7]), "ids: there is no Gaussian 7 in frame 4"),
-        (lambda: next(given.states("9:")), "frames 9: are not there; frames 0 to 4 are"),
+        (lambda: next(given.states("9:")), "frames 9: do not exist; give frames 0 to 4"),
         (lambda: Scene.open(source, frames="8:"), "frames 8: are not in states; it has frames 0 to 4"),
-        (lambda: Scene.open(tmp_path), "holds no numbered files .*; give a .s4d file"),
-        (lambda: Scene.open(tmp_path / "no.s4d"), "is not there; give a compact file"),
+        (lambda: Scene.open(tmp_path), "contains no numbered files .*; give a .s4d file"),
+        (lambda: Scene.open(tmp_path / "no.s4d"), "does not exist; give a compact file"),
     ):
         with pytest.raises(InputError, match=said):
             ask()

@@ -204,7 +204,7 @@ def test_tracks_of_what_stands_are_refused(tmp_path):
         writer.add(0, 0.0, still.replace(foreground=0 * still.foreground))
     with pytest.raises(InputError, match="tracks: there is no motion in these frames; leave --tracks out"):
         made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", tracks=3))
-    with pytest.raises(InputError, match="parts: states holds none; leave --parts out"):
+    with pytest.raises(InputError, match="parts: states contains no parts; leave --parts out"):
         made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", parts=True))
     assert [path.name for path in tmp_path.iterdir()] == ["states.s4d"]
 
@@ -221,12 +221,12 @@ def test_a_moment_from_all_around(source, tmp_path):
     [
         ("a.gif", FRONT, {}, r"out .*a.gif' ends in '.gif'; give a name that ends in .mp4 or .webp"),
         ("a.mp4", VideoOptions(path="camera", size=(63, 48)), {}, "size 63x48 is odd, .*; give 62x48, or a .webp"),
-        ("a.mp4", VideoOptions(path="camera", camera="up"), {}, "camera 'up' is not there; give one of front, side"),
+        ("a.mp4", VideoOptions(path="camera", camera="up"), {}, "camera 'up' does not exist; give one of front, side"),
         ("a.mp4", VideoOptions(path="way.json"), {}, "path 'way.json' is not a file; give orbit, camera, or a JSON"),
         ("a.mp4", FRONT, {"frames": "7:9"}, "frames 7:9 are not in states; it has frames 0 to 4"),
-        ("a.mp4", VideoOptions(fps=200, speed=1e-6), {}, "speed 1e-06 make 80000001 pictures; give --frames"),
-        ("a.mp4", VideoOptions(), {"compared": True}, "compare is given for path 'orbit'; give --path camera"),
-        ("a.mp4", VideoOptions(path="camera", interpolate=True), {"compared": True}, "compare and interpolate exclude"),
+        ("a.mp4", VideoOptions(fps=200, speed=1e-6), {}, "speed 1e-06 result in 80000001 images; change --frames"),
+        ("a.mp4", VideoOptions(), {"compared": True}, "compare is given for path 'orbit'; use --path camera"),
+        ("a.mp4", VideoOptions(path="camera", interpolate=True), {"compared": True}, "compare and interpolate are"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_and_nothing_is_left(source, tmp_path, true_capture, out, options, more, said):
@@ -238,7 +238,7 @@ def test_what_cannot_be_is_refused_and_nothing_is_left(source, tmp_path, true_ca
 
 def test_a_size_names_its_remedy():
     for wrong in ("640", "0x0", "640x480x3", "9999x9999", "-640x480"):
-        with pytest.raises(InputError, match="is not a picture size; give WIDTHxHEIGHT, such as 1280x720"):
+        with pytest.raises(InputError, match="is not an image size; give WIDTHxHEIGHT, such as 1280x720"):
             picture_size(wrong)
 
 
@@ -248,8 +248,8 @@ def test_the_command(source, tmp_path):
     arguments = ["video", str(source), "--path", str(tmp_path / "keys.json"), "--out", str(tmp_path / "a.webp")]
     done = CliRunner().invoke(app, [*arguments, "--size", "65x49", "--tracks", "2", "--parts", "--background", "white"])
     assert done.exit_code == 0, done.exception
-    assert "5 pictures of 65x49, 0.5 s" in done.output
+    assert "5 images of 65x49, 0.5 s" in done.output
     with Image.open(tmp_path / "a.webp") as file:
         assert (file.size, file.n_frames) == ((65, 49), FRAMES)
     done = CliRunner().invoke(app, [*arguments, "--size", "65"])
-    assert "size '65' is not a picture size" in str(done.exception)
+    assert "size '65' is not an image size" in str(done.exception)

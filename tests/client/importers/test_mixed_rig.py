@@ -40,8 +40,8 @@ def test_each_camera_keeps_its_size_and_sees_the_ball_where_it_is(folder):
 
 def test_what_is_not_as_usual_is_said(folder):
     remarks = open_source(folder).remarks
-    assert f"camera {DEEP!r}: its pictures have 16 bits; they are rounded to 8, value / 257" in remarks
-    assert any(remark.startswith(f"grey cameras beside colour ones: {GREY};") for remark in remarks)
+    assert f"camera {DEEP!r}: its 16-bit images are rounded to 8 bits (value / 257)" in remarks
+    assert any(remark.startswith(f"grayscale cameras among colour ones: {GREY};") for remark in remarks)
     assert len(remarks) == 2
 
 
@@ -58,7 +58,7 @@ def test_it_is_written_and_read_again(folder, tmp_path):
     write_dynamic3dgs(source, tmp_path / "out")
     again = open_capture(tmp_path / "out")
     assert len(again.remarks) == 1  # 16 bits are no more
-    assert again.remarks[0].startswith("grey cameras beside colour ones: c1; ")
+    assert again.remarks[0].startswith("grayscale cameras among colour ones: c1; ")
     for of in ("full_rig", "full_test_rig"):
         for one, other in zip(getattr(source, of).cameras, getattr(again, of).cameras, strict=True):
             assert (one.name, one.width, one.height) == (other.name, other.width, other.height)
@@ -96,7 +96,7 @@ def test_pictures_at_half_of_the_calibrated_size_scale_their_cameras_and_say_so(
         np.testing.assert_allclose(one.intrinsics, other.intrinsics, rtol=1e-3 if one.name == FISHEYE else 1e-12)
     said = [remark for remark in capture.remarks if "scaled by 0.5" in remark]
     assert len(said) == COUNT
-    assert said[0] == "camera 'c0': calibrated for 96x72, its pictures are 48x36: its intrinsics are scaled by 0.5"
+    assert said[0] == "camera 'c0': calibrated for 96x72, but images are 48x36: intrinsics scaled by 0.5"
 
 
 def test_pictures_a_little_off_are_refused_until_it_is_said_why(folder, tmp_path):

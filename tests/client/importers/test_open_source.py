@@ -36,7 +36,7 @@ def test_pictures_of_straight_lenses_go_as_they_are(straight):
 def test_pictures_of_a_camera_without_a_calibration_are_named(straight):
     assert open_source(straight).remarks == ()
     (straight / "images" / "cam7").mkdir()
-    assert open_source(straight).remarks == ("left out, transforms.json has no such camera: cam7",)
+    assert open_source(straight).remarks == ("left out cameras that are not in transforms.json: cam7",)
     assert open_source(straight).rig.names == ("cam1", "cam2", "cam10")
 
 
@@ -115,14 +115,14 @@ def test_times_and_numbers_of_pictures_must_fit(tmp_path):
     meta = timed(tmp_path)
     meta["frames"][4]["time"] = 0.05
     write(tmp_path / "transforms.json", meta)
-    with pytest.raises(CaptureError, match=r"frame 1 has pictures of different times .*0.05"):
+    with pytest.raises(CaptureError, match=r"frame 1 has images with different times .*0.05"):
         open_source(tmp_path)
     del meta["frames"][4]
     write(tmp_path / "transforms.json", meta)
-    with pytest.raises(CaptureError, match=r"camera 'cam10' has 2 pictures and 'cam2' 3"):
+    with pytest.raises(CaptureError, match=r"camera 'cam10' has 2 images, but 'cam2' has 3"):
         open_source(tmp_path)
     write(tmp_path / "transforms.json", timed(tmp_path, (0.0, 0.04, 0.04)))
-    with pytest.raises(CaptureError, match=r"frame 2 is at 0.04 s, not after the one before"):
+    with pytest.raises(CaptureError, match=r"frame 2 is at 0.04 s, not later than the previous one"):
         open_source(tmp_path)
 
 
@@ -176,7 +176,7 @@ def empty(folder):
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (cut, r"images/cam2: has no pictures of 1 of 2 frames \(000001\), which 'cam1' has"),
+        (cut, r"images/cam2: has no pictures for 1 of 2 frames \(000001\), which 'cam1' has"),
         (
             resize,
             r"cam10/000000.png: is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--size-mismatch",
@@ -186,16 +186,16 @@ def empty(folder):
             lambda f: (f / "images/cam10").rename(f / "images/ten"),
             r"images/cam10: no such folder.* images/ has cam1, cam2",
         ),
-        (lambda f: (f / "images/cam1/000000.tif").write_bytes(b""), r"000000.tif: .tif is not read; give JPEG"),
+        (lambda f: (f / "images/cam1/000000.tif").write_bytes(b""), r"000000.tif: .tif is not supported; use JPEG"),
         (lambda f: (f / "images/cam1/000000.jpg").write_bytes(b""), r"000000.png: 000000.jpg is the same frame"),
         (lambda f: (f / "images/cam1/000000.png").write_bytes(b"x"), r"cam1/000000.png: cannot be read as a picture"),
         (lambda f: (f / "transforms.json").unlink(), r"no known capture layout: no train_meta.json .*--calibration"),
-        (lambda f: (f / "videos").mkdir(), r"pictures in images/ and in videos/.*--pictures images"),
+        (lambda f: (f / "videos").mkdir(), r"has images/ and videos/; .*--pictures images"),
         (lambda f: (f / "masks").mkdir(), r"masks/cam1: no such folder"),
-        (lambda f: write_pictures(f / "masks", frames=("000000",)), r"frame 1: its picture is .* and its mask None"),
+        (lambda f: write_pictures(f / "masks", frames=("000000",)), r"frame 1: its image is .* and its mask is None"),
         (
             lambda f: write_pictures(f / "masks", frames=("000000", "7")),
-            r"frame 1: .*masks/cam1/7.png; call masks like the pictures",
+            r"frame 1: .*masks/cam1/7.png; name masks like the images",
         ),
     ],
 )

@@ -123,23 +123,23 @@ def test_a_longer_video_is_cut_and_said_so(rig_of_videos):
     film(rig_of_videos / "videos/cam2.mp4", range(FRAMES + 2))
     source = open_source(rig_of_videos)
     assert source.frame_count == FRAMES
-    assert list(source.remarks) == ["cam2.mp4 has 2 frames more than the shortest; they are left out"]
+    assert list(source.remarks) == ["cam2.mp4 has 2 more frames than the shortest; they are left out"]
 
 
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda f: film(f / "cam2.mp4", rate=30), r"cam2.mp4: has 30 frames per second, cam1.mp4 25"),
+        (lambda f: film(f / "cam2.mp4", rate=30), r"cam2.mp4: has 30 frames per second, but cam1.mp4 has 25"),
         (lambda f: film(f / "cam2.mp4", size=(152, 240)), r"cam2.mp4: is 152x240 pixels.*calibrated for 320x240"),
         (
             lambda f: film(f / "cam2.mp4", skip=(10,), rate=25),
-            r"cam2.mp4: frame 10 is at 0.440 s, that of cam1.mp4 at 0.400 s",
+            r"cam2.mp4: frame 10 is at 0.440 s, but in cam1.mp4 at 0.400 s",
         ),
         (
             lambda f: (f / "cam2.mp4").unlink(),
-            r"no video of camera 'cam2' of .*transforms.json, only cam1.mp4, cam10.mp4",
+            r"no video for camera 'cam2' of .*transforms.json, only cam1.mp4, cam10.mp4",
         ),
-        (lambda f: (f / "cam2.mkv").write_bytes(b"x"), r"has cam2.mkv and cam2.mp4 of one camera"),
+        (lambda f: (f / "cam2.mkv").write_bytes(b"x"), r"has cam2.mkv and cam2.mp4 for the same camera"),
         (lambda f: (f / "cam2.mp4").write_bytes(b"no video at all"), r"cam2.mp4: cannot be read as video"),
         (lambda f: (f / "cam2.mp4").write_bytes(b""), r"cam2.mp4: cannot be read as video"),
     ],

@@ -94,7 +94,7 @@ def test_cameras_of_different_sizes_are_written_and_read(tmp_path):
     assert capture.frame(0).images["cam2"].shape == (80, 100, 3)
     meta = json.loads((tmp_path / "out/train_meta.json").read_text())
     (tmp_path / "out/train_meta.json").write_text(json.dumps(meta | {"w": [100, 100]}))
-    with pytest.raises(CaptureError, match=r"w lists 2 sizes and cam_id 3 cameras; give one per camera"):
+    with pytest.raises(CaptureError, match=r"w has 2 values for 3 cameras \(cam_id\); give one per camera"):
         open_capture(tmp_path / "out")
 
 

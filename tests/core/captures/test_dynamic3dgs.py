@@ -188,14 +188,14 @@ ELSEWHERE[1][0][3] = 0.01
         ({"k": [[[1, 2], [3, 4]]]}, r"k must have shape \[3, 3, 3, 3\]"),
         ({"k": [[1, 2], [3]]}, "k must be numbers"),
         ({"k": [[[["a"] * 3] * 3] * 3] * 3}, "k must be numbers"),
-        ({"k": [[[[9.0, 0, float("nan")], [0, 9.0, 3], [0, 0, 1]]] * 3] * 3}, "camera '0': intrinsics holds NaN"),
+        ({"k": [[[[9.0, 0, float("nan")], [0, 9.0, 3], [0, 0, 1]]] * 3] * 3}, "camera '0': intrinsics contains NaN"),
         (
             {"w2c": [MOVED, MOVED, ELSEWHERE]},
-            "w2c of camera number 1 changes at frame 2; a rig's cameras must not move",
+            "w2c of camera number 1 changes at frame 2; the cameras of a rig must not move",
         ),
         ({"cam_id": [[0, 1, 3], [0, 1, 3], [1, 0, 3]]}, "cam_id of frame 2 differs"),
         ({"cam_id": []}, "cam_id must be a list of frames"),
-        ({"cam_id": [[0, 0, 3]] * 3}, "given twice: 0"),
+        ({"cam_id": [[0, 0, 3]] * 3}, "duplicates: 0"),
         ({"cam_id": [[0, 1, 2]] * 3}, "cam_id 2 is also in train_meta"),
         ({"fn": [["0/000000.png"] * 3] * 2}, "fn must list 3 frames"),
         ({"fn": [["0/000000.png"] * 2] * 3}, r"fn\[0\] must list 3 file names"),
@@ -211,7 +211,8 @@ def test_faults_of_the_cameras_are_named(folder, entries, message):
 
 
 def test_broken_json_is_named(folder):
-    for text, message in (("{", "is not JSON"), ("[]", "must hold a JSON object"), ('{"w": 3}', "has no h, k, w2c")):
+    faults = ("{", "is not valid JSON"), ("[]", "must contain a JSON object"), ('{"w": 3}', "has no h, k, w2c")
+    for text, message in faults:
         (folder / "train_meta.json").write_text(text)
         with pytest.raises(CaptureError, match=rf"train_meta\.json: {message}"):
             open_capture(folder)
@@ -227,7 +228,7 @@ def test_a_missing_mask_of_a_training_camera_is_named(folder):
 def test_test_cameras_must_have_the_same_frames(folder):
     short = {key: value[:2] if isinstance(value, list) else value for key, value in meta([2]).items()}
     change(folder / "test_meta.json", **short)
-    with pytest.raises(CaptureError, match=r"test_meta\.json: has 2 frames, train_meta\.json 3"):
+    with pytest.raises(CaptureError, match=r"test_meta\.json: has 2 frames, but train_meta\.json has 3"):
         open_capture(folder)
 
 

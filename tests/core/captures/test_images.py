@@ -89,7 +89,7 @@ def test_cmyk_animation_and_unknown_formats_are_refused():
     with pytest.raises(ImageError, match="colour mode CMYK"):
         decode_image(encoded(Image.new("CMYK", (4, 4)), "JPEG"), name="front.jpg")
     frames = [Image.fromarray(rgb(seed)) for seed in range(3)]
-    with pytest.raises(ImageError, match=r"front.png: holds 3 pictures"):
+    with pytest.raises(ImageError, match=r"front.png: contains 3 images"):
         decode_image(encoded(frames[0], save_all=True, append_images=frames[1:]), name="front.png")
     with pytest.raises(ImageError, match="cannot be read as a picture"):
         decode_image(encoded(frames[0], "GIF"))
@@ -122,7 +122,7 @@ def test_an_icc_profile_is_converted_to_srgb_and_srgb_itself_left_alone():
 
 def test_the_size_of_the_camera_is_checked_before_decoding():
     damaged = encoded(Image.fromarray(rgb()))[:60]  # the head is whole, the pixels are not
-    with pytest.raises(ImageError, match=r"cam3: is 8x6 pixels, the camera 16x12"):
+    with pytest.raises(ImageError, match=r"cam3: is 8x6 pixels, but the camera is 16x12"):
         decode_image(damaged, size=(16, 12), name="cam3")
 
 

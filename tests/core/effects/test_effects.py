@@ -95,11 +95,11 @@ def test_a_scene_without_a_floor_has_no_floor_term() -> None:
 @pytest.mark.parametrize(
     ("given", "fault", "remedy"),
     [
-        ({"effects": {"floor": "on"}}, "effects.floor cannot be 'on': the scene names no floor", "give scene.floor"),
+        ({"effects": {"floor": "on"}}, "effects.floor cannot be 'on': the scene has no floor plane", "set scene.floor"),
         (
             {"effects": {"rigidity": "on"}, "update": {"weights": {"rigidity": 0}}},
             "effects.rigidity cannot be 'on': update.weights.rigidity is 0",
-            "give it a weight above 0",
+            "set a weight above 0",
         ),
         ({"effects": {"flour": "off"}}, "flour is not an effect", "did you mean floor?"),
         ({"effects": {"floor": "maybe"}}, "Input should be 'auto', 'on' or 'off'", ""),

@@ -294,7 +294,7 @@ def test_an_engine_that_cannot_do_what_a_plan_asks_says_so_by_name() -> None:
         SceneSettings(), UpdateSettings(), ViewFactory(rig()), scene.structure.hierarchy, scene.previous
     )
     builder.plan = scene.plan
-    with pytest.raises(EngineError, match="engine colourless cannot compute: colours; switch the effect off") as error:
+    with pytest.raises(EngineError, match="engine colourless does not support: colours; disable the effect") as error:
         FrameUpdate(Colourless(), builder, None)
     assert error.value.asked == ("colours",)
 

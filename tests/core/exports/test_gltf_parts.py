@@ -103,7 +103,7 @@ def test_what_is_retired_in_the_first_frame_is_left_out(tmp_path):
 
 
 def test_times_must_rise(tmp_path):
-    with pytest.raises(InputError, match=r"time 1 s of frame 13 is not later than 1 s of the frame before"):
+    with pytest.raises(InputError, match=r"time 1 s of frame 13 is not later than 1 s of the previous frame"):
         written(tmp_path / "a.glb", [moving.state(0), moving.state(1)], times=[1.0, 1.0])
     with pytest.raises(InputError, match="there is no frame to export"):
         PartAsset(tmp_path / "a.glb", corner.WORLD, moving.LABELS).finish()

@@ -111,7 +111,7 @@ def test_those_that_are_not_there_do_not_count():
 
 def test_labels():
     assert part_labels(np.array([1, 0, 2]), 2).tolist() == [1, 0]
-    with pytest.raises(InputError, match="parts: no Gaussian of the first frame belongs to one"):
+    with pytest.raises(InputError, match="parts: no Gaussian of the first frame belongs to a part"):
         PartMotion(np.full(10, -1), moving.state(0), corner.WORLD)
     with pytest.raises(InputError, match=r"parts: labels have shape \(2,\) and type float64"):
         part_labels(np.array([0.0, 1.0]), 2)

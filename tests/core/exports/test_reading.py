@@ -102,7 +102,7 @@ def test_numbered_ply_comes_back_where_all_files_have_the_same(tmp_path):
         assert back.ids.tolist() == list(range(len(truth)))
         corner.assert_same(found(back, read), corner.wanted(truth), **limits)
     other = open_export(written(tmp_path / "other", "ply", sequence(changes=True)), RATE)
-    with pytest.raises(InputError, match=r"frame_000006.ply has other Gaussians than frame_000005.ply"):
+    with pytest.raises(InputError, match=r"frame_000006.ply has different Gaussians from frame_000005.ply"):
         list(other.states())
 
 

@@ -131,7 +131,7 @@ def test_an_error_leaves_nothing_half_written(tmp_path, format, zipped):
 def test_an_empty_range(tmp_path, format):
     each = FORMATS[format]
     out = tmp_path / ("out" if each.numbered else f"a{each.suffixes[0]}")
-    with pytest.raises(InputError, match="states has no frame; give a range that holds at least one"):
+    with pytest.raises(InputError, match="states has no frames; give a range that contains at least one"):
         exported(out, format, [])
     assert not list(tmp_path.iterdir())
 
@@ -155,7 +155,7 @@ def test_what_is_refused(tmp_path):
     for format in ("glb-parts", "poses"):
         with pytest.raises(InputError, match=f"parts is None, but format '{format}' requires parts; give one label"):
             export_sequence(states(), format, tmp_path / "a.glb", world=corner.WORLD)
-    with pytest.raises(InputError, match=r"out '.*a\.glb' is not a file name for format 'usd'; let it end in \.usdc"):
+    with pytest.raises(InputError, match=r"out '.*a\.glb' has the wrong suffix for format 'usd'; use \.usdc"):
         exported(tmp_path / "a.glb", "usd")
     with pytest.raises(InputError, match=r"frames_per_second is 0; give a positive number, or None"):
         exported(tmp_path / "a.usda", "usd", frames_per_second=0)

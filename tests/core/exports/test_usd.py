@@ -192,7 +192,7 @@ def test_given_up_and_refused_nothing_is_left(tmp_path):
     sequence.discard()
     with pytest.raises(InputError, match="there is no frame to export"):
         UsdSequence(tmp_path / "a.usdc", corner.WORLD).finish()
-    with pytest.raises(InputError, match=r"out 'a\.fbx' has no suffix of USD; give one of \.usdc"):
+    with pytest.raises(InputError, match=r"out 'a\.fbx' has no USD suffix; use one of \.usdc"):
         UsdSequence(tmp_path / "a.fbx", corner.WORLD)
     with pytest.raises(InputError, match=r"out '.*a\.usdc' cannot be written"):
         UsdSequence(tmp_path / "no" / "a.usdc", corner.WORLD)

@@ -33,7 +33,7 @@ def test_it_is_named_in_the_report_and_in_a_warning() -> None:
     scene = Reconstruction.start(RIG, frames[0], settings, points=points)
     assert scene.report is not None
     assert scene.report.grey == [NAMES[1]]
-    told = [sentence for sentence in scene.report.warnings if sentence.startswith("grey cameras")]
+    told = [sentence for sentence in scene.report.warnings if sentence.startswith("grayscale cameras")]
     assert len(told) == 1
     assert f"colour ones: {NAMES[1]}; " in told[0]
     assert told[0] in first_warnings(scene.history.report(0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from scas4d_core.engines.choose import fit_engine_of, renderer_of
 from scas4d_core.engines.cpu.gloss import GlossShading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, SCALE, FitLoss, FitScalars
 from scas4d_core.engines.limits import scene_limits
+from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.fit.exposures import Exposures
 from scas4d_core.fit.gaussian_fit import BETA1, BETA2, FitStep, GaussianFit, each_once
@@ -20,9 +23,24 @@ from scas4d_core.kernels.appearance.direction import CELLS
 from scas4d_core.update.view_factory import ViewFactory
 
 RIG, BOX = make_rig(), make_box()
-RENDERER = renderer_of("cpu", (0.1, 0.2, 0.3), scene_limits("auto", RIG.radius))
+DEVICES = ["cpu", "gpu"] if importlib.util.find_spec("warp") else ["cpu"]
+"""Without a GPU, "gpu" runs the Warp engine on Warp's CPU device."""
+RENDERERS: dict[str, Renderer] = {}
 COUNT = 150
 ALL = np.full(COLUMNS, 1e-3, np.float32)
+
+
+@pytest.fixture(params=DEVICES, autouse=True)
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Runs each test on each engine."""
+    use(request.param)
+    return str(request.param)
+
+
+def use(device: str) -> None:
+    """Selects the engine of the following fits."""
+    os.environ.setdefault("SCAS4D_WARP_DEVICE", "cpu")
+    RENDERERS["now"] = renderer_of(device, (0.1, 0.2, 0.3), scene_limits("auto", RIG.radius))
 
 
 def make_views() -> list[TrainingView]:
@@ -39,7 +57,7 @@ def table(seed: int = 0) -> np.ndarray:
 
 
 def make_fit(parameters: np.ndarray | None = None, mask_weight: float = 0.0, **more: Any) -> GaussianFit:
-    engine = fit_engine_of(RENDERER, mask_weight)
+    engine = fit_engine_of(RENDERERS["now"], mask_weight)
     return GaussianFit(engine, make_views(), table() if parameters is None else parameters, **more)
 
 
@@ -110,8 +128,8 @@ def test_glossy_fixed_gaussians_are_drawn_as_each_camera_sees_them() -> None:
     clear[:, OPACITY] = -20
     fit = make_fit(clear, fixed=[glossy] * len(RIG.cameras))
     fit.run(range(len(RIG.cameras)), lambda now: FitScalars(0 * ALL))
-    assert fit.psnr == [pytest.approx(RENDERER.compare(glossy, view).psnr, rel=1e-5) for view in fit.views]
-    assert abs(fit.psnr[0] - RENDERER.compare(BOX, fit.views[0]).psnr) > 1
+    assert fit.psnr == [pytest.approx(RENDERERS["now"].compare(glossy, view).psnr, rel=1e-5) for view in fit.views]
+    assert abs(fit.psnr[0] - RENDERERS["now"].compare(BOX, fit.views[0]).psnr) > 1
 
 
 def test_a_fit_with_no_fixed_gaussians_in_a_view_has_the_bits_of_one_without() -> None:
@@ -182,8 +200,45 @@ def test_exposures_are_learnt_where_they_are_given() -> None:
     assert all((view.exposure == (1, 0)).all() for view in fit.views)
     views = make_views()
     learnt = Exposures(views, True, 1e-3, BETA1, BETA2)
-    fit = GaussianFit(fit_engine_of(RENDERER), views, table(), exposures=learnt)
+    fit = GaussianFit(fit_engine_of(RENDERERS["now"]), views, table(), exposures=learnt)
     fit.run([0, 1, 2], lambda now: FitScalars(0 * ALL))
     gains = np.array([view.exposure[:3, 0] for view in views])
     assert (gains[:3] != 1).all()
     np.testing.assert_allclose(gains.mean(axis=0), 1, atol=1e-6)
+
+
+@pytest.mark.skipif(len(DEVICES) < 2, reason="NVIDIA Warp is not installed: pip install warp-lang")
+@pytest.mark.parametrize("case", ["plain", "masks", "fixed", "gloss", "exposures"])
+def test_the_engines_agree(case: str) -> None:
+    ends = {}
+    for device in DEVICES:
+        use(device)
+        more: dict[str, Any] = {}
+        if case == "fixed":
+            more["fixed"] = [BOX.rows(np.arange(10 * k)) for k in range(len(RIG.cameras))]
+        if case == "gloss":
+            normals = (BOX.means[:COUNT] / np.linalg.norm(BOX.means[:COUNT], axis=1, keepdims=True)).astype(np.float32)
+            more["gloss"] = GlossShading.fresh(0.5 * normals, table()[:, MEAN])
+        fit = make_fit(mask_weight=3.0 * (case == "masks"), statistics=True, **more)
+        if case == "exposures":
+            fit.exposures = Exposures(fit.views, True, 1e-2, BETA1, BETA2)
+        fit.run([0, 1, 2, 3, 0, 1], lambda now: FitScalars(ALL, colour_shift=True))
+        ends[device] = fit
+    mine, true = ends["gpu"], ends["cpu"]
+    assert mine.losses == pytest.approx(true.losses, rel=1e-3)
+    assert mine.psnr == pytest.approx(true.psnr, rel=1e-3)
+    before = table()
+    changes = [fit.table.parameters - before for fit in (mine, true)]
+    assert np.linalg.norm(changes[0] - changes[1]) < 0.05 * np.linalg.norm(changes[1])
+    for name in ("screen_gradients", "rendered", "factors"):
+        one, other = (getattr(fit.table.statistics, name) for fit in (mine, true))
+        assert np.linalg.norm(one - other) < 0.01 * np.linalg.norm(other), name
+    if case == "gloss":
+        assert mine.table.gloss is not None
+        assert true.table.gloss is not None
+        for name in ("gloss", "environment"):
+            one, other = (getattr(fit.table.gloss, name) for fit in (mine, true))
+            assert np.linalg.norm(one - other) < 0.01 * np.linalg.norm(other), name
+    exposures = [np.stack([view.exposure for view in fit.views]) for fit in (mine, true)]
+    np.testing.assert_allclose(*exposures, atol=1e-4)
+    assert (case == "exposures") == bool(np.ptp(exposures[0][:, 0, 0]) > 1e-3)

@@ -167,5 +167,5 @@ def test_layers_that_rest_are_applied_once_and_all_else_keeps_its_bits(kind: Lit
 def test_the_last_layer_does_not_rest() -> None:
     labels = np.zeros(5, np.int32)
     model = CpuDeformation(Hierarchy(np.arange(5), (labels,), (starts_of(labels),)), None, np.ones((5, 3)), "centred")
-    with pytest.raises(ValueError, match="1 of 1 layers cannot be frozen"):
+    with pytest.raises(ValueError, match="cannot freeze 1 of 1 layers"):
         model.freeze_layers(1)

@@ -111,7 +111,7 @@ def test_lpips_without_package_or_weights_says_so_and_fetches_nothing(monkeypatc
 
 @pytest.mark.parametrize("metric", [psnr, ssim, flip, lpips])
 def test_faults_are_named(metric):
-    with pytest.raises(ValueError, match="render at the size of the truth"):
+    with pytest.raises(ValueError, match="render at the ground-truth size"):
         metric(noise(0), noise(0, (24, 30, 3)))
     with pytest.raises(ValueError, match="NaN"):
         metric(np.full((4, 4, 3), np.nan), np.zeros((4, 4, 3)))

@@ -164,7 +164,7 @@ def test_labels_are_matched_by_weight_as_a_whole():
 
 def test_refusals():
     history, _ = bodies(frames=2, n=4)
-    with pytest.raises(ValueError, match="count 99 must be between 1 and the 12 moving"):
+    with pytest.raises(ValueError, match="count 99 must be between 1 and 12, the number of moving"):
         parts(history, 99)
     with pytest.raises(ValueError, match="history is empty"):
         parts(History(), 2)

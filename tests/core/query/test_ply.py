@@ -95,7 +95,7 @@ def test_bad_rows_are_named_and_nothing_is_written(tmp_path):
     theta = state(random_factors(6))
     means = theta.means.copy()
     means[[2, 4], 1] = np.nan
-    with pytest.raises(PlyError, match=r"2 Gaussians have means not finite: rows \[2, 4\], ids \[52, 54\]"):
+    with pytest.raises(PlyError, match=r"2 Gaussians have non-finite means: rows \[2, 4\], ids \[52, 54\]"):
         write_ply(tmp_path / "f.ply", theta.replace(means=means), WORLD)
     factors = theta.factors.copy()
     factors[3, :, 0] = 0

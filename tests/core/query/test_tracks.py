@@ -212,7 +212,7 @@ def test_pixels_go_along_their_rays_and_report_what_met_no_surface(monkeypatch):
     assert tracks.visibility["c"][0, 1] == np.False_
     monkeypatch.setattr("scas4d_core.query.tracks.PIXEL_REACH", 1)
     assert tracks_of_pixels(history, WORLD, user_camera, uv, 0, FRAMES, depth).ids[2] == -1
-    with pytest.raises(ValueError, match=r"pixel \[64\.0, 3\.0\] \(query 1\) lies outside"):
+    with pytest.raises(ValueError, match=r"pixel \[64\.0, 3\.0\] \(query 1\) is outside"):
         tracks_of_pixels(history, WORLD, user_camera, np.array([[1, 1], [64, 3]]), 0, FRAMES, depth)
 
 
@@ -220,13 +220,13 @@ def test_tracks_of_ids_are_the_means():
     history, rest = rigid_history()
     tracks = tracks_of_ids(history, WORLD, np.array([30, 0]), [4, 2])
     np.testing.assert_allclose(tracks.positions, truth(rest[[10, 0]])[[4, 2]], atol=1e-4)
-    with pytest.raises(ValueError, match=r"ids \[31\] are not Gaussians"):
+    with pytest.raises(ValueError, match=r"ids \[31\] do not exist"):
         tracks_of_ids(history, WORLD, np.array([31]), [0])
 
 
 def test_refusals():
     history, _ = rigid_history(10)
-    with pytest.raises(ValueError, match=r"points \[1\] hold NaN"):
+    with pytest.raises(ValueError, match=r"points \[1\] contain NaN"):
         tracks_of_points(history, WORLD, np.array([[0, 0, 0], [np.nan, 0, 0]]), 0, FRAMES)
     with pytest.raises(ValueError, match=r"give \[Q, 3\]"):
         tracks_of_points(history, WORLD, np.zeros(3), 0, FRAMES)

@@ -154,7 +154,7 @@ def test_a_camera_that_was_left_out_has_that_alarm_alone(past: Past) -> None:
         (AlarmKind.CAMERA_LEFT_OUT, "b"), (AlarmKind.CAMERA_LEFT_OUT, "c"),
     ]  # fmt: skip
     assert "it shows nothing" in found[0].evidence
-    assert "no picture came" in found[1].evidence
+    assert "no image was received" in found[1].evidence
 
 
 def test_what_alarms_are_told_from_goes_through_arrays(past: Past) -> None:

@@ -85,7 +85,7 @@ def test_a_light_that_stays_is_taken_on(light: float, masks: bool) -> None:
     found, reports, scene = run([1.0] * FROM + [light] * (LAST - FROM + 1), masks)
     usual, _, other = run([light] * (LAST + 1), masks)
     accepted = reports[FROM - 1 + PATIENCE - 1]
-    assert "the light, for good" in accepted.attempts[0]
+    assert "the lighting, permanently" in accepted.attempts[0]
     for report in reports[FROM - 1 + PATIENCE :]:
         assert (report.exposure, report.degraded, report.dropped) == (1.0, None, {})
     assert found[-1] >= usual[-1] - WITHIN_DB
@@ -143,7 +143,7 @@ def test_a_light_that_goes_on_is_followed_at_once(light: list[float]) -> None:
     usual, _, _ = run([light[-1]] * len(light), masks=True)
     steps = [now / before for before, now in pairwise(light)]
     alike = [1 / EXPOSURE < steps[0] < EXPOSURE] + [1 / ALIKE < now / before < ALIKE for before, now in pairwise(steps)]
-    assert any("for good" in report.attempts[0] for report in reports)
+    assert any("permanently" in report.attempts[0] for report in reports)
     assert all(report.exposure == 1.0 for report, like in zip(reports, alike, strict=True) if like)
     assert found[-1] >= usual[-1] - GOING_DB
 

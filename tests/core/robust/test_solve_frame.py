@@ -156,7 +156,7 @@ def test_an_unmet_frame_is_sought_longer_and_from_where_the_update_ended() -> No
 def test_what_is_sought_from_where_an_update_ended_has_the_motion_of_both() -> None:
     fake = Fake(met(LEVEL - 3))
     outcome, _ = solve(fake, given(replace(PAST, rejected=1)))
-    assert names(fake) == ["as set", "on from where the update ended"]
+    assert names(fake) == ["as set", "continued from the end of the update"]
     np.testing.assert_array_equal(fake.starts[1].means, AFTER.means)
     np.testing.assert_array_equal(fake.starts[1].colours, BEFORE.colours)  # not those that followed it astray
     assert outcome.motion is MOTION  # no better: the first is taken
@@ -245,7 +245,7 @@ def test_pictures_that_stay_brighter_in_the_same_light_are_not_held_for_ever() -
         assert (not outcome.outcome.rejected) == (number == SETTINGS.max_rejected_frames)
     assert outcome.gaussians is AFTER
     np.testing.assert_array_equal(fake.starts[0].colours, BEFORE.colours)
-    assert outcome.attempts == ["the same light, for good", "as set"]
+    assert outcome.attempts == ["unchanged lighting, permanently", "as set"]
     assert (check_brightness(past, bright), past.light_frames) == ((1.0, {}, None), 0)
 
 
@@ -286,7 +286,7 @@ def test_what_is_found_again_as_patience_ends_is_the_scene_as_it_was() -> None:
     past = replace(PAST, updates=5, rejected=SETTINGS.max_rejected_frames - 1)
     outcome, after = solve(Fake(met(LEVEL - 20), met(LEVEL - 4)), given(past))
     assert not outcome.outcome.rejected
-    assert "sought" in outcome.reason
+    assert "search" in outcome.reason
     assert (after.updates, after.level) == (6, LEVEL)
 
 

@@ -213,7 +213,7 @@ def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, mo
         {"outcome": FrameOutcome.REJECTED_MISFIT},
         {"outcome": FrameOutcome.RELOCATED},
         {"exposure": 1.1},
-        {"attempts": ["as set", "sought again"]},
+        {"attempts": ["as set", "longer search"]},
         {"trace": replace(result.trace, kept=Candidate.PREVIOUS)},
         {"trace": replace(result.trace, shown={})},  # as on a GPU
     ):

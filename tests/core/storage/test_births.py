@@ -264,5 +264,5 @@ def test_a_frame_is_written_anew_with_its_log(tmp_path: Path) -> None:
     history.replace(BORN_AT, 0.1, arrays, {})
     check(history)
     check(History.load(tmp_path))
-    with pytest.raises(HistoryError, match="cannot replace"):
+    with pytest.raises(HistoryError, match="cannot be replaced"):
         history.replace(BORN_AT, 0.1, base.arrays(), {})

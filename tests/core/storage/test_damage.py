@@ -87,7 +87,7 @@ def test_a_file_without_checksums_is_refused(tmp_path):
         np.savez(opened, **small_state())
     for read in (verify, read_npz):
         with pytest.raises(
-            ValueError, match=r"^file\.npz is damaged, or no npz file \(ValueError: it has no checksums"
+            ValueError, match=r"^file\.npz is damaged or not an npz file \(ValueError: the file has no checksums"
         ):
             read(file)
 
@@ -181,7 +181,7 @@ def test_a_damaged_state_is_left_out_until_another_file_is_there(tmp_path):
     assert reader.refresh((2,)) == ([2], [])
     assert same(reader.gaussians(2), state(7).replace(opacities=state(0).opacities))
     assert reader.report(2) == {"recomputed": True}
-    with pytest.raises(HistoryError, match="frame 10 cannot replace"):
+    with pytest.raises(HistoryError, match="frame 10 cannot be replaced"):
         writer.replace(10, 9.0, arrays, {})
 
 
@@ -191,7 +191,7 @@ def test_a_state_that_somebody_deleted_is_told(tmp_path):
     (tmp_path / "frame_000004.npz").unlink()
     with pytest.raises(HistoryError, match="frame 4 is not in the history"):
         reader.gaussians(4)
-    assert reader.pop_faults() == {"frame_000004.npz": "frame_000004.npz is gone"}
+    assert reader.pop_faults() == {"frame_000004.npz": "frame_000004.npz is missing"}
 
 
 def test_no_message_has_a_path(tmp_path):

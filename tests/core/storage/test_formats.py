@@ -46,8 +46,8 @@ def with_format(folder: Path, written: int | None) -> None:
 @pytest.mark.parametrize("frames", [0, FRAMES])
 @pytest.mark.parametrize(
     ("format_", "said"),
-    [(7, "states, a folder of states, has format 7; this scas4d reads format 1: use the scas4d that wrote it"),
-     (None, "states, a folder of states, names no format; this scas4d reads format 1: use the scas4d that wrote it")],
+    [(7, "states, a folder of states, has format 7; this version reads format 1: use the version"),
+     (None, "states, a folder of states, has no format number; this version reads format 1: use the version")],
 )  # fmt: skip
 def test_a_folder_of_states_of_another_format(format_: int | None, said: str, frames: int, tmp_path: Path) -> None:
     folder = tmp_path / "states"

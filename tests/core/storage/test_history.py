@@ -76,7 +76,7 @@ def test_damage_is_found_and_the_file_named(tmp_path):
 
 def test_refusals_name_what_is_wrong(tmp_path):
     history = filled(History(tmp_path), 2)
-    with pytest.raises(HistoryError, match="frame 2 comes after frame 2"):
+    with pytest.raises(HistoryError, match="frame 2 is not after frame 2"):
         history.append(2, 0.0, state(2))
     with pytest.raises(HistoryError, match="ids differ"):
         history.append(3, 0.0, state(3).replace(ids=np.arange(7)))
@@ -84,11 +84,11 @@ def test_refusals_name_what_is_wrong(tmp_path):
         history.append(3, 0.0, state(3).replace(means=np.zeros((6, 3), np.float32)))
     with pytest.raises(HistoryError, match="frame 7 is not in the history; committed frames: 0 to 2"):
         history.gaussians(7)
-    with pytest.raises(HistoryError, match="not kept per frame"):
+    with pytest.raises(HistoryError, match="not stored per frame"):
         history.stacked("ids")
-    with pytest.raises(HistoryError, match="already holds a history"):
+    with pytest.raises(HistoryError, match="already contains a history"):
         History(tmp_path)
-    with pytest.raises(HistoryError, match="holds no history"):
+    with pytest.raises(HistoryError, match="contains no history"):
         History.load(tmp_path / "elsewhere")
 
 

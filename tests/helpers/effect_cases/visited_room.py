@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
 from scas4d_core.effects.evidence import FrameObservation
-from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.choose import Device, renderer_of
 from scas4d_core.engines.limits import scene_limits
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.result import UpdateResult, UpdateTrace
@@ -84,13 +84,18 @@ def known(centre: np.ndarray = BOX) -> Gaussians:
 
 
 def seen(
-    state: Gaussians, true: Gaussians, index: int = 5, masks: bool = True, carried: dict[str, Any] | None = None
+    state: Gaussians,
+    true: Gaussians,
+    index: int = 5,
+    masks: bool = True,
+    carried: dict[str, Any] | None = None,
+    device: Device = "cpu",
 ) -> FrameObservation:
     """A frame that shows ``true``, updated to ``state``."""
     rig = make_rig()
     factory = ViewFactory(rig)
     views = factory.views(take_frame(index, float(index), true, rig, masks), {})
-    renderer = CpuRenderer((0.0, 0.0, 0.0), limits=scene_limits("auto", rig.radius))
+    renderer = renderer_of(device, (0.0, 0.0, 0.0), scene_limits("auto", rig.radius))
     return FrameObservation(
         index, state, UpdateResult(state, None, UpdateTrace(), carried=carried or {}), rig, views, renderer
     )

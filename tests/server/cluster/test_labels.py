@@ -55,7 +55,7 @@ def test_ray_takes_what_the_request_takes(labels: dict[str, str]) -> None:
 
 @pytest.mark.parametrize("labels", BAD)
 def test_what_no_node_can_have_is_refused_with_the_rule(labels: dict[str, str]) -> None:
-    with pytest.raises(ValidationError, match=r"of a node.s label.*write names and values of 1 to 63 letters"):
+    with pytest.raises(ValidationError, match=r"for a node label.*use names and values of 1 to 63 letters"):
         SceneCreate(rig=RIG, nodes=labels)
 
 

@@ -178,7 +178,7 @@ def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes)
         late = next(id for id in waiting() if service.status(id).error)
         said = service.status(late)
         assert said.degraded
-        assert "its worker is not placed on a node yet; it needs 1 CPU and" in str(said.error)
+        assert "its worker is waiting for a node with 1 CPU and" in str(said.error)
         sent(service, late, range(1))
         for id in ids:
             if id not in waiting():

@@ -106,12 +106,12 @@ def test_ready_says_how_long_the_kernels_took(tmp_path, monkeypatch):
     try:
         assert httpx.get(f"{running.url}/health/live", timeout=HANG_S).json()["status"] == "live"
         early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
-        assert "being loaded" in problem(early, 503)["detail"]
+        assert "have been loading" in problem(early, 503)["detail"]
         assert early.headers["retry-after"] == "1"
         while "kernels" not in early.json():  # until the process beside has told how far it is
             early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
         assert (early.json()["kernels_compiled"], early.json()["kernels"]) == (1, 3)
-        assert early.json()["detail"].endswith("compiles them: 1 of 3")
+        assert early.json()["detail"].endswith("they are compiled: 1 of 3")
         until.touch()
         answer = waited(running)
         assert answer.json()["ready_after"] > 0

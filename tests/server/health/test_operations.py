@@ -87,7 +87,7 @@ def test_it_ends_gracefully_in_the_middle_of_an_update(tmp_path, ending):
             assert time.monotonic() < until, "a process outlived the service"
             time.sleep(0.05)
         lines = [json.loads(line) for line in log.read_text().splitlines()]
-        assert lines[-1]["message"] == "ended"
+        assert lines[-1]["message"] == "stopped"
         assert not [line for line in lines if line["level"] == "error"]
     with served(tmp_path) as (process, url, log), Client(url) as sdk:  # everything is there
         assert sdk.wait(id, 1).state == "committed"

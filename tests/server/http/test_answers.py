@@ -77,7 +77,7 @@ def test_a_picture_comes_back_as_it_was_sent(http, sdk, committed, address):
     for index in (1, 2):
         sdk.put_frame(committed, index, sent)
     sdk.wait(committed, 2)
-    assert "not kept any more" in problem(http.get(f"{address}/cameras/{NAME}"), 404)["detail"]
+    assert "no longer stored" in problem(http.get(f"{address}/cameras/{NAME}"), 404)["detail"]
 
 
 def test_a_mask_comes_back_as_it_was_sent(http, sdk, scene):

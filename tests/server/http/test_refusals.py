@@ -9,6 +9,7 @@ from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import RigModel
+from scas4d_core.engines.choose import gpu_fault
 
 CUT_JPEG, CUT_PNG = picture(format="JPEG")[:-9], picture()[:-9]
 
@@ -41,7 +42,7 @@ QUERIES = {
     "tracks?pixels=1,2&camera=c0": ("pixels", "1,2", "'pixel'"),
     "tracks?pixel=99,2&camera=c0": ("pixels", "[99.0, 2.0]", "0 ≤ u < 24"),
     "tracks?pixel=1,2": ("camera", "nothing", "c0, c1"),
-    "tracks?ids=99": ("ids", "[99]", "from an answer"),
+    "tracks?ids=99": ("ids", "[99]", "in a response"),
     "tracks?ids=0&from=7": ("from", "7", "0 to 0"),
     "tracks": ("ids", "none", "exactly one of"),
     "parts?cont=3": ("cont", "3", "'count'"),
@@ -134,8 +135,18 @@ def test_a_device_without_an_engine_is_refused_with_the_reason(http):
     before = http.get("/v1/scenes").json()
     document = problem(http.post("/v1/scenes", json=body(settings={"device": "cuda"})), 422)
     assert (document["field"], document["value"]) == ("settings.device", "cuda")
-    assert "no engine" in document["detail"]
-    assert document["remedy"] == "give 'cpu'"
+    assert "is not supported" in document["detail"]
+    assert document["remedy"] == "give 'auto', 'cpu' or 'gpu'"
+    assert http.get("/v1/scenes").json() == before
+
+
+@pytest.mark.skipif(gpu_fault() is None, reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there_is_refused_with_the_reason(http):
+    before = http.get("/v1/scenes").json()
+    document = problem(http.post("/v1/scenes", json=body(settings={"device": "gpu"})), 422)
+    assert (document["field"], document["value"]) == ("settings.device", "gpu")
+    assert document["detail"] == f"no GPU can be used: {gpu_fault()}"
+    assert document["remedy"] == "give 'auto' or 'cpu', or see docs/gpu.md"
     assert http.get("/v1/scenes").json() == before
 
 

@@ -190,7 +190,7 @@ def test_a_token_that_was_changed_opens_nothing(running, owner, scenes):
     )
     for other in others:
         with bearer(running, other) as http:
-            assert "wrong" in problem(http.get(f"/v1/scenes/{shown}"), 401)["detail"]
+            assert "invalid" in problem(http.get(f"/v1/scenes/{shown}"), 401)["detail"]
 
 
 def test_what_cannot_be_shared(running, owner, tmp_path):

@@ -32,12 +32,12 @@ BAD = {
     "truncated JPEG": (lambda: picture(format="JPEG")[:-5], "bytes", "again from its source"),
     "truncated PNG": (lambda: picture()[:-5], "bytes", "again from its source"),
     "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "again from its source"),
-    "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "size the camera was"),
+    "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "for which the camera was"),
     "16 bits": (sixteen_bits, "16 bits", "convert the picture to 8 bits"),
-    "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send RGB or grey"),
+    "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send 8-bit RGB"),
     "animated PNG": (animated, "animated", "one picture per file"),
     "animated WebP": (animated_webp, "animated", "one picture per file"),
-    "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "size the camera was"),
+    "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "for which the camera was"),
     "no picture": (lambda: b"GIF89a or so", "bytes", "encode the picture"),
 }
 

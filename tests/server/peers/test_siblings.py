@@ -198,7 +198,7 @@ def test_handshakes_are_refused_with_the_others_words(services, other):
     url = str(second.base_url).replace("http", "ws").rstrip("/")
     with pytest.raises(Exception, match="400") as refused:
         connect(f"{url}/v1/scenes/{id}/stream", additional_headers=HEADERS if token else {})
-    assert "offers no subprotocol" in refused.value.response.body.decode()
+    assert "offers no supported subprotocol" in refused.value.response.body.decode()
 
 
 def test_who_may_only_read_one_scene_may_no_more_elsewhere(services, other):
@@ -222,7 +222,7 @@ def test_a_service_that_does_not_answer_is_no_scene_that_is_not_there(services, 
     GONE.append("http://127.0.0.1:9")
     try:
         answer = second.get(f"/v1/scenes/{NOBODYS}")
-        assert problem(answer, 503)["remedy"].startswith("ask again")
+        assert problem(answer, 503)["remedy"].startswith("try again")
         assert answer.headers["retry-after"]
         assert second.get("/v1/scenes").headers["x-unreachable"] == "http://127.0.0.1:9"
         assert second.get(f"/v1/scenes/{id}").status_code == 200

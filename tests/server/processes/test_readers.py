@@ -145,7 +145,7 @@ def test_too_many_questions_are_refused(scene, monkeypatch):
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
     wait_for(lambda: readers.bulk._waiting)
     refused = http.get(f"/v1/scenes/{id}/parts")
-    assert problem(refused, 503)["detail"] == "1 question of this scene are already waiting"
+    assert problem(refused, 503)["detail"] == "this scene already has 1 waiting request"
     assert refused.headers["retry-after"] == "1"
     assert not hanging.done()
 

@@ -143,7 +143,7 @@ def test_a_state_in_the_middle_is_made_again_from_its_pictures(tmp_path, found_b
             http, sdk = stack.enter_context(serving(tmp_path, **NEVER))
         if found_by == "reading":
             assert view(http, id, 2).status_code in (404, 503)
-        status_with(http, id, "made again from its pictures")
+        status_with(http, id, "recomputed from its images")
         eventually(lambda: view(http, id, 2).status_code == 200)
         report = http.get(f"/v1/scenes/{id}/frames/2").json()
         assert report["recomputed"] is True
@@ -162,7 +162,7 @@ def test_what_cannot_be_made_again_is_named_and_the_rest_goes_on(tmp_path):
         id = filled(http, sdk, keep_frames={"last": 2})
         flip(tmp_path / "scenes" / id / "states" / "frame_000002.npz")
         status = status_with(http, id, "the state of frame 2")
-        assert "its pictures are no longer held" in status["damage"][-1]
+        assert "its images are no longer stored" in status["damage"][-1]
         assert status["committed"] == 7
         said = problem(view(http, id, 2), 404)
         assert "frame 2 was damaged" in said["detail"]
@@ -252,7 +252,7 @@ def test_a_frame_is_acknowledged_into_a_journal_that_has_its_name(tmp_path):
         id = filled(http, sdk, 3)
         (tmp_path / "scenes" / id / "journal.log").unlink()
         assert put(http, id, 3).status_code == 202
-        assert "journal.log is gone" in http.get(f"/v1/scenes/{id}").json()["damage"][0]
+        assert "journal.log is missing" in http.get(f"/v1/scenes/{id}").json()["damage"][0]
     with serving(tmp_path, **NEVER) as (http, sdk):
         status = settled(http, id)
         assert (status["damage"], status["next_frame"], status["committed"]) == ([], 4, 4)

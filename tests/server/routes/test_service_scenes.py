@@ -153,11 +153,11 @@ def test_a_bad_scene_is_refused_by_name(http, name):
 def test_labels_of_nodes_need_a_cluster(http):
     found = problem(http.post("/v1/scenes", json={"rig": rig_json(), "nodes": {"rig": "stage-a"}}), 422)
     assert (found["field"], found["value"]) == ("nodes", "{'rig': 'stage-a'}")
-    assert found["remedy"] == "leave it out, or run the service on a cluster: scas4d serve --placement ray"
+    assert found["remedy"] == "omit it, or run the service on a cluster: scas4d serve --placement ray"
     bad = problem(http.post("/v1/scenes", json={"rig": rig_json(), "nodes": {"rig": "stage a"}}), 422)
     assert (bad["field"], bad["detail"]) == (
         "body.nodes",
-        "body.nodes: 'stage a' cannot be the value of a node's label",
+        "body.nodes: 'stage a' is not a valid value for a node label",
     )
 
 
@@ -190,7 +190,7 @@ def test_points_come_before_the_first_frame(http, sdk, scene):
     sdk.put_frame(scene, 0, pictures())
     assert sdk.wait(scene, 0).gaussians == 3  # the fake starts one Gaussian a point
     assert sdk.put_points(scene, points) == receipt
-    with pytest.raises(ServiceError, match="begun already, without these points"):
+    with pytest.raises(ServiceError, match="already started without these points"):
         sdk.put_points(scene, InitialPoints(points.positions + 1, points.colours))
 
 
@@ -295,7 +295,7 @@ def test_poses_the_wrong_way_round_are_a_warning(http, sdk):
         cloud = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3))
         sdk.put_points(id, InitialPoints(cloud, np.zeros((50, 3), np.float32)))
         (said,) = sdk.scene(id).warnings
-        assert "the poses seem to be the wrong way round" in said
+        assert "the poses seem to be inverted" in said
     finally:
         sdk.delete_scene(id)
 

@@ -153,7 +153,7 @@ def test_committed_frames_are_dropped_only_if_the_request_says_so(http, sdk, mak
     assert sdk.wait(id, 3).state == "committed"
     found = reports(http, id)
     assert [found[index]["state"] for index in range(4)] == ["failed", "failed", "committed", "committed"]
-    assert found[0]["error"] == found[1]["error"] == "the reconstruction begins with frame 2"
+    assert found[0]["error"] == found[1]["error"] == "the reconstruction starts with frame 2"
     after = settled(http, id)
     assert (after["first_frame"], after["first_committed"], after["committed"]) == (2, 2, 2)
     assert (after["state"], after["degraded"]) == ("ready", False)
@@ -175,7 +175,7 @@ def test_it_may_begin_with_a_frame_still_to_come(http, sdk, make):
     assert (waiting["state"], waiting["queued"], waiting["error"]) == ("awaiting_first_frame", 0, None)
     for index in (1, 2):
         put_form(http, id, index, pictures(fakes.RAISES))
-        assert sdk.frame(id, index).error == "the reconstruction begins with frame 3"
+        assert sdk.frame(id, index).error == "the reconstruction starts with frame 3"
     assert status(http, id)["state"] == "awaiting_first_frame"
     put_form(http, id, 3)
     assert sdk.wait(id, 3).state == "committed"
@@ -200,8 +200,8 @@ def test_pictures_that_are_deleted_cannot_be_begun_with(http, sdk, make):
         sdk.wait(id, index)
     wait_for(lambda: status(http, id)["frames_kept"] == 2)
     refused = problem(begin(http, id, 1, discard=True), 409)
-    assert (refused["detail"], refused["expected"]) == ("the pictures of frame 0 are deleted", 4)
-    assert "begin with frame 4" in refused["remedy"]
+    assert (refused["detail"], refused["expected"]) == ("the pictures of frame 0 were deleted", 4)
+    assert "start with frame 4" in refused["remedy"]
     begun(http, id, 1, discard=True, frame=4)
     sdk.wait(id, 5)
     assert settled(http, id)["committed"] == 2
@@ -230,7 +230,7 @@ def test_points_of_the_next_reconstruction(http, sdk, service, make):
     sdk.wait(id, 0)
     with pytest.raises(Exception, match=r"send them with \?reconstruction=1"):
         sdk.put_points(id, cloud(5))
-    with pytest.raises(Exception, match="comes after another one"):
+    with pytest.raises(Exception, match="is not the next one"):
         sdk.put_points(id, cloud(5), reconstruction=2)
     receipt = sdk.put_points(id, cloud(5), reconstruction=1)
     assert (receipt.points, receipt.reconstruction) == (5, 1)

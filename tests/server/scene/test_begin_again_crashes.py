@@ -182,8 +182,8 @@ def test_damage_of_the_journal_or_the_definition_costs_no_state(tmp_path):
                     assert now == reports[id]
                 else:  # that frame 3 was set aside is lost: there is no state of it
                     assert [report["state"] for report in now if report["index"] != 3] == [*AFTER[:3], AFTER[4]]
-                    assert now[3]["error"] == (NO_STATE if how == "journal" else "found gone")
-                assert now[0]["error"] == "the reconstruction begins with frame 2"
+                    assert now[3]["error"] == (NO_STATE if how == "journal" else "found missing")
+                assert now[0]["error"] == "the reconstruction starts with frame 2"
     with serving(tmp_path) as (http, sdk):
         for id in ids:
             assert put_form(http, id, 5).status_code == 202
@@ -231,7 +231,7 @@ def test_what_happened_to_frames_before_is_forgotten_and_frames_of_old_states_ar
     assert ledger.waiting() == [1, 2, 3]
     ledger.apply(begun(2, 0))
     assert ledger.waiting() == [1, 2, 3]
-    assert "were deleted before" in ledger.frames[0].error
+    assert "had been deleted" in ledger.frames[0].error
     ledger.reconcile([1, 2], {})
     assert (list(ledger.committed), ledger.waiting()) == ([1, 2], [3])
 
@@ -247,7 +247,7 @@ def test_a_scene_whose_states_are_lost_begins_again(tmp_path):
     with serving(tmp_path) as (http, sdk):
         wait_for(lambda: status(http, id)["state"] == "failed")
         found = status(http, id)
-        assert "cannot be gone on from" in found["error"]
+        assert "cannot resume from the committed states" in found["error"]
         assert f"PUT /v1/scenes/{id}/reconstructions/1" in found["error"]
         assert begin(http, id).status_code == 200
         assert sdk.wait(id, FRAMES - 1).state == "committed"

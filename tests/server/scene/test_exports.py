@@ -150,7 +150,7 @@ def test_exports_wait_for_each_other_and_can_be_cancelled(ran, http, service):
         found = sdk.export(id, one.id)
         assert found.state in ("cancelled", "done")  # the first may have been quicker
         if found.state == "cancelled":
-            assert found.error == "it was cancelled"
+            assert found.error == "the export was cancelled"
             assert problem(http.get(f"/v1/scenes/{id}/exports/{one.id}/file"), 409)["detail"].endswith("cancelled")
             assert not manager.get(id, one.id).spec.file.parent.exists()
     assert sdk.export(id, second.id).state == "cancelled"

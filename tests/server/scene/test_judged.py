@@ -114,14 +114,14 @@ def test_one_dark_camera_is_left_out_by_name(served):
     index = sdk.scene(id).next_frame
     report = put(sdk, id, index, ["c2"])
     assert report.degraded is None
-    assert "shows nothing" in report.dropped_cameras["c2"]
+    assert "is dark" in report.dropped_cameras["c2"]
     assert "c2" not in report.used_cameras
     assert len(report.used_cameras) == 5
-    assert "c2: it shows nothing" in sdk.scene(id).error
+    assert "c2: its image is dark" in sdk.scene(id).error
     assert metric(sdk, "scas4d_cameras_left_out_total") == left_out + 1
     assert metric(sdk, 'scas4d_alarms_total{kind="camera_left_out"}') == raised + 1
     assert [(alarm.kind.value, alarm.camera) for alarm in report.alarms] == [("camera_left_out", "c2")]
-    assert "shows nothing" in report.alarms[0].evidence
+    assert "is dark" in report.alarms[0].evidence
     assert [alarm.kind.value for alarm in sdk.frame(id, 3).alarms] == []
 
 

@@ -82,7 +82,7 @@ def test_states_that_cannot_be_taken_over_are_tried_again(tmp_path, monkeypatch,
     monkeypatch.setattr(worker_process, "begin_epoch", faulty)
     with service(tmp_path, Machines) as http:
         id = create(http)
-        wait_for(lambda: "the committed states cannot be taken over: " in (status(http, id)["error"] or ""))
+        wait_for(lambda: "cannot take over the committed states: " in (status(http, id)["error"] or ""))
         sent(http, id, [0])
         committed(http, id, 1)
         assert len(faults) == 2

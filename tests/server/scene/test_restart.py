@@ -72,7 +72,7 @@ def test_warnings_of_points_are_found_again(tmp_path):
         assert sdk.scene(id).warnings == []
         sdk.put_points(id, InitialPoints(cloud, np.zeros((50, 3), np.float32)))
         (said,) = sdk.scene(id).warnings
-        assert "the wrong way round" in said
+        assert "the poses seem to be inverted" in said
     with serving(tmp_path) as (_, sdk):
         assert sdk.scene(id).warnings == [said]
 
@@ -84,9 +84,9 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
         sdk.wait(id, 0)
         said = sdk.scene(id).warnings
         assert said[0].startswith("frame 0 is a guess")
-        assert "begin the reconstruction again with points" in said[0]
+        assert "restart the reconstruction with points" in said[0]
         assert said[1].startswith("frame 0 had too little time: no stereo; ")
-        assert said[2].startswith("grey cameras beside colour ones: c1; ")
+        assert said[2].startswith("grayscale cameras among colour ones: c1; ")
         assert len(said) == 3
         assert sdk.frame(id, 0).grey == ["c1"]
         assert sdk.frame(id, 0).shortened == ["no stereo"]
@@ -175,7 +175,7 @@ def test_a_damaged_definition_comes_back_from_the_journal_and_without_it_is_left
     with serving(tmp_path) as (http, _):
         after = http.get(f"/v1/scenes/{id}").json()
         assert without(after, "damage") == without(before, "damage")
-        assert "taken from the journal" in after["damage"][0]
+        assert "read from the journal instead" in after["damage"][0]
     assert file.read_text() == text
     file.write_text("{")
     (tmp_path / "scenes" / id / "journal.log").write_bytes(b"")
@@ -257,10 +257,10 @@ def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
         with httpx.Client(base_url=running.url, timeout=HANG_S) as http:
             assert http.get("/health/live").json()["status"] == "live"
             answer = http.get("/health/ready")
-            assert "recovering 0 of 2 scenes" in problem(answer, 503)["detail"]
+            assert "recovered 0 of 2 scenes" in problem(answer, 503)["detail"]
             assert answer.headers["Retry-After"]
             for call in (http.get(f"/v1/scenes/{first}"), http.get("/v1/scenes"), http.delete(f"/v1/scenes/{second}")):
-                assert "recovering" in problem(call, 503)["detail"]
+                assert "recovered" in problem(call, 503)["detail"]
             assert problem(put(http, second, 0), 503)["value"] == second
             problem(http.get("/v1/scenes/none"), 404)
             problem(http.post("/v1/scenes", json={"rig": RigModel.of(make_rig()).model_dump(mode="json")}), 503)

@@ -147,7 +147,7 @@ def goes_on_beside_a_replay(http, sdk, go_on):
     go_on.unlink()
     sdk.replay(id, [50], frames=1)
     ended = sdk.end_replay(id).replay
-    assert (ended.state, ended.error) == ("failed", "it was ended on request")
+    assert (ended.state, ended.error) == ("failed", "the replay was stopped on request")
     assert sdk.end_replay(id).replay == ended
     assert not sdk.scene(id).degraded
     sdk.replay(id, [50], frames=1)
@@ -175,7 +175,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     push(sdk, id, range(7))
     wait_for(lambda: not sdk.frame(id, 4).pictures_kept)
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff", json={"frames": 4}), 409)
-    assert "no longer kept" in document["detail"]
+    assert "were deleted" in document["detail"]
     assert "at most 1 frame" in document["remedy"]
     assert sdk.replay(id, [10], frames=1).replay.state == "running"
     sdk.delete_scene(id)

@@ -60,7 +60,7 @@ def test_an_entry_says_what_the_events_said():
     assert [report.identity for report in reports_] == [identity(0), None, identity(2), identity(3), identity(4)]
     assert [report.pictures_kept for report in reports_] == [False, False, True, True, False]
     assert [report.error for report in reports_[:2]] == [None, "cable"]
-    assert "frame 3 came" in reports_[2].error
+    assert "when frame 3 arrived" in reports_[2].error
     assert (reports_[3].error, reports_[3].worker_deaths) == ("two deaths", 2)
     assert reports_[3].dropped_cameras == {"c0": "torn"}
     assert ledger.frames[1].receipt is None
@@ -92,7 +92,7 @@ def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
     # The newest state turns out damaged: what comes after the one before is done again where its pictures are held.
     assert ledger.reconcile([0, 2], {4: "torn"}) == []
     assert (list(ledger.committed), ledger.waiting()) == ([0, 2], [3, 4, 5])
-    gone = "its state is damaged, and its pictures are deleted"
+    gone = "its state is damaged, and its images are deleted"
     assert ledger.reconcile([0], {}) == [FrameFailed(index=1, reason=gone), FrameFailed(index=2, reason=gone)]
     assert ledger.frames[2].state == FrameState.FAILED
 

@@ -208,7 +208,7 @@ def test_every_cut_and_flipped_bit_of_a_record_of_pictures_is_found(tmp_path):
     file.write_bytes(data + b"\0")
     with pytest.raises(FrameDamage):
         read_pictures(tmp_path, record.name)
-    with pytest.raises(FrameDamage, match="no name"):
+    with pytest.raises(FrameDamage, match="not the name"):
         read_pictures(tmp_path, "../secret")
 
 

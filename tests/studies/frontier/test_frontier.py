@@ -87,7 +87,7 @@ def test_every_setting_is_another_and_the_default_comes_first():
     assert {(v.settings.static.seed, v.settings.update.seed) for v in seeds} == {(0, 1), (0, 2)}
     assert variants(["iterations"], most_iterations=25)[0] == DEFAULT
     assert max(v.iterations for v in variants(["iterations"], most_iterations=25)[1:]) == 25
-    with pytest.raises(ValueError, match="axis 'layer' is unknown; choose of iterations"):
+    with pytest.raises(ValueError, match="axis 'layer' is unknown; choose from iterations"):
         variants(["layer"])
 
 
@@ -247,7 +247,7 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
     assert "`scas4d` robot 0.20, cloth 0.20 (3 seeds)" in text
     refused = CliRunner().invoke(app, [*command, "--only", "plots"])
     assert refused.exit_code == 2
-    assert "choose of rows, times, convergence, page" in " ".join(refused.output.replace("│", " ").split())
+    assert "choose from rows, times, convergence, page" in " ".join(refused.output.replace("│", " ").split())
 
 
 def test_a_page_of_nothing_says_what_to_do(tmp_path):

@@ -180,7 +180,7 @@ def test_the_runs_are_measured_where_captures_are(tmp_path, monkeypatch):
         measure_runs(tmp_path, tmp_path / "out", ["scas"])
     with pytest.raises(ValueError, match="capture 'robots' has no targets"):
         measure_runs(tmp_path, tmp_path / "out", only=["robots"])
-    with pytest.raises(ValueError, match="holds none of the captures"):
+    with pytest.raises(ValueError, match="contains none of the requested captures"):
         measure_runs(tmp_path, tmp_path / "out", only=["cloth"], report=lines.append)
 
 

@@ -9,7 +9,7 @@ import pytest
 from studies.hard_frames.footage import SyntheticFootage
 from studies.service import hard_frames as stability
 
-CASES = [("all black", 3, "previous state kept"), ("swapped", 2, ""), ("drop out", 2, ""), ("jumps", 1, "sought")]
+CASES = [("all black", 3, "previous state kept"), ("swapped", 2, ""), ("drop out", 2, ""), ("jumps", 1, "search")]
 """Part of the name of a case, its sizes here, and what the table says of it."""
 
 

@@ -83,7 +83,7 @@ def test_a_lamp_that_moves_switches_it_on_and_is_followed() -> None:
     error, scene = followed("auto", 0.08)
     switch = scene._prepared.carried.switches["light"]
     assert switch.on
-    assert switch.text.startswith("the light changes by ")
+    assert switch.text.startswith("the lighting changes by ")
     assert error < 0.8 * off
 
 

@@ -55,7 +55,7 @@ def test_a_shadow_over_what_stands_is_followed() -> None:
     assert error(on, truth) < 0.4 * error(off, truth)
     switch = on._prepared.carried.switches[NAME]
     assert switch.on
-    assert switch.text.endswith("of what stands looks other than in frame 0")
+    assert switch.text.endswith("of the static scene looks different from frame 0")
 
 
 def test_nothing_changes_where_nothing_does() -> None:

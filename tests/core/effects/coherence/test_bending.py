@@ -204,7 +204,7 @@ def test_a_sheet_that_swings_switches_it_on_and_is_met_better() -> None:
     switch = auto._prepared.carried.switches["bending"]
     assert switch.on
     assert switch.since == 1
-    assert switch.text.endswith("unlike each other")
+    assert switch.text.endswith("per frame relative to each other")
     error = [np.abs(scene.history.newest.means - swings[-1].means).mean() for scene in (auto, off)]
     assert error[0] < 0.85 * error[1]
     again = followed("auto", swings)

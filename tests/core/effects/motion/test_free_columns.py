@@ -149,9 +149,9 @@ def test_without_prediction_an_update_starts_where_the_frame_before_ended(kind: 
             {"effects": dict.fromkeys(MOVES[3:], "off"), "update": {"clusters": ()}},
             "own_position",
             "off",
-            "no motion of clusters and of Gaussians is left",
+            "no effect could move clusters or Gaussians",
         ),
-        ({"effects": {"own_scale": "on"}, "update": {"rate_scale": 0}}, "own_scale", "on", "give it a rate above 0"),
+        ({"effects": {"own_scale": "on"}, "update": {"rate_scale": 0}}, "own_scale", "on", "set a rate above 0"),
         (
             {"effects": {"cluster_scaling": "on"}, "update": {"clusters": ()}},
             "cluster_scaling",

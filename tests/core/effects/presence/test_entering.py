@@ -170,7 +170,7 @@ def test_what_there_is_no_time_for_is_not_born_and_the_frame_says_so(monkeypatch
         frame, result = timed(monkeypatch, end)
         assert result is frame.result
         assert len(frame.time.postponed) == 1
-        assert "Gaussians that move were not born" in frame.time.postponed[0]
+        assert "moving Gaussians were not added" in frame.time.postponed[0]
 
 
 def test_with_some_time_it_is_fitted_in_fewer_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,4 +187,4 @@ def test_without_time_the_young_stay_as_they_are() -> None:
     carried = {"entering": NO_NEWBORNS | {"rows": rows, "age": np.zeros(len(rows), np.int64)}}
     frame = replace(seen(true, true, 6, carried=carried), time=FitTime(0.0))
     assert EFFECT.add_and_retire_gaussians(frame).gaussians is true
-    assert frame.time.postponed == [f"{len(rows)} newborn Gaussians were not settled"]
+    assert frame.time.postponed == [f"{len(rows)} recently added Gaussians were not refined"]

@@ -71,7 +71,7 @@ def test_until_something_is_seen_to_move_nothing_does() -> None:
     scene = start()
     reports = [scene.step(noisy(index)) for index in (1, 2)]
     assert [report.outcome for report in reports] == 2 * [FrameOutcome.UNCHANGED]
-    assert [report.attempts for report in reports] == 2 * [["nothing is seen to move"]]
+    assert [report.attempts for report in reports] == 2 * [["no motion detected"]]
     np.testing.assert_array_equal(scene.history.newest.means, BOX.means)
     assert len(scene._prepared.carried.seen) == len(RIG)
 

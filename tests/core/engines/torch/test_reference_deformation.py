@@ -186,7 +186,7 @@ def test_a_separate_covariance_is_changed_by_what_is_the_gaussians_own_alone(kin
 
 
 def test_unknown_covariance_is_named() -> None:
-    with pytest.raises(ValueError, match="'loose' is unknown; give 'entangled' or 'separate'"):
+    with pytest.raises(ValueError, match="unknown covariance 'loose'; choose 'entangled' or 'separate'"):
         deform(normal(2, 3), normal(2, 3, 3), [], Deltas.identity(2), "centred", "loose")  # type: ignore[arg-type]
 
 

@@ -43,6 +43,10 @@ class Drawn:
         self.rasterizer.draw(self.cameras, self.first, self.arrays[3], behind)
 
     @property
+    def room(self) -> float:
+        return float(self.log.numpy()[0, PAIRS])
+
+    @property
     def planes(self) -> np.ndarray:
         return self.rasterizer.planes.numpy()[:, : self.shot.height, : self.shot.width]
 
@@ -190,21 +194,21 @@ def test_a_picture_of_nothing_is_the_background() -> None:
     assert not any(np.any(gradient) for gradient in mine.gradients(np.ones((4, 20, 20))))
 
 
-def test_lists_without_room_set_a_flag_and_grow() -> None:
+def test_lists_without_room_say_how_much_they_need_and_grow() -> None:
     given, shot = cloud(100), camera(48, 32)
     whole = Drawn(given, shot)
     entries = sum(map(len, whole.lists))
-    assert whole.rasterizer.overflow.numpy()[0] == 0
-    assert not whole.rasterizer.grow()
+    assert whole.room == entries
+    assert not whole.rasterizer.grow(whole.room)
     small = Drawn(given, shot, capacity=entries - 1)
-    assert small.rasterizer.overflow.numpy()[0] == 1
+    assert small.room == 1.25 * entries
     assert not any(small.lists)
     assert np.ptp(small.planes[4]) == 0  # drawn empty
-    assert small.rasterizer.grow()
+    assert small.rasterizer.grow(small.room)
     small.draw()
     assert small.lists == whole.lists
     assert np.array_equal(small.planes, whole.planes)
-    assert not small.rasterizer.grow()
+    assert not small.rasterizer.grow(small.room)
     assert Drawn(given, shot, capacity=entries).lists == whole.lists
 
 

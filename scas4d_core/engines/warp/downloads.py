@@ -1,0 +1,37 @@
+"""Reads of device memory by the host: several arrays with one wait."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+from numpy.typing import NDArray
+
+
+class Downloads:
+    """Copies arrays to the host, through page-locked buffers that are allocated once.
+
+    Args:
+        device: Warp device, such as "cpu" or "cuda:0".
+
+    Attributes:
+        waits: number of times that the host waited for the device.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device, self._staged = wp.get_device(device), dict[int, wp.array]()
+        self.waits = 0
+
+    def read(self, *arrays: wp.array) -> list[NDArray[Any]]:
+        """Returns copies of arrays, after everything enqueued before has finished."""
+        self.waits += 1
+        if not self._device.is_cuda:
+            return [array.numpy().copy() for array in arrays]
+        for array in arrays:
+            staged = self._staged.get(array.ptr)
+            if staged is None or staged.shape != array.shape or staged.dtype != array.dtype:
+                staged = wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=True)
+                self._staged[array.ptr] = staged
+            wp.copy(staged, array)
+        wp.synchronize_stream(self._device)
+        return [self._staged[array.ptr].numpy().copy() for array in arrays]

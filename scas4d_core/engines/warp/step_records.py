@@ -1,0 +1,67 @@
+"""What changes between the iterations of a captured graph: the host writes it, and kernels read it from the device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from scas4d_core.engines.warp.adam import SCALARS
+
+WEIGHTS = 3
+"""Scalars before those of the optimizers: weights of rigidity, isometry and rotation per pair of neighbours."""
+VIEW_COLUMNS = 3
+"""Integers of a view: index of the view, row of the log, and slot of the kept picture."""
+
+
+class StepRecords:
+    """One record on the device, and a ring of records on the host from which it is filled without waiting.
+
+    Args:
+        device: Warp device. optimizers: number of optimizers. views: largest number of views per iteration.
+        rows: number of records that may be pending; the caller waits for the device before it writes more.
+
+    Attributes:
+        sample, iteration: [1] int32, sample of neighbours and row of the iteration in the log.
+        weights: [3] float32, see ``WEIGHTS``.
+    """
+
+    def __init__(self, device: str, optimizers: int, views: int, rows: int) -> None:
+        pinned = wp.get_device(device).is_cuda
+        integers, scalars = 2 + VIEW_COLUMNS * views, WEIGHTS + SCALARS * optimizers
+        self.views, self.rows, self._next = views, rows, 0
+        self._integers = wp.zeros(integers, dtype=wp.int32, device=device)
+        self._scalars = wp.zeros(scalars, dtype=wp.float32, device=device)
+        self._integer_ring = wp.zeros((rows, integers), dtype=wp.int32, device="cpu", pinned=pinned)
+        self._scalar_ring = wp.zeros((rows, scalars), dtype=wp.float32, device="cpu", pinned=pinned)
+        self._host_integers, self._host_scalars = self._integer_ring.numpy(), self._scalar_ring.numpy()
+        self.sample, self.iteration = self._integers[:1], self._integers[1:2]
+        self.weights = self._scalars[:WEIGHTS]
+
+    def optimizer(self, place: int) -> wp.array:
+        """Returns the [``SCALARS``] scalars of an optimizer."""
+        first = WEIGHTS + SCALARS * place
+        return self._scalars[first : first + SCALARS]
+
+    def view(self, place: int) -> tuple[wp.array, wp.array, wp.array]:
+        """Returns the integers of a view of the iteration, [1] each; see ``VIEW_COLUMNS``."""
+        first = 2 + VIEW_COLUMNS * place
+        view, record, slot = (self._integers[k : k + 1] for k in range(first, first + VIEW_COLUMNS))
+        return view, record, slot
+
+    def write(
+        self, sample: int, iteration: int, views: Sequence[tuple[int, int, int]], scalars: Sequence[float]
+    ) -> None:
+        """Enqueues a record.
+
+        Args:
+            views: integers of each view. scalars: weights, followed by the scalars of each optimizer.
+        """
+        row, self._next = self._next, (self._next + 1) % self.rows
+        integers = self._host_integers[row]
+        integers[:2] = sample, iteration
+        integers[2 : 2 + VIEW_COLUMNS * len(views)] = np.ravel(views)
+        self._host_scalars[row] = scalars
+        wp.copy(self._integers, self._integer_ring[row])
+        wp.copy(self._scalars, self._scalar_ring[row])

@@ -1,0 +1,37 @@
+"""The command `scripts/bench devices`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from studies.options import Captures, Page, write_page
+
+
+def devices(
+    captures: Captures,
+    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Image scale.")] = 0.25,
+    frames: Annotated[int, typer.Option(min=1, help="Number of updates.")] = 5,
+    iterations: Annotated[int, typer.Option(min=1, help="Iterations per update.")] = 10,
+    static: Annotated[int, typer.Option(min=1, help="Iterations of frame 0, which is fitted on the CPU.")] = 600,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the updates.")] = 0,
+    itself: Annotated[
+        bool, typer.Option("--itself", help="Compare the CPU with itself, from a frame 0 that differs in the last bit.")
+    ] = False,
+    page: Page = None,
+) -> None:
+    """Compares images, tracks and times of updates on the CPU and on a GPU, from the same frame 0.
+
+    Without a GPU, the kernels of the GPU run on the CPU: results are comparable, times are not.
+
+    Example: scripts/bench devices samples/robot
+    """
+    from studies.devices.devices import compare, table, use_cpu_without_gpu
+    from studies.machine import in_words, machine
+
+    stands_for = "the CPU again, from a perturbed frame 0" if itself else use_cpu_without_gpu()
+    rows = [row for folder in captures for row in compare(folder, scale, frames, iterations, static, seed, itself)]
+    text = f"{table(rows)}\n\n*GPU* is {stands_for}. {in_words(machine())}."
+    print(text)
+    write_page(page, text)

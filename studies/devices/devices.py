@@ -1,0 +1,161 @@
+"""Updates the same frames on both devices, from the same frame 0, and compares images, tracks and times.
+
+Without a GPU, the kernels of the GPU run on the CPU device of NVIDIA Warp: results are comparable, times are not.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.captures import Capture
+from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.metrics.evaluation import measure_pictures, measure_tracks
+from scas4d_core.presets import preset
+from scas4d_core.reconstruction import Reconstruction
+from studies.captures import open_measured
+
+DEVICES: tuple[Device, ...] = ("cpu", "gpu")
+
+
+@dataclass(frozen=True)
+class DeviceRow:
+    """Comparison of one frame.
+
+    Attributes:
+        capture: name of the capture.
+        index: frame index.
+        psnr: mean PSNR on the test cameras in dB, keyed by device.
+        seconds: duration of the update in seconds, keyed by device.
+        gaussians: number of Gaussians present, keyed by device.
+        distance: median distance between the positions of the same moving Gaussian on both devices, divided by the
+            extent of the scene.
+        tracks: median track error in percent of the extent, keyed by device; for the last frame, over all frames, if the
+            capture has ground truth.
+    """
+
+    capture: str
+    index: int
+    psnr: dict[Device, float]
+    seconds: dict[Device, float]
+    gaussians: dict[Device, int]
+    distance: float
+    tracks: dict[Device, float]
+
+    @property
+    def difference(self) -> float:
+        """PSNR on the GPU minus PSNR on the CPU, in dB."""
+        return self.psnr["gpu"] - self.psnr["cpu"]
+
+
+def use_cpu_without_gpu() -> str:
+    """Lets device "gpu" run on Warp's CPU device if there is no GPU; returns what "gpu" stands for.
+
+    Raises:
+        SystemExit: NVIDIA Warp is not installed.
+    """
+    if (fault := gpu_fault()) is None and WARP_DEVICE not in os.environ:
+        return "a GPU"
+    os.environ[WARP_DEVICE] = "cpu"
+    gpu_fault.cache_clear()
+    if gpu_fault() is not None:
+        raise SystemExit(f"scripts/bench devices: {fault}; in the checkout: scripts/setup dev")
+    return "the CPU device of NVIDIA Warp"
+
+
+def compare(
+    folder: Path, scale: float, frames: int, iterations: int, static: int, seed: int = 0, itself: bool = False
+) -> list[DeviceRow]:
+    """Returns a row for each updated frame.
+
+    Args:
+        folder: folder of the capture.
+        scale: image scale.
+        frames: number of updates.
+        iterations: iterations per update.
+        static: iterations of frame 0, which is fitted on the CPU.
+        seed: seed of the updates.
+        itself: whether to compare the CPU with itself instead, from a frame 0 whose positions differ in the last bit.
+            This is the difference that rounding alone may cause.
+    """
+    capture = open_measured(folder, image_scale=scale)
+    changes = {
+        "static": {"iterations": static, "seconds": None},
+        "update": {"iterations": iterations, "stop_gain": 0, "seed": seed},
+    }
+    scenes: dict[Device, Reconstruction] = {}
+    for device in DEVICES:
+        settings = preset("scas4d", {**changes, "device": "cpu" if itself else device})
+        first = scenes["cpu"].static if scenes else None
+        if first is not None and itself:
+            first = replace(first, gaussians=with_last_bits_changed(first.gaussians))
+        scenes[device] = Reconstruction.start(
+            capture.rig, capture.frame(0), settings, points=capture.points, static=first
+        )
+    extent = capture.extent or float(np.ptp(scenes["cpu"].history.gaussians(0).means, axis=0).max())
+    rows, last = [], min(frames, capture.frame_count - 1)
+    for index in range(1, last + 1):
+        reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
+        psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
+        row = DeviceRow(
+            capture.name, index,
+            psnr={device: value if value is not None else float("nan") for device, value in psnr.items()},
+            seconds={device: sum(report.seconds.values()) for device, report in reports.items()},
+            gaussians={device: report.gaussians for device, report in reports.items()},
+            distance=float(np.median(distances(scenes, index))) / extent,
+            tracks=track_errors(scenes, capture, index) if index == last else {},
+        )  # fmt: skip
+        rows.append(row)
+    return rows
+
+
+def with_last_bits_changed(gaussians: Gaussians) -> Gaussians:
+    """Returns the Gaussians with each coordinate moved to the next larger or smaller float32."""
+    up = np.random.default_rng(1).random(gaussians.means.shape) < 0.5
+    towards = np.where(up, np.float32(np.inf), np.float32(-np.inf))
+    return gaussians.replace(means=np.nextafter(gaussians.means, towards))
+
+
+def track_errors(scenes: dict[Device, Reconstruction], capture: Capture, last: int) -> dict[Device, float]:
+    """Returns the median track error over all frames, in percent of the extent; empty if nothing can be measured."""
+    if capture.ground_truth is None:
+        return {}
+    scores = {device: measure_tracks(scene, capture, range(last + 1)) for device, scene in scenes.items()}
+    medians = {device: score.get("track_3d_median") for device, score in scores.items()}
+    return {device: median for device, median in medians.items() if median is not None}
+
+
+def distances(scenes: dict[Device, Reconstruction], index: int) -> NDArray[np.float64]:
+    """Returns the distances in metres between the moving Gaussians that both states share."""
+    mine, true = (scenes[device].history.gaussians(index) for device in ("gpu", "cpu"))
+    _, here, there = np.intersect1d(mine.ids[mine.moving], true.ids[true.moving], return_indices=True)
+    away: NDArray[np.float64] = np.linalg.norm(
+        mine.means[mine.moving][here].astype(np.float64) - true.means[true.moving][there], axis=1
+    )
+    return away if len(away) else np.zeros(1)
+
+
+def table(rows: Sequence[DeviceRow]) -> str:
+    """Formats rows of any captures as a Markdown table, with one line per capture."""
+    lines = [
+        "| capture | updates | PSNR on the CPU | GPU minus CPU: mean, worst frame | distance, % of the extent | "
+        "track error, % of the extent: CPU, GPU | seconds per update: CPU, GPU |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name in dict.fromkeys(row.capture for row in rows):
+        own = [row for row in rows if row.capture == name]
+        differences = np.array([row.difference for row in own])
+        seconds = [np.median([row.seconds[device] for row in own]) for device in DEVICES]
+        tracks = [f"{own[-1].tracks[device]:.3f}" if own[-1].tracks else "–" for device in DEVICES]
+        lines.append(
+            f"| {name} | {len(own)} | {np.mean([row.psnr['cpu'] for row in own]):.2f} dB | "
+            f"{differences.mean():+.3f} dB, {differences[np.argmax(abs(differences))]:+.3f} dB | "
+            f"{100 * max(row.distance for row in own):.4f} | {', '.join(tracks)} | {seconds[0]:.2f}, {seconds[1]:.2f} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,119 @@
+"""Whole frames of a small scene on the Warp engine, beside the CPU engine: every effect, births and resuming."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
+
+from box_scene import RIG, make_box, moved, take_frame
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.presence import entering
+from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault
+from scas4d_core.first_frame.static_result import StaticResult
+from scas4d_core.metrics.image import psnr
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import EFFECTS, Settings
+from scas4d_core.storage.history import History
+from tests.helpers.effect_cases.visited_room import known, scene, seen, visitor
+from tests.helpers.effect_cases.visited_room import psnr as room_psnr
+
+DEVICES: tuple[Device, ...] = ("cpu", "gpu")
+UPDATE = {"clusters": (2, 12), "iterations": 12, "stop_gain": 0, "skip_tolerance": 0}
+
+
+@pytest.fixture(autouse=True)
+def _kernels_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(WARP_DEVICE, os.environ.get(WARP_DEVICE, "cpu"))
+    gpu_fault.cache_clear()
+
+
+def settings(device: Device, **more: object) -> Settings:
+    given = {
+        "scene": {"floor": (0, 1, 0, -2)},
+        "static": {"iterations": 60, "max_gaussians": 600, "seconds": None},
+        "update": UPDATE,
+        **more,
+    }
+    return Settings.model_validate({"device": device, **given})
+
+
+@cache
+def frames() -> list[Frame]:
+    """A box that moves twice."""
+    first = make_box()
+    states = [first, moved(first), moved(moved(first))]
+    return [take_frame(index, index / 30, state, RIG) for index, state in enumerate(states)]
+
+
+@cache
+def first_fit(glossy: bool) -> StaticResult:
+    """The fit of frame 0, which all scenes share."""
+    effects = {"direction": "on"} if glossy else {}
+    scene = Reconstruction.start(RIG, frames()[0], settings("cpu", effects=effects))
+    assert scene.static is not None
+    return scene.static
+
+
+def error(scene: Reconstruction, frame: Frame) -> float:
+    """Returns the mean PSNR on the training cameras in dB."""
+    return float(np.mean([psnr(scene.render(camera).colour, frame.images[camera.name]) for camera in RIG.cameras]))
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_an_effect_that_is_on_gives_the_state_of_the_cpu_engine(effect: str) -> None:
+    scenes = {}
+    for device in DEVICES:
+        given = settings(device, effects={effect: "on"})
+        scenes[device] = Reconstruction.start(RIG, frames()[0], given, static=first_fit(effect == "direction"))
+        for frame in frames()[1:]:
+            scenes[device].step(frame)
+    mine, true = scenes["gpu"], scenes["cpu"]
+    assert mine.history.report(2)["device"] == "gpu"
+    assert error(mine, frames()[2]) == pytest.approx(error(true, frames()[2]), abs=0.05)
+    assert len(mine.history.gaussians(2)) == len(true.history.gaussians(2))
+    for index in (1, 2):
+        losses = [scene.history.report(index)["loss"] for scene in (mine, true)]
+        assert losses[0] == pytest.approx(losses[1], rel=0.01)
+        assert mine.history.report(index)["candidate"] == true.history.report(index)["candidate"]
+
+
+def test_frame_0_is_as_good_as_that_of_the_cpu_engine() -> None:
+    ends = {}
+    for device in DEVICES:
+        given = settings(device, effects={"direction": "on"})
+        scene = Reconstruction.start(RIG, frames()[0], given)
+        ends[device] = error(scene, frames()[0])
+    assert ends["gpu"] == pytest.approx(ends["cpu"], abs=0.3)
+
+
+def test_what_enters_is_added_as_by_the_cpu_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scas4d_core.effects.presence.newborn_fit.ITERATIONS", 120)
+    before, after = scene(known()), scene(known(), visitor())
+    born, gained = {}, {}
+    for device in DEVICES:
+        frame = seen(before, after, device=device)
+        result = entering.EFFECT.add_and_retire_gaussians(frame)
+        born[device] = len(result.gaussians) - len(before)
+        gained[device] = room_psnr(result.gaussians, frame) - room_psnr(before, frame)
+    assert born["gpu"] == born["cpu"] > 50
+    assert gained["gpu"] == pytest.approx(gained["cpu"], abs=0.3)
+    assert gained["cpu"] > 8
+
+
+def test_a_scene_is_resumed_on_the_other_device(tmp_path: Path) -> None:
+    scene = Reconstruction.start(
+        RIG, frames()[0], settings("gpu"), static=first_fit(False), history=History(tmp_path / "states")
+    )
+    scene.step(frames()[1])
+    again = Reconstruction.resume(RIG, settings("cpu"), History.open(tmp_path / "states"))
+    again.step(frames()[2])
+    scene.step(frames()[2])
+    assert error(again, frames()[2]) == pytest.approx(error(scene, frames()[2]), abs=0.05)
+    assert [again.history.report(index)["device"] for index in (1, 2)] == ["gpu", "cpu"]

@@ -1,0 +1,32 @@
+"""The comparison of devices on the sample, a little of it."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from scas4d_core.engines.choose import WARP_DEVICE, gpu_fault
+from studies.devices.devices import compare, table, use_cpu_without_gpu
+
+SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
+
+
+@pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="NVIDIA Warp is not installed")
+def test_an_update_of_the_sample_is_that_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(WARP_DEVICE, "cpu")
+    gpu_fault.cache_clear()
+    assert use_cpu_without_gpu() == "the CPU device of NVIDIA Warp"
+    rows = compare(SAMPLE, 0.25, frames=2, iterations=10, static=100)
+    assert [row.index for row in rows] == [1, 2]
+    assert all(abs(row.difference) < 0.05 for row in rows)
+    assert all(row.psnr["cpu"] > 20 and row.gaussians["gpu"] == row.gaussians["cpu"] for row in rows)
+    assert rows[0].distance < 2e-4
+    assert "| robot | 2 |" in table(rows)
+
+
+def test_the_cpu_differs_from_itself_where_the_last_bit_of_frame_0_does() -> None:
+    rows = compare(SAMPLE, 0.25, frames=1, iterations=4, static=30, itself=True)
+    assert 0 < rows[0].distance < 0.01
+    assert rows[0].difference != 0
