@@ -36,8 +36,8 @@ class DeviceRow:
         gaussians: number of Gaussians present, keyed by device.
         distance: median distance between the positions of the same moving Gaussian on both devices, divided by the
             extent of the scene.
-        tracks: median track error over all frames, in percent of the extent, keyed by device; only for the last frame of
-            a capture with ground truth.
+        tracks: median track error over all frames, in percent of the extent, keyed by device; only given for the last
+            frame of a capture with ground truth.
     """
 
     capture: str
