@@ -1,4 +1,4 @@
-"""The commands `scripts/bench kernels`, `moving` and `startup`."""
+"""The commands `scripts/bench kernels`, `gpu-kernels`, `moving` and `startup`."""
 
 from __future__ import annotations
 
@@ -30,6 +30,27 @@ def kernels(
     row = study.study(capture, settings, store, frames=frames, repeats=repeats)
     if out is not None:
         write_part(out, study.page(row))
+
+
+def gpu_kernels(
+    ptxas: Annotated[
+        Path | None,
+        typer.Option(help="ptxas of CUDA 13.4 or later, from the package nvidia-cuda-nvcc; default: on PATH."),
+    ] = None,
+    architectures: Annotated[
+        list[int] | None, typer.Option("--arch", help="Compute capability times 10: 90. May be repeated; default: all.")
+    ] = None,
+    out: Page = None,
+) -> None:
+    """Compiles the GPU kernels without a GPU, and reports registers and spills per thread if ptxas is available."""
+    from scas4d_core.engines.warp.compile_ahead import ARCHITECTURES
+    from studies.kernels import gpu_kernels as study
+
+    assembler = ptxas or study.find_ptxas()
+    uses = study.measure(architectures or ARCHITECTURES, assembler)
+    text = study.table(uses) if assembler else "All kernels compile. Their registers are unknown without ptxas."
+    typer.echo(text)
+    write_page(out, text)
 
 
 def moving(

@@ -363,7 +363,7 @@ def blend_backward(
         passed = wp.float32(1.0)
         behind = wp.float32(0.0)  # contribution of later entries and background
         g = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        through = wp.vec4(0.0, 0.0, 0.0, 0.0)  # the part that reaches the blending weights
+        label = wp.float32(0.0)  # the part of g[3] that reaches the blending weights; a second vector would spill
         if spot.inside == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
             if number < begun[spot.y, spot.x]:
                 g = wp.vec4(
@@ -374,9 +374,10 @@ def blend_backward(
                     planes[0, spot.y, spot.x], planes[1, spot.y, spot.x], planes[2, spot.y, spot.x],
                     planes[3, spot.y, spot.x],
                 )  # fmt: skip
-                through = wp.vec4(g[0], g[1], g[2], wp.where(raster.detached == 1, 0.0, g[3]))
+                label = wp.where(raster.detached == 1, 0.0, g[3])
                 passed = segment_light[segment * PIXELS + k]
-                behind = wp.dot(through, shown - load(segment_features, segment * PIXELS + k))
+                later = shown - load(segment_features, segment * PIXELS + k)
+                behind = g[0] * later[0] + g[1] * later[1] + g[2] * later[2] + label * later[3]
                 if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
                     open = wp.int32(1)
         alive = ballot(open)
@@ -426,7 +427,8 @@ def blend_backward(
                     else:
                         passed = after
                         drawn = wp.int32(1)
-                        own = weight * wp.dot(through, feature)
+                        own = g[0] * feature[0] + g[1] * feature[1] + g[2] * feature[2] + label * feature[3]
+                        own = weight * own
                         behind -= own
                         if alpha < raster.alpha_cap:
                             g_power = own - behind * fast_divide(alpha, 1.0 - alpha)
