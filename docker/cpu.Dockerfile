@@ -1,7 +1,7 @@
-# The service on a CPU. From the root of the repository: docker build -f docker/cpu.Dockerfile -t scas4d .
-# docker/try-image builds it without a Docker engine and runs it as docker/compose.yaml does.
-# The digest is the one under which public repositories pin this tag; it was not resolved at the registry itself.
-# docker/pin-images does that, and renews it.
+# Image of the service for CPUs. Build it from the root of the repository: docker build -f docker/cpu.Dockerfile -t scas4d .
+# docker/try-image builds it without a Docker engine and runs it with the options of docker/compose.yaml.
+# The digest was copied from public repositories that pin this tag, and was not resolved at the registry.
+# docker/pin-images resolves and updates it.
 ARG BASE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 
 FROM ${BASE} AS build
@@ -22,7 +22,7 @@ RUN tools/bin/python -m pip wheel --no-cache-dir --no-deps --no-build-isolation 
 
 FROM ${BASE}
 COPY --from=build /opt/scas4d /opt/scas4d
-# A volume takes its owner from these folders when it is made. The service writes there and in /tmp, nowhere else.
+# New volumes inherit the owner of these folders. The service writes only to them and to /tmp.
 RUN install -d -o 10001 -g 10001 -m 700 /data /cache
 ENV PATH=/opt/scas4d/bin:/usr/local/bin:/usr/bin:/bin HOME=/tmp PYTHONDONTWRITEBYTECODE=1 \
     SCAS4D_DATA=/data NUMBA_CACHE_DIR=/cache/numba SCAS4D_HOST=0.0.0.0 SCAS4D_PORT=8000
@@ -33,6 +33,6 @@ EXPOSE 8000
 HEALTHCHECK --start-period=60s --interval=30s --timeout=10s \
     CMD ["python", "-c", "import os, urllib.request as u; \
         u.urlopen('http://127.0.0.1:%(SCAS4D_PORT)s/health/live' % os.environ, timeout=5)"]
-# The service listens at all addresses of the container, and so does not start without a token:
-# SCAS4D_TOKEN_FILE names a mounted file, SCAS4D_TOKEN is the token itself.
+# The service listens on all addresses of the container, so it does not start without a token. Set SCAS4D_TOKEN_FILE
+# to the path of a mounted file, or SCAS4D_TOKEN to the token itself.
 CMD ["scas4d", "serve"]

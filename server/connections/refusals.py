@@ -97,7 +97,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
                 "the request is not HTTP/1.1",
                 field="request",
                 value="bytes that cannot be parsed",
-                remedy="send a valid HTTP/1.1 request (RFC 9112), without TLS",
+                remedy="send a valid HTTP request (RFC 9112), without TLS",
             )
 
 
