@@ -1,4 +1,4 @@
-# Image of the service for CPUs. Build it from the root of the repository: docker build -f docker/cpu.Dockerfile -t scas4d .
+# CPU image of the service. Build it from the repository root: docker build -f docker/cpu.Dockerfile -t scas4d .
 # docker/try-image builds it without a Docker engine and runs it with the options of docker/compose.yaml.
 # The digest was copied from public repositories that pin this tag, and was not resolved at the registry.
 # docker/pin-images resolves and updates it.

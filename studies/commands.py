@@ -10,6 +10,7 @@ from studies.devices.commands import devices
 from studies.effort.commands import effort
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
+from studies.gpu.commands import gpu_check
 from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import gpu_kernels, kernels, moving, startup
 from studies.paper.commands import paper
@@ -33,7 +34,7 @@ STUDIES = {
     "Rigs": (rigs, calibration, drift),
     "What comes out": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
-    "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices),
+    "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
     "Hard cases": (stability, timing),
     "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster, head, simulate),
 }

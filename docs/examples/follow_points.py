@@ -1,7 +1,7 @@
-"""Follows the points that move most, and leaves a picture: python docs/examples/follow_points.py out/reconstruct
+"""Plots the trajectories of the points that move most: python docs/examples/follow_points.py out/reconstruct
 
-SOURCE is what `scas4d reconstruct` left (its folder or a .s4d file), or the id of a scene of the service. Needs
-matplotlib, and the client (pip install -e .).
+SOURCE is the output folder of `scas4d reconstruct`, a .s4d file, or the id of a scene on the service. Requires
+matplotlib and the client (pip install -e .).
 """
 
 import argparse
@@ -17,29 +17,29 @@ from client.scene import Scene
 asked = argparse.ArgumentParser(description=__doc__)
 asked.add_argument("source")
 asked.add_argument("--out", default="follow_points.png")
-asked.add_argument("--count", type=int, default=25, help="how many points")
+asked.add_argument("--count", type=int, default=25, help="number of points")
 given = asked.parse_args()
 
 with Scene.open(given.source) as scene:
-    tracks = scene.tracks()  # [T, K, 3] of all that moves in the last frame, in the rig's world and unit
+    tracks = scene.tracks()  # [T, K, 3] for all Gaussians that move in the last frame, in the rig's world and units
     last = next(scene.states(str(scene.frames[-1])))
     rig, millimetres = scene.rig, 1000 * scene.metres_per_unit
 
-# How far each has gone, along its way. What was not there in every frame has NaN, and is left out.
+# Length of each trajectory. It is NaN for Gaussians that are not present in every frame, which are ranked last.
 lengths = np.linalg.norm(np.diff(tracks.positions, axis=0), axis=2).sum(axis=0)
 ranked = np.argsort(-np.nan_to_num(lengths))
-# Of those that move most, every so many, so that they do not all lie in one place.
+# Select evenly from the quarter that moves most, so that the points are not all in one place.
 chosen = ranked[: max(given.count, len(ranked) // 4)][:: max(1, len(ranked) // 4 // given.count)][: given.count]
 for k in chosen[:5]:
     print(f"Gaussian {tracks.ids[k]}: {lengths[k] * millimetres:.0f} mm in {np.ptp(tracks.seconds):.2f} s")
 
-# Axes of the picture: those of the first camera, with the height upwards.
+# The plot uses the axes of the first camera, with the vertical axis pointing up.
 across, down, ahead = rig.cameras[0].rotation if rig is not None else np.eye(3)
 figure, axes = plt.subplots(subplot_kw={"projection": "3d"}, figsize=(7, 7), layout="constrained")
 
 
 def drawn(points):
-    """The picture's coordinates of points [..., 3]: to the right, away, up."""
+    """Converts points [..., 3] to plot coordinates: right, away, up."""
     return np.moveaxis(np.stack([points @ across, points @ ahead, -points @ down], axis=-1), -1, 0)
 
 

@@ -1,10 +1,10 @@
 // Sends one frame to a SCas4D service as one binary body (S4DF, docs/api.md), with C++17 and POSIX sockets.
-// It speaks plain HTTP: over an open network put a TLS proxy or an SSH tunnel between.
+// It uses plain HTTP; on an untrusted network, add a TLS proxy or an SSH tunnel.
 //
 //     c++ -std=c++17 -O2 send_frame.cpp -o send_frame
 //     SCAS4D_TOKEN=... ./send_frame http://127.0.0.1:8000 SCENE 0 north=0.jpg east=1.jpg mask.north=0.png time=0.25
 //
-// It prints the answer. Exit status: 0 acknowledged (202), 1 refused or not reached, 2 wrong arguments.
+// It prints the response. Exit status: 0 acknowledged (202), 1 refused or unreachable, 2 invalid arguments.
 #include <netdb.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -24,9 +24,9 @@
 #include <stdexcept>
 #include <string>
 using std::string;
-constexpr int kTries = 60;         // of a frame that is refused with 429 or 503
-constexpr long kLongestWait = 60;  // seconds between two tries
-constexpr long kSilence = 60;      // seconds in which no byte comes or goes: the connection is given up
+constexpr int kTries = 60;         // maximum number of attempts if a frame is refused with 429 or 503
+constexpr long kLongestWait = 60;  // maximum seconds between attempts
+constexpr long kSilence = 60;      // seconds without traffic after which the connection is closed
 
 struct Answer {
     int status = 0;
@@ -41,7 +41,7 @@ string read_file(const string& path) {
     return data;
 }
 
-// A camera's name needs no escaping in JSON: the service takes these characters only.
+// Camera names need no escaping in JSON, because the service only accepts these characters.
 string camera_name(const string& name) {
     const auto plain = [](unsigned char c) { return std::isalnum(c) || c == '.' || c == '_' || c == '-'; };
     if (name.empty() || !std::all_of(name.begin(), name.end(), plain))
@@ -49,7 +49,7 @@ string camera_name(const string& name) {
     return name;
 }
 
-// The body: S4DF, the length of the head as uint32 in little-endian order, the head as JSON, the files.
+// The body: S4DF, the header length as little-endian uint32, the header as JSON, and the files.
 string frame_body(const string& index, int count, char** arguments) {
     string listed, files, time;
     for (int i = 0; i < count; ++i) {
@@ -92,7 +92,7 @@ int connected(const string& host, const string& port) {
     return fd;
 }
 
-// Where the service has answered and closed before all is sent, its answer says why: a failed send is no error here.
+// A failed send is not an error: if the service closes the connection early, its response gives the reason.
 void send_all(int fd, const string& data) {
     ssize_t n = 0;
     for (size_t sent = 0; sent < data.size(); sent += static_cast<size_t>(n))
