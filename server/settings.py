@@ -23,6 +23,8 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
+from scas4d_core.engines.choose import WARP_DEVICE
+
 PREFIX = "SCAS4D_"
 CONFIG = "SCAS4D_CONFIG"
 """Environment variable with the path of the TOML file; not a setting itself."""
@@ -300,7 +302,7 @@ class ServerSettings(BaseSettings):
 
 def unknown_names(environment: Mapping[str, str]) -> list[str]:
     """Returns the names that look like settings but are unknown, most likely because they are misspelled."""
-    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
+    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL, WARP_DEVICE}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 

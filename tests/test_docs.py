@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
+from scas4d_core.engines.choose import WARP_DEVICE
 from server.settings import CONFIG, PREFIX, URL, ServerSettings
 from studies.commands import app
 
@@ -49,13 +50,13 @@ def test_named_files_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_named_studies_exist(page: Path) -> None:
     known = get_command(app).list_commands(None)
-    unknown = set(re.findall(r"scripts/bench ([a-z]+)", page.read_text())) - {*known}
+    unknown = set(re.findall(r"scripts/bench ([a-z]+(?:-[a-z]+)*)", page.read_text())) - {*known}
     assert not unknown, f"{page.name} names studies that do not exist: {', '.join(unknown)}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_named_variables_are_settings(page: Path) -> None:
-    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
+    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL, WARP_DEVICE}
     unknown = set(re.findall(r"SCAS4D_[A-Z][A-Z_]*[A-Z]", page.read_text())) - known
     assert not unknown, f"{page.name} names variables that are no settings: {', '.join(unknown)}"
 

@@ -13,6 +13,15 @@ EXPORTS = ("gsply", "pxr")
 """Modules installed by the extra `exports`."""
 RERUN = ("rerun",)
 """Modules installed by the extra `rerun`."""
+EXTRAS = {
+    "server": SERVER,
+    "importers": ("cv2", "av"),
+    "exports": EXPORTS,
+    "rerun": RERUN,
+    "ray": ("ray",),
+    "gpu": ("warp",),
+}
+"""Maps each extra to the modules that it installs."""
 
 
 def need_server() -> None:
@@ -29,8 +38,7 @@ def need_server() -> None:
 def install_hint(missing: ModuleNotFoundError) -> str | None:
     """Returns an installation hint for a missing module, or None if no extra installs it."""
     package = (missing.name or "").partition(".")[0]
-    extras = {"server": SERVER, "exports": EXPORTS, "rerun": RERUN}
-    extra = next((name for name, packages in extras.items() if package in packages), None)
+    extra = next((name for name, packages in EXTRAS.items() if package in packages), None)
     if extra is None:
         return None
     return f"this needs {package}, which is not installed; run in the project folder: pip install -e '.[{extra}]'"

@@ -57,6 +57,16 @@ def serve(
 
 
 @app.command()
+def doctor(
+    data: Annotated[Path, typer.Option(help="Data folder of the service.")] = Path("data"),
+) -> None:
+    """Checks this machine: packages, disk and GPU. Says what is missing and how to install it."""
+    from client.cli.doctor import run as check
+
+    raise typer.Exit(check(data))
+
+
+@app.command()
 @with_capture_options
 def demo(
     options: CaptureOptions,

@@ -35,16 +35,16 @@ class DeviceError(ValueError):
         super().__init__(f"device 'gpu' cannot be used: {reason}; see docs/gpu.md, or choose device 'cpu' or 'auto'")
 
 
-@cache
 def gpu_fault() -> str | None:
-    """Returns why no GPU can be used, or None if one can.
-
-    The answer is determined once per process. NVIDIA Warp is only imported if there is a driver.
-    """
+    """Returns why device "gpu" cannot be used, or None if it can."""
     if importlib.util.find_spec("warp") is None:
         return "NVIDIA Warp is not installed (extra gpu)"
-    if WARP_DEVICE in os.environ:
-        return None
+    return None if WARP_DEVICE in os.environ else _hardware_fault()
+
+
+@cache
+def _hardware_fault() -> str | None:
+    """Returns why no GPU can be used, or None; determined once. NVIDIA Warp is only imported if there is a driver."""
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -68,12 +68,9 @@ def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
     >>> resolve_device("cpu")
     'cpu'
     """
-    if device == "cpu":
+    if device == "cpu" or (device == "auto" and (WARP_DEVICE in os.environ or gpu_fault() is not None)):
         return "cpu"
-    fault = gpu_fault()
-    if device == "auto":
-        return "gpu" if fault is None and WARP_DEVICE not in os.environ else "cpu"
-    if fault is not None:
+    if fault := gpu_fault():
         raise DeviceError(fault)
     return "gpu"
 

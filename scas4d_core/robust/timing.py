@@ -135,8 +135,8 @@ def record_timing(
 ) -> Past:
     """Returns the past with measurements of some cameras of a frame; unchanged if the frame cannot be used.
 
-    Frames that were rejected, retried, skipped or lit differently cannot be used. Nor can the first frames with motion,
-    or any frame on a GPU, which keeps no renderings. Excluded cameras are not measured.
+    Frames that were rejected, retried, skipped or lit differently cannot be used. Nor can the first frames with
+    motion. Excluded cameras are not measured.
 
     Args:
         past: usual values after the frame.

@@ -60,11 +60,10 @@ def use_cpu_without_gpu() -> str:
     Raises:
         SystemExit: NVIDIA Warp is not installed.
     """
-    if (fault := gpu_fault()) is None and WARP_DEVICE not in os.environ:
+    if WARP_DEVICE not in os.environ and gpu_fault() is None:
         return "a GPU"
     os.environ[WARP_DEVICE] = "cpu"
-    gpu_fault.cache_clear()
-    if gpu_fault() is not None:
+    if (fault := gpu_fault()) is not None:
         raise SystemExit(f"scripts/bench devices: {fault}; in the checkout: scripts/setup dev")
     return "the CPU device of NVIDIA Warp"
 

@@ -76,13 +76,15 @@ def whole_capture(folder: Path, device: str, frames: int | None = None, **change
         changes: further settings.
     """
     capture = open_capture(folder)
+    scale = changes.get("scene", {}).get("image_scale", 1.0)
     settings = preset("scas4d", {"device": device, **changes})
     first = capture.frame(0)
     began = perf_counter()
     scene = Reconstruction.start(capture.rig, first, settings, points=capture.points)
     row: Row = {"capture": capture.name, "device": device, "frame_0": perf_counter() - began, "updates": []}
     row["gaussians"] = len(scene.history.gaussians(0))
-    row["psnr_0"] = measured(scene, capture, 0)
+    scored = open_capture(folder, image_scale=scale)
+    row["psnr_0"] = measured(scene, scored, 0)
     psnr, stages = [], defaultdict[str, list[float]](list)
     for index in range(1, min(frames or capture.frame_count, capture.frame_count)):
         frame = capture.frame(index)
@@ -91,7 +93,7 @@ def whole_capture(folder: Path, device: str, frames: int | None = None, **change
         row["updates"].append(perf_counter() - began)
         for stage, seconds in report.seconds.items():
             stages[stage].append(seconds)
-        psnr.append(measured(scene, capture, index))
+        psnr.append(measured(scene, scored, index))
     row["stages"] = {stage: median(seconds) for stage, seconds in stages.items()}
     return row | {"update": median(row["updates"]), "psnr": float(np.mean(psnr)), "psnr_last": psnr[-1]}
 
@@ -104,10 +106,10 @@ def measured(scene: Reconstruction, capture: Capture, index: int) -> float:
     return float("nan") if value is None else value
 
 
-def one_size(size: Size, views: int, updates: int = 4) -> Row:
-    """Returns the median seconds of an update of 100 iterations, and the microseconds of each kernel in one more."""
+def one_size(size: Size, views: int, iterations: int = 100, updates: int = 4) -> Row:
+    """Returns the median seconds of an update, and the microseconds of each kernel in one more."""
     state, cameras = wall(size), rig(size)
-    changes = {"iterations": 100, "views": views, "stop_gain": 0, "skip_tolerance": 0}
+    changes = {"iterations": iterations, "views": views, "stop_gain": 0, "skip_tolerance": 0}
     settings = preset("scas4d", {"device": "gpu", "scene": SCENE, "update": changes})
     frames = [shown(state, index, cameras) for index in range(updates + 2)]
     scene = Reconstruction.start(cameras, frames[0], settings, static=known(state, cameras))
@@ -143,16 +145,17 @@ def kernel_times() -> Iterator[Row]:
             times[name] = {"launches": len(each), "microseconds": median(each)}
 
 
-def spread(folder: Path, runs: int, frames: int) -> Row:
+def spread(folder: Path, runs: int, frames: int, **changes: Any) -> Row:
     """Repeats the same reconstruction; returns the range of the PSNR, and whether the states have the same bits."""
     ends, digests = [], set()
     for _ in range(runs):
         capture = open_capture(folder)
-        settings = preset("scas4d", {"device": "gpu", "static": {"iterations": 300}})
+        settings = preset("scas4d", {"device": "gpu", "static": {"iterations": 300}, **changes})
         scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
         for index in range(1, frames):
             scene.step(capture.frame(index))
-        ends.append(measured(scene, capture, frames - 1))
+        scale = changes.get("scene", {}).get("image_scale", 1.0)
+        ends.append(measured(scene, open_capture(folder, image_scale=scale), frames - 1))
         digests.add(scene.history.gaussians(frames - 1).means.tobytes())
     return {"runs": runs, "psnr": ends, "range": max(ends) - min(ends), "same_bits": len(digests) == 1}
 
@@ -202,8 +205,8 @@ def _captures(rows: Sequence[Row]) -> list[str]:
     lines = ["| capture | device | Gaussians | frame 0, s | PSNR | update, s | PSNR |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         lines.append(
-            f"| {row['capture']} | {row['device']} | {row['gaussians']:,} | {row['frame_0']:.2f} | {row['psnr_0']:.2f} | "
-            f"{row['update']:.3f} | {row['psnr']:.2f} |"
+            f"| {row['capture']} | {row['device']} | {row['gaussians']:,} | {row['frame_0']:.2f} | "
+            f"{row['psnr_0']:.2f} | {row['update']:.3f} | {row['psnr']:.2f} |"
         )
     stages = [f"{row['capture']} on the {row['device']}: " + ", ".join(
         f"{stage} {1e3 * seconds:.1f}" for stage, seconds in row["stages"].items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,7 +30,9 @@ def gpu_check(
 
     stands_for, began = use_cpu_without_gpu(), perf_counter()
     sample, frames = ROOT / "samples" / "robot", 3 if quick else None
-    changes = {"static": {"iterations": 50}, "update": {"iterations": 10}} if quick else {}
+    changes: dict[str, Any] = {}
+    if quick:
+        changes = {"scene": {"image_scale": 0.25}, "static": {"iterations": 50}, "update": {"iterations": 10}}
     sizes = (Size(gaussians=900, width=64, height=64, cameras=6, moving=1.0),) if quick else check.SIZES
     found: check.Row = {
         "card": {"device": stands_for, **check.graphics_card()},
@@ -54,11 +56,11 @@ def gpu_check(
     for size in sizes:
         for views in check.VIEWS:
             if write("sizes"):
-                found["sizes"].append(check.one_size(size, views))
+                found["sizes"].append(check.one_size(size, views, 5 if quick else 100))
         if write(f"{size.gaussians} Gaussians"):
             found["views"].append(check.view_time(size))
     if write("sizes are done"):
-        found["spread"] = check.spread(sample, 2 if quick else 10, 3)
+        found["spread"] = check.spread(sample, 2 if quick else 10, 3, **changes)
     for folder in captures or []:
         if write("spread is done"):
             found["captures"].append(check.whole_capture(folder, "gpu", frames, **changes))

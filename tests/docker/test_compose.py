@@ -68,6 +68,17 @@ def test_volumes_secrets_and_mounted_files_are_there() -> None:
             assert (DOCKER.parent / service["build"]["dockerfile"]).is_file()
 
 
+def test_the_gpu_file_only_adds_the_lock_and_the_gpu() -> None:
+    added = yaml.safe_load((DOCKER / "compose.gpu.yaml").read_text())
+    (name,) = added["services"]
+    service = added["services"][name]
+    assert name == "scas4d"
+    assert set(service) == {"image", "build", "deploy"}
+    assert (DOCKER / service["build"]["args"]["LOCK"]).is_file()
+    (device,) = service["deploy"]["resources"]["reservations"]["devices"]
+    assert device == {"driver": "nvidia", "count": 1, "capabilities": ["gpu"]}
+
+
 def test_the_user_is_that_of_the_image() -> None:
     service = SERVICES["scas4d"]
     dockerfile = (DOCKER.parent / service["build"]["dockerfile"]).read_text()

@@ -66,7 +66,7 @@ def test_its_scene_can_be_looked_at_later_and_its_parts_have_the_colours_of_the_
     done, capture_folder, tmp_path, monkeypatch
 ):
     out, said = done
-    id = re.search(rf"scas4d serve --data {out / 'data'}, and open \S+/#scene=(\w+)", said)[1]
+    id = re.search(rf"scas4d serve --data {out / 'data'}, then open \S+/#scene=(\w+)", said)[1]
     monkeypatch.setenv("PYTHONPATH", fakes.environment()["PYTHONPATH"])
     camera = open_capture(capture_folder).full_test_rig.cameras[0]
     with running_service(out / "data", tmp_path / "log") as url, Client(url) as client:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from scas4d_core.engines import choose
-from scas4d_core.engines.choose import DeviceError, engine_of, gpu_fault, resolve_device
+from scas4d_core.engines.choose import DeviceError, engine_of, resolve_device
 from scas4d_core.engines.cpu.engine import CpuEngine
 
 WARP = importlib.util.find_spec("warp") is not None
@@ -19,14 +19,18 @@ WARP = importlib.util.find_spec("warp") is not None
 def forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Lets each test determine anew whether there is a GPU."""
     monkeypatch.delenv(choose.WARP_DEVICE, raising=False)
-    gpu_fault.cache_clear()
+    choose._hardware_fault.cache_clear()
     yield
-    gpu_fault.cache_clear()
+    choose._hardware_fault.cache_clear()
 
 
 def no_driver(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load(name: str) -> None:
-        raise OSError(name)
+    real = ctypes.CDLL
+
+    def load(name: str, *given: object, **named: object) -> object:
+        if "cuda" in name:
+            raise OSError(name)
+        return real(name, *given, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(ctypes, "CDLL", load)
 
@@ -66,3 +70,6 @@ def test_the_kernels_run_without_a_gpu_only_on_request(monkeypatch) -> None:
     assert resolve_device("gpu") == "gpu"
     assert engine_of("gpu").name == "warp"
     assert isinstance(engine_of("cpu"), CpuEngine)
+    monkeypatch.delenv(choose.WARP_DEVICE)
+    no_driver(monkeypatch)
+    assert resolve_device("auto") == "cpu"  # what was found for one is not kept for the other

@@ -276,7 +276,7 @@ def test_another_attempt_starts_afresh(engine: UpdateEngine) -> None:
 
 def test_gains_that_were_not_given_are_refused(engine: UpdateEngine) -> None:
     loaded(engine, case())
-    with pytest.raises(ValueError, match="gains were not given"):
+    with pytest.raises(ValueError, match="begin was called without gains"):
         engine.gains()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from box_scene import make_box, make_rig, take_frame
 
-from scas4d_core.engines.choose import fit_engine_of, renderer_of
+from scas4d_core.engines.choose import WARP_DEVICE, fit_engine_of, renderer_of
 from scas4d_core.engines.cpu.gloss import GlossShading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, SCALE, FitLoss, FitScalars
 from scas4d_core.engines.limits import scene_limits
@@ -33,13 +33,13 @@ ALL = np.full(COLUMNS, 1e-3, np.float32)
 @pytest.fixture(params=DEVICES, autouse=True)
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Runs each test on each engine."""
+    monkeypatch.setenv(WARP_DEVICE, os.environ.get(WARP_DEVICE, "cpu"))
     use(request.param)
     return str(request.param)
 
 
 def use(device: str) -> None:
     """Selects the engine of the following fits."""
-    os.environ.setdefault("SCAS4D_WARP_DEVICE", "cpu")
     RENDERERS["now"] = renderer_of(device, (0.1, 0.2, 0.3), scene_limits("auto", RIG.radius))
 
 

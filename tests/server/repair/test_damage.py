@@ -323,7 +323,7 @@ def test_sentences_are_bounded_and_counted():
     for number in range(SENTENCES_KEPT):
         log.add(DamageKind.FRAME, f"{number}")
     assert len(log.sentences) == SENTENCES_KEPT + 1
-    assert log.sentences[0].startswith("2 more")
+    assert log.sentences[0].startswith("2 earlier messages")
 
 
 def test_flipped_bits_over_everything(tmp_path):

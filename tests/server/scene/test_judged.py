@@ -91,7 +91,7 @@ def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served)
     index = sdk.scene(id).next_frame
     report = put(sdk, id, index, RIG.names)
     assert report.state == "committed"
-    assert report.degraded.startswith("previous state kept: the pictures are")
+    assert report.degraded.startswith("previous state kept: the images are")
     assert report.used_cameras == []
     history = History.load(states)
     before, after = history.gaussians(index - 1), history.gaussians(index)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scas4d_core.engines.choose import WARP_DEVICE, gpu_fault
+from scas4d_core.engines.choose import WARP_DEVICE
 from studies.devices.devices import compare, table, use_cpu_without_gpu
 
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
@@ -16,7 +16,6 @@ SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="NVIDIA Warp is not installed")
 def test_an_update_of_the_sample_is_that_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(WARP_DEVICE, "cpu")
-    gpu_fault.cache_clear()
     assert use_cpu_without_gpu() == "the CPU device of NVIDIA Warp"
     rows = compare(SAMPLE, 0.25, frames=2, iterations=10, static=100)
     assert [row.index for row in rows] == [1, 2]

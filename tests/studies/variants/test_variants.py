@@ -71,7 +71,7 @@ def test_times_of_pictures_rise_backwards():
 
 @pytest.mark.parametrize("text", ["a: update.iterations", ": update.iterations=3"])
 def test_a_contender_that_cannot_be_read_is_refused(text):
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(ValueError, match="is invalid; write it as"):
         Contender.read(text)
 
 

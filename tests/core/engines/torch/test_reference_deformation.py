@@ -135,7 +135,7 @@ def test_only_the_centred_cascade_is_translation_equivariant() -> None:
 
 
 def test_unknown_map_is_named() -> None:
-    with pytest.raises(ValueError, match="'sideways' is unknown"):
+    with pytest.raises(ValueError, match="unknown cluster map 'sideways'"):
         cascade(normal(12, 3), some_layers(12), "sideways")  # type: ignore[arg-type]
 
 

@@ -15,7 +15,7 @@ from box_scene import RIG, make_box, moved, take_frame
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.presence import entering
-from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault
+from scas4d_core.engines.choose import WARP_DEVICE, Device
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.metrics.image import psnr
 from scas4d_core.reconstruction import Reconstruction
@@ -31,7 +31,6 @@ UPDATE = {"clusters": (2, 12), "iterations": 12, "stop_gain": 0, "skip_tolerance
 @pytest.fixture(autouse=True)
 def _kernels_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(WARP_DEVICE, os.environ.get(WARP_DEVICE, "cpu"))
-    gpu_fault.cache_clear()
 
 
 def settings(device: Device, **more: object) -> Settings:

@@ -1,0 +1,103 @@
+"""Checks of the machine for `scas4d doctor`: Python, extras, memory, disk and GPU."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from client import __version__
+from client.cli import extras
+
+LEAST_FREE_GB = 5
+"""Free space below which a data folder is reported as small."""
+DRIVER_FILE = Path("/proc/driver/nvidia/version")
+"""File in which the NVIDIA driver reports its version on Linux."""
+LEAST_DRIVER = 580
+"""Oldest NVIDIA driver that the packages of NVIDIA Warp support; its release page has builds for older ones."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Result of one check.
+
+    Attributes:
+        name: what was checked.
+        text: what was found, and the remedy if something is missing.
+        fault: whether the service cannot run.
+    """
+
+    name: str
+    text: str
+    fault: bool = False
+
+
+def checks(data: Path) -> Iterator[Check]:
+    """Checks the machine; ``data`` is the data folder of the service, which need not exist yet."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    python = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}, {cores} cores"
+    yield Check("scas4d", f"{__version__}, {python}")
+    yield from installed()
+    yield disk(data)
+    yield gpu()
+
+
+def installed() -> Iterator[Check]:
+    """Checks the packages of each extra; only `server` is required."""
+    for extra, modules in extras.EXTRAS.items():
+        missing = [module for module in modules if find_spec(module) is None]
+        if missing:
+            text = f"not installed ({', '.join(missing)}); in the project folder: pip install -e '.[{extra}]'"
+            yield Check(f"extra {extra}", text, fault=extra == "server")
+        else:
+            yield Check(f"extra {extra}", "installed")
+
+
+def disk(data: Path) -> Check:
+    """Checks the free space for the data folder."""
+    existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
+    free = shutil.disk_usage(existing).free / 1e9
+    small = (
+        "; a day of frames takes more (docs/operations.md), so use another disk: --data" if free < LEAST_FREE_GB else ""
+    )
+    return Check("disk", f"{free:.0f} GB free for {data}{small}")
+
+
+def gpu() -> Check:
+    """Checks whether scenes with device 'auto' use a GPU, and what is missing otherwise."""
+    from scas4d_core.engines.choose import gpu_fault
+
+    driver = driver_version(DRIVER_FILE.read_text()) if DRIVER_FILE.exists() else None
+    if fault := gpu_fault():
+        old = driver is not None and driver[0] < LEAST_DRIVER
+        remedy = (
+            f"; the driver is {'.'.join(map(str, driver or ()))}, NVIDIA Warp asks for {LEAST_DRIVER}" if old else ""
+        )
+        return Check("GPU", f"not used: {fault}{remedy}; scenes run on the CPU (docs/gpu.md)")
+    from scas4d_core.engines.warp.device import describe
+
+    return Check("GPU", describe())
+
+
+def driver_version(text: str) -> tuple[int, ...] | None:
+    """Reads the version from the driver's own file.
+
+    >>> driver_version("NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.159.04  Tue Jan  6")
+    (580, 159, 4)
+    """
+    found = re.search(r"\b(\d{3,})\.(\d+)(?:\.(\d+))?\b", text)
+    return None if found is None else tuple(int(part) for part in found.groups() if part is not None)
+
+
+def run(data: Path) -> int:
+    """Prints all checks; returns 1 if the service cannot run, else 0."""
+    results = list(checks(data))
+    width = max(len(check.name) for check in results)
+    for check in results:
+        print(f"{check.name:<{width}}  {'missing: ' if check.fault else ''}{check.text}")
+    return int(any(check.fault for check in results))
