@@ -70,7 +70,7 @@ def disk(data: Path) -> Check:
 
 def gpu() -> Check:
     """Checks whether scenes with device 'auto' use a GPU, and what is missing otherwise."""
-    from scas4d_core.engines.choose import gpu_fault
+    from scas4d_core.engines.choose import gpu_fault, warp_device
 
     driver = driver_version(DRIVER_FILE.read_text()) if DRIVER_FILE.exists() else None
     if fault := gpu_fault():
@@ -81,7 +81,7 @@ def gpu() -> Check:
         return Check("GPU", f"not used: {fault}{remedy}; scenes run on the CPU (docs/gpu.md)")
     from scas4d_core.engines.warp.device import describe
 
-    return Check("GPU", describe())
+    return Check("GPU", describe(warp_device()))
 
 
 def driver_version(text: str) -> tuple[int, ...] | None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from scas4d_core.engines.choose import warp_device
 
-
-def describe() -> str:
-    """Returns the name, memory and versions of the device in one line."""
-    device = wp.get_device(warp_device())
+def describe(name: str) -> str:
+    """Returns the name, memory and versions of a Warp device, such as "cuda:0", in one line."""
+    device = wp.get_device(name)
     if not device.is_cuda:
         return f"kernels run on the CPU device of NVIDIA Warp {wp.config.version}"
     driver = ".".join(map(str, wp.get_cuda_driver_version()))
