@@ -32,7 +32,7 @@ class IngestSocket:
 
     Args:
         client: client that provides the address, token, timeouts and `on_retry` callback.
-        scene: id of the scene.
+        scene: scene id.
 
     >>> n = client.scene(open_scene).next_frame
     >>> with IngestSocket(client, open_scene) as socket:

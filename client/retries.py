@@ -90,7 +90,7 @@ class Retries:
         if (self.call.repeatable or unsent) and not isinstance(error, httpx.UnsupportedProtocol):
             wait = self._outage_wait(0.0, str(error))
         if wait is None:
-            tries = f" after {self._failures} tries" if self._failures > 1 else ""
+            tries = f" after {self._failures} attempts" if self._failures > 1 else ""
             what = str(error) or type(error).__name__
             raise ServiceUnreachable(f"{self._url} cannot be reached{tries}: {what}") from error
         self._lost = self._lost or not unsent
@@ -111,7 +111,7 @@ class Retries:
                 wait = self._busy_wait(asked, response)
             elif response.status_code in OUTAGE_STATUSES:
                 self._lost = True
-                wait = self._outage_wait(asked or 0.0, f"it responded with {response.status_code}")
+                wait = self._outage_wait(asked or 0.0, f"it responded with status {response.status_code}")
         if wait is None:
             raise error_of(response)
         return wait

@@ -33,8 +33,8 @@ class State:
     """State of N Gaussians in one frame. Row i is the same Gaussian in every frame; new Gaussians are appended.
 
     Attributes:
-        frame: index of the frame.
-        seconds: time of the frame in seconds.
+        frame: frame index.
+        seconds: frame time in seconds.
         gaussians: state in the internal world frame, float32.
         world: transform between the user's and the internal world frame.
     """
@@ -93,9 +93,9 @@ class GaussianTracks:
     Attributes:
         positions: centres [T, K, 3], float64, in the user's world and units; NaN in frames in which a Gaussian is not
             present.
-        seconds: times [T] of the frames in seconds.
-        frames: indices [T] of the frames.
-        ids: ids [K] of the Gaussians.
+        seconds: frame times [T] in seconds.
+        frames: frame indices [T].
+        ids: Gaussian ids [K].
         present: mask [T, K] of the frames in which a Gaussian is present.
     """
 
@@ -115,11 +115,11 @@ class PartPoses:
     """Rigid motions of P parts over T frames.
 
     Attributes:
-        parts: labels [P] of the parts.
-        frames: indices [T] of the frames.
-        seconds: times [T] of the frames in seconds.
+        parts: part labels [P].
+        frames: frame indices [T].
+        seconds: frame times [T] in seconds.
         motions: rigid transforms [P, T, 4, 4], float64, in the user's units. A point of part p at (x, y, z) in the
-            first of the frames is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN if no Gaussian of the part is
+            first frame is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN if no Gaussian of the part is
             present.
         residuals: RMS distances [P, T] between the Gaussians and the rigid motion, in the user's units.
     """
@@ -138,8 +138,8 @@ class Scene:
     the object or use it as a context manager.
 
     Attributes:
-        frames: indices of the frames.
-        seconds: times [T] of the frames in seconds.
+        frames: frame indices.
+        seconds: frame times [T] in seconds.
 
     >>> with Scene.open(scene, url=url) as given:  # a folder, a .s4d file, or an id
     ...     shapes = [(state.frame, state.means.shape) for state in given.states("0:1")]
@@ -163,8 +163,8 @@ class Scene:
             source: .s4d file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
                 of a scene on the service.
             frames: inclusive range ``A:B``, as for `scas4d export`; None for all frames.
-            url: address of the service.
-            token: token of the service.
+            url: service URL.
+            token: access token for the service.
 
         Raises:
             InputError: the source does not exist, or contains none of these frames.
@@ -192,12 +192,12 @@ class Scene:
 
     @property
     def frames(self) -> list[int]:
-        """Indices of the frames in ascending order."""
+        """Frame indices in ascending order."""
         return list(self._times)
 
     @property
     def seconds(self) -> Float:
-        """Times [T] of the frames in seconds."""
+        """Frame times [T] in seconds."""
         return np.array(list(self._times.values()))
 
     @property
@@ -233,7 +233,7 @@ class Scene:
         """Returns the trajectories of Gaussians; they take 24 bytes per Gaussian and frame.
 
         Args:
-            ids: ids [K] of the Gaussians; None for all Gaussians that are moving in the last of these frames.
+            ids: Gaussian ids [K]; None for all Gaussians that are moving in the last of these frames.
             frames: inclusive range ``A:B``; None for all frames.
 
         Raises:
@@ -256,7 +256,7 @@ class Scene:
     def parts(self) -> Int:
         """Returns the part label [N] of each row in the last frame; −1 if a Gaussian belongs to no part.
 
-        For a scene on the service, the labels are those of its newest frame. The service computes them on demand,
+        For a scene on the service, the labels refer to its newest frame. The service computes them on demand,
         which takes a few seconds.
 
         >>> with Scene.open(scene, url=url) as given:
@@ -319,7 +319,7 @@ class Scene:
         low, high = frame_range(frames)
         times = {index: time for index, time in self._times.items() if low <= index <= high}
         if not times:
-            raise InputError(f"frames {frames} do not exist", f"give frames {self.frames[0]} to {self.frames[-1]}")
+            raise InputError(f"no frames in the range {frames}", f"use frames {self.frames[0]} to {self.frames[-1]}")
         return times
 
     def _rows(self, ids: ArrayLike | None, last: int) -> tuple[NDArray[np.intp], Int]:
@@ -333,5 +333,5 @@ class Scene:
         rows = order[places]
         missing = asked[state.ids[rows] != asked]
         if missing.size:
-            raise InputError(f"ids: there is no Gaussian {missing[0]} in frame {last}", "give ids from a state's `ids`")
+            raise InputError(f"ids: no Gaussian {missing[0]} in frame {last}", "use ids from a state's `ids`")
         return rows, state.ids[rows]

@@ -59,15 +59,13 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
 
 
 class _ClientBase:
-    """Common base class of both clients, which stores the address, token and timeouts."""
+    """Common base class of both clients, which stores the URL, token and timeouts."""
 
     def __init__(
         self, url: str, token: str | None, busy_timeout: float, outage: float, on_retry: OnRetry | None
     ) -> None:
         if not url.startswith(("http://", "https://")):
-            raise ValueError(
-                f"url {url!r} is not the address of a service; write http://{url.partition('://')[2] or url}"
-            )
+            raise ValueError(f"url {url!r} is not a service URL; use http://{url.partition('://')[2] or url}")
         self.url, self.token = url.rstrip("/"), token
         self.busy_timeout, self.outage, self.on_retry = busy_timeout, outage, on_retry
 
@@ -85,7 +83,7 @@ class Client(_ClientBase):
     Close it after use, or use it as a context manager.
 
     Args:
-        url: address of the service.
+        url: service URL.
         token: access token, if the service requires one.
         busy_timeout: maximum time in seconds that a call waits for space in a full queue (429).
         outage: maximum time in seconds that a call waits for a service that does not respond.
@@ -202,8 +200,8 @@ class Client(_ClientBase):
         """Yields the scene's status periodically until a frame is finished or the scene has failed.
 
         Args:
-            id: id of the scene.
-            index: index of the frame.
+            id: scene id.
+            index: frame index.
             seconds: timeout in seconds.
             every: polling interval in seconds.
 
@@ -227,8 +225,8 @@ class Client(_ClientBase):
         """Waits until a frame is committed, failed, missing or skipped, or the scene has failed; returns its report.
 
         Args:
-            id: id of the scene.
-            index: index of the frame.
+            id: scene id.
+            index: frame index.
             seconds: timeout in seconds.
             every: polling interval in seconds.
 

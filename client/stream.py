@@ -78,8 +78,8 @@ class Stream:
     can continue after a `ServiceError`.
 
     Args:
-        url: address of the service, http or https.
-        scene: id of the scene.
+        url: service URL, http or https.
+        scene: scene id.
         token: access token, if the service requires one.
         outage: maximum time in seconds to wait for a service that does not respond.
 

@@ -54,7 +54,7 @@ class BinaryEvent:
     """Event from a binary message of a subscription.
 
     Attributes:
-        id: id of the subscription.
+        id: subscription id.
         tag: tag of the request that caused the event.
         missed: number of unsent messages that this one replaces.
         frame: index of the newest frame that the event covers.
@@ -72,7 +72,7 @@ class BinaryEvent:
     body: bytes
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Returns the arrays in an npz body, keyed by name; refuses pickled data."""
+        """Returns the arrays in an npz body, keyed by name; rejects pickled data."""
         with np.load(io.BytesIO(self.body), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
 
@@ -89,7 +89,7 @@ class ViewEvent(BinaryEvent):
 
 @dataclass(frozen=True)
 class TracksEvent(BinaryEvent):
-    """Event with trajectories over the frames `first` to `frame`, continuing those of the previous event."""
+    """Event with trajectories over the frames `first` to `frame`, continuing the trajectories of the previous event."""
 
     first: int
 

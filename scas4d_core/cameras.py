@@ -1,4 +1,4 @@
-"""Cameras, rigs and the similarity transform to the internal world frame. NumPy only.
+"""Cameras, rigs and the similarity transform to the internal world frame. Requires only NumPy.
 
 Axes follow OpenCV: x right, y down, z forward; ``X_cam = R X_world + t``; ``u = fx x/z + cx``.
 Pixel (column i, row j) covers [i, i+1) x [j, j+1), and its centre is (i + 0.5, j + 0.5).
@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 CAMERA_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
 """Pattern of valid camera names. Names are used as file names, so path separators are not allowed."""
 ROTATION_TOLERANCE = 1e-3
-"""Largest absolute entry of R Rᵀ − I for which R counts as a rotation; calibration files round to 4–6 digits."""
+"""Maximum absolute entry of R Rᵀ − I for a valid rotation R; calibration files are rounded to 4–6 digits."""
 
 
 class CameraError(InputError):
@@ -38,7 +38,7 @@ class Camera:
         width, height: image size in pixels.
 
     Raises:
-        CameraError: a value is not finite, a focal length is not positive, the intrinsics have skew, the rotation is
+        CameraError: if a value is not finite, a focal length is not positive, the intrinsics have skew, the rotation is
             invalid, or the image is empty.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
@@ -62,9 +62,9 @@ class Camera:
         for field, shape in (("intrinsics", (3, 3)), ("world_to_camera", (4, 4))):
             value = np.array(getattr(self, field), dtype=np.float64)
             if value.shape != shape:
-                raise CameraError(f"camera {self.name!r}: {field} has shape {value.shape}", f"give {shape}")
+                raise CameraError(f"camera {self.name!r}: {field} has shape {value.shape}", f"expected {shape}")
             if not np.isfinite(value).all():
-                raise CameraError(f"camera {self.name!r}: {field} contains NaN or infinity", "give finite numbers")
+                raise CameraError(f"camera {self.name!r}: {field} contains NaN or infinity", "use finite numbers")
             value.setflags(write=False)
             object.__setattr__(self, field, value)
         with np.errstate(over="ignore", invalid="ignore"):  # values that overflow fail the checks below
@@ -74,33 +74,33 @@ class Camera:
         k, r = self.intrinsics, self.rotation
         if k[0, 0] <= 0 or k[1, 1] <= 0:
             raise CameraError(
-                f"camera {self.name!r}: focal lengths {k[0, 0]:g}, {k[1, 1]:g} must be positive",
-                "give positive focal lengths in pixels",
+                f"camera {self.name!r}: focal lengths must be positive, got {k[0, 0]:g} and {k[1, 1]:g}",
+                "specify them in pixels",
             )
         if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
             raise CameraError(
-                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]", "remove the skew first"
+                f"camera {self.name!r}: intrinsics must be [[fx,0,cx],[0,fy,cy],[0,0,1]]", "remove any skew first"
             )
         turns = np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE
         if turns and np.linalg.det(r) < 0:
             raise CameraError(
-                f"camera {self.name!r}: the rotation world_to_camera[:3,:3] has determinant -1: a left-handed frame",
-                "mirror one axis: if the world is left-handed, negate one of its axes for all cameras (that column of "
-                "every rotation) and in the points; if the camera axes are left-handed, negate the wrong row of the "
-                "rotation and of the translation",
+                f"camera {self.name!r}: the rotation world_to_camera[:3,:3] has determinant -1 (left-handed)",
+                "flip one axis: if the world is left-handed, negate one world axis for all cameras (the same column of "
+                "each rotation) and in the points; if the camera axes are left-handed, negate the row of the flipped "
+                "axis in the rotation and the translation",
             )
         if not turns:
             raise CameraError(
                 f"camera {self.name!r}: world_to_camera[:3,:3] is not a rotation (determinant {np.linalg.det(r):.4g})",
-                "give the world-to-camera rotation with OpenCV axes",
+                "use a world-to-camera rotation with OpenCV axes",
             )
         if not np.allclose(self.world_to_camera[3], (0, 0, 0, 1)):
             raise CameraError(
-                f"camera {self.name!r}: the last row of world_to_camera is not 0 0 0 1", "give a 4x4 pose"
+                f"camera {self.name!r}: the last row of world_to_camera must be 0 0 0 1", "use a rigid 4x4 pose"
             )
         if self.width < 1 or self.height < 1:
             raise CameraError(
-                f"camera {self.name!r}: size {self.width}x{self.height} is empty", "give at least 1x1 pixels"
+                f"camera {self.name!r}: invalid image size {self.width}x{self.height}", "use at least 1x1 pixels"
             )
 
     @property
@@ -125,12 +125,12 @@ class Camera:
 
     @property
     def rotation(self) -> Float:
-        """[3, 3] rotation from world to camera."""
+        """[3, 3] world-to-camera rotation."""
         return self.world_to_camera[:3, :3]
 
     @property
     def translation(self) -> Float:
-        """[3] translation from world to camera."""
+        """[3] world-to-camera translation."""
         return self.world_to_camera[:3, 3]
 
     @property
@@ -210,7 +210,7 @@ class WorldFrame:
 AUTO_RIG_RADIUS_M = 3.0
 """Rig radius in metres that ``metres_per_unit="auto"`` assumes, typical of a room-sized stage."""
 ONE_PLACE = 1e-8
-"""Rig radius, in user units or metres, below which all cameras count as being at the same position."""
+"""Rig radius, in user units or metres, below which all cameras are considered to be at the same position."""
 
 LONG_LENS = 2.0
 """Ratio of focal length to the longer image side above which a lens counts as long; equivalent to 72 mm on 36 mm film.
@@ -219,7 +219,7 @@ LONG_LENS = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Ordered set of cameras that observe the same scene and have unique names.
+    """Ordered set of uniquely named cameras that observe the same scene.
 
     >>> lens, pose = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside = pose.copy()
@@ -236,11 +236,11 @@ class Rig:
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
         if not names:
-            raise CameraError("a rig needs at least one camera", "add one")
+            raise CameraError("the rig has no cameras", "add at least one")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise CameraError(
-                f"camera names must be unique within a rig, duplicates: {', '.join(twice)}", "rename all but one"
+                f"camera names must be unique within a rig; duplicates: {', '.join(twice)}", "rename all but one"
             )
 
     def __len__(self) -> int:
@@ -277,8 +277,8 @@ class Rig:
     def reach(self) -> float:
         """Rig radius, reduced if the median lens exceeds ``LONG_LENS``, because long lenses see only part of the scene.
 
-        Position learning rates are proportional to it. A step that moves a point by one pixel with a normal lens moves
-        it by ten pixels with a lens ten times as long.
+        Position learning rates are proportional to this value. A step that moves a point by one pixel with a normal
+        lens moves it by ten pixels with a lens ten times as long.
         """
         lens = float(np.median([camera.intrinsics[0, 0] / max(camera.width, camera.height) for camera in self.cameras]))
         return self.radius * min(1.0, LONG_LENS / lens)
@@ -299,25 +299,25 @@ class Rig:
             metres_per_unit: metres per calibration unit, or "auto" to assume a rig radius of 3 m.
 
         Raises:
-            CameraError: the value is not positive, "auto" is used although all cameras are at the same position, or the
-                poses overflow.
+            CameraError: if the value is not positive, "auto" is used although all cameras are at the same position, or
+                the poses overflow.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             far = not np.isfinite(self._spread)
         if far:
-            raise CameraError("camera centres are too far from the origin", "give world_to_camera in larger units")
+            raise CameraError("camera centres are too far from the origin", "use larger units for world_to_camera")
         if metres_per_unit == "auto":
             if self.at_one_place:
                 raise CameraError(
-                    f"metres_per_unit 'auto' depends on the distances between cameras, but {len(self)} camera(s) are "
-                    "at one place",
-                    f"give metres_per_unit as a number that places the subject about {AUTO_RIG_RADIUS_M:g} m away",
+                    f"metres_per_unit 'auto' requires cameras at different positions, but all {len(self)} camera(s) "
+                    "are at the same position",
+                    f"set metres_per_unit to a number that puts the subject about {AUTO_RIG_RADIUS_M:g} m away",
                 )
             metres = AUTO_RIG_RADIUS_M / self.radius
         else:
             metres = float(metres_per_unit)
             if not (np.isfinite(metres) and metres > 0):
-                raise CameraError(f"metres_per_unit {metres_per_unit!r} must be a positive number or 'auto'")
+                raise CameraError(f"metres_per_unit must be a positive number or 'auto'; got {metres_per_unit!r}")
         return WorldFrame(self.centre, metres)
 
     def scaled(self, image_scale: float) -> Rig:
@@ -336,7 +336,7 @@ def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
 
 
 def farthest_first(centres: NDArray[np.floating], count: int) -> list[int]:
-    """Returns the indices of ``count`` of the points [N, 3], selected by farthest-point sampling from the first point.
+    """Selects ``count`` points [N, 3] by farthest-point sampling, starting with the first, and returns their indices.
 
     >>> farthest_first(np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
     [0, 2]

@@ -1,8 +1,8 @@
-"""Checkpoints of the update state beyond Θ_{t−1}, and selection of the commit from which a scene is resumed.
+"""Checkpoints of all update state except Θ_{t−1}, and selection of the commit from which a scene is resumed.
 
-A scene that is resumed after a crash gives bit-identical results.
+After a crash, a resumed scene produces bit-identical results.
 
-Each of the newest commits of a ``History`` has a file ``checkpoint_<index>.npz`` next to its frame. The file is
+Each of the newest commits in a ``History`` has a file ``checkpoint_<index>.npz`` next to its frame. The file is
 written, synced and renamed *before* the frame itself is renamed, which is the commit. Every committed frame therefore
 has a checkpoint, and a checkpoint without a frame is ignored. The second newest checkpoint is kept in case the newest
 state or checkpoint is damaged. Constant data (exposures, presence of masks) is stored in the report of the first frame.
@@ -36,7 +36,7 @@ from scas4d_core.update.warm_start import Motion
 
 
 class CheckpointError(ValueError):
-    """Raised if a checkpoint is missing or damaged; the message names the file and the fault."""
+    """Raised if a checkpoint is missing or damaged; the message names the file and the problem."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,11 @@ class CarryOver:
     """State, in addition to Θ, that one update passes to the next.
 
     Attributes:
-        motion: motion of the last update; None if the next update is a cold start.
+        motion: motion of the last update, or None if the next update is a cold start.
         labels: [N] bool, true for Gaussians that have moved at least once; None in scenes with masks, and before the
             first motion.
-        seen: views of the last accepted frame, with which the next frame is compared, in scenes without masks. Until
-            the first motion is detected, the views of the first frame are kept, so that slow motion accumulates.
+        seen: views with which the next frame is compared, in scenes without masks: those of the last accepted frame.
+            Until the first motion is detected, the views of the first frame are kept, so that slow motion accumulates.
         structure: digest of the clusters and neighbours for which ``motion`` is valid.
         past: statistics of the scene and its cameras over the previous frames.
         shown: fingerprint of each camera's image in the last accepted frame (``robust.checks``).
@@ -148,7 +148,7 @@ class Checkpoints:
             factory: factory that creates views from the stored images.
 
         Raises:
-            CheckpointError: the checkpoint is missing or damaged.
+            CheckpointError: if the checkpoint is missing or damaged.
         """
         file = self._file(index)
         try:
@@ -156,7 +156,7 @@ class Checkpoints:
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
-                raise ValueError(f"{file.name}: {', '.join(sorted(missing))} are missing")
+                raise ValueError(f"{file.name}: missing or unexpected arrays: {', '.join(sorted(missing))}")
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
@@ -235,7 +235,7 @@ def cold_start(history: History, index: int, masked: bool) -> CarryOver:
         masked: whether the scene has masks.
 
     Raises:
-        HistoryError: the frame cannot be read.
+        HistoryError: if the frame cannot be read.
     """
     moving = history.gaussians(index).foreground > 0.5
     first, newest = history.effects(history.indices[0]), history.effects(index)
@@ -259,8 +259,8 @@ class ResumePoint:
         index: frame index of the commit.
         undone: indices of later committed frames that were rolled back; they are lost unless they are sent again.
         faults: one sentence per file that could not be used; empty after a normal shutdown.
-        cold: whether the state is intact but its checkpoint is not. The next update then starts without motion, and the
-            results are no longer bit-identical to those of an uninterrupted scene.
+        cold: whether the state is intact, but its checkpoint is missing or damaged. The next update then starts without
+            motion, and the results are no longer bit-identical to those of an uninterrupted scene.
     """
 
     index: int
@@ -278,13 +278,13 @@ def find_commit(
         history: history of the scene.
         checkpoints: checkpoints of the scene.
         factory: factory that creates views from stored images.
-        held: returns whether the images of a committed frame can be sent again.
+        held: function that returns whether the images of a committed frame can be sent again.
 
     Returns:
         The index of the commit, its carry-over (None for a cold start), and one sentence per fault that was found.
 
     Raises:
-        ResumeError: no state can be read.
+        ResumeError: if no state can be read.
     """
     faults = list(history.damaged.values())
     whole: list[int] = []

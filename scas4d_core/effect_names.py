@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 Mode = Literal["auto", "on", "off"]
-"""With "auto", evidence in the images decides; "on" and "off" are fixed."""
+""""auto" lets evidence in the images decide whether an effect is on; "on" and "off" are fixed."""
 
 EFFECTS = {
     "cluster_rotation": "scas4d_core.effects.motion.cluster_rotation",
@@ -39,4 +39,4 @@ EFFECTS = {
     "entering": "scas4d_core.effects.presence.entering",
     "leaving": "scas4d_core.effects.presence.leaving",
 }
-"""Maps the name of each effect to its module, in the order in which the effects run in an iteration."""
+"""Maps each effect's name to its module, in the order in which the effects run in an iteration."""

@@ -1,4 +1,4 @@
-"""Errors that state a fault and a remedy, and error messages without local paths. Standard library only."""
+"""Errors that state a problem and its remedy, and error messages without local paths. Needs no third-party packages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def without_paths(text: str) -> str:
 
 
 def message_of(error: BaseException) -> str:
-    """Returns an error's message without paths; for an ``OSError``, only the system's error text.
+    """Returns an error's message without paths, or only the system's error text for an ``OSError``.
 
     >>> message_of(OSError(28, "No space left on device", "/usr/share/a.npz"))
     'No space left on device'

@@ -25,7 +25,7 @@ class FrameInput:
         bright: mean brightness of each camera's image, 0…1.
         fingerprints: fingerprint of each camera's image.
         exposure: brightness of the frame relative to the usual brightness.
-        left_out: excluded cameras, with the reason.
+        left_out: maps each excluded camera to the reason.
         unusable: reason why the frame cannot be used, or None (``robust.checks.check_brightness``).
         light_changes: whether the lighting keeps changing from frame to frame.
         past: statistics of the scene, including the brightness of this frame.
@@ -59,7 +59,7 @@ class FrameContext:
     Attributes:
         frame: the frame, with decoded images.
         watch: stopwatch for the stages.
-        dropped: cameras excluded by the caller, with the reason.
+        dropped: maps each camera excluded by the caller to the reason.
         notes: additional JSON data to commit.
         frame_input: measurements of the images, set by the "observe" stage.
         prepared: updater and carry-over, set by the "prepare" stage.
@@ -67,7 +67,7 @@ class FrameContext:
         result: result of the update, set by the "solve" stage.
         past: statistics after the update, set by the "solve" stage.
         check_seconds: duration of the checks outside the update, in seconds.
-        birth_fit_time: time for fitting added Gaussians, used by the "populate" stage.
+        birth_fit_time: time limit for fitting added Gaussians, used by the "populate" stage.
     """
 
     frame: Frame

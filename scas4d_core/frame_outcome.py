@@ -38,7 +38,8 @@ class FrameOutcome(StrEnum):
     UNCHANGED = "unchanged"
     """Θ_{t−1} already matches the frame; no iteration was needed and nothing was learnt."""
     RETRIED = "retried"
-    """Committed by a later attempt with smaller steps or rigid layers, because earlier ones gave no plausible state."""
+    """Committed by a later attempt with smaller steps or rigid layers, because earlier attempts produced no plausible
+    state."""
     RELOCATED = "relocated"
     """Committed after a longer search, because the regular update did not match the frame."""
     ACCEPTED = "accepted"
@@ -46,23 +47,23 @@ class FrameOutcome(StrEnum):
     REJECTED_UNUSABLE = "rejected_unusable"
     """Θ_{t−1} is kept: the images are too dark or too bright to learn from."""
     REJECTED_IMPLAUSIBLE = "rejected_implausible"
-    """Θ_{t−1} is kept: no attempt gave a finite, bounded and plausible state."""
+    """Θ_{t−1} is kept: no attempt produced a finite, bounded and plausible state."""
     REJECTED_MISFIT = "rejected_misfit"
     """Θ_{t−1} is kept: no state was found that matches the frame."""
 
     @property
     def rejected(self) -> bool:
-        """True if the frame was rejected and the previous state is kept."""
+        """Whether the frame was rejected and the previous state is kept."""
         return self in (self.REJECTED_UNUSABLE, self.REJECTED_IMPLAUSIBLE, self.REJECTED_MISFIT)
 
     @property
     def degraded(self) -> bool:
-        """True for every outcome except UPDATED and UNCHANGED."""
+        """Whether the outcome is neither UPDATED nor UNCHANGED."""
         return self not in (self.UPDATED, self.UNCHANGED)
 
     @property
     def learnt(self) -> bool:
-        """True if the state was updated to the frame's images."""
+        """Whether the state was updated to the frame's images."""
         return not self.rejected and self is not self.UNCHANGED
 
 
@@ -74,7 +75,7 @@ class AlarmKind(StrEnum):
     CAMERA_MISFIT = "camera_misfit"
     """The camera's image fits worse than usual compared with the other cameras: it may have moved, be dirty or lag."""
     CAMERA_COLOURS = "camera_colours"
-    """The camera's colours deviate from its earlier images and from the other cameras: exposure or white balance."""
+    """The camera's colours (exposure or white balance) deviate from its earlier images and from the other cameras."""
     CAMERA_SHARPNESS = "camera_sharpness"
     """The camera's image is blurrier or noisier than its earlier images and those of the other cameras."""
     CAMERA_FROZEN = "camera_frozen"
@@ -119,7 +120,7 @@ class CameraTiming(TypedDict):
 
 
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
-    """Returns the user-facing explanation of a degraded outcome; None if the outcome is not degraded.
+    """Returns the user-facing explanation of a degraded outcome, or None if the outcome is not degraded.
 
     >>> degraded_text(FrameOutcome.REJECTED_MISFIT, "the pictures are met at 12.0 dB")
     'previous state kept: the pictures are met at 12.0 dB'
@@ -136,15 +137,15 @@ guess; above it, no other methods are needed (``first_frame.initial_points``).
 
 
 def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
-    """Returns warnings if the initial points of frame 0 are unreliable; otherwise empty.
+    """Returns warnings if the initial points of frame 0 are unreliable, otherwise an empty list.
 
     Args:
-        cloud: record of a ``FirstCloud``; None for any frame but the first.
+        cloud: record of a ``FirstCloud``, or None for all frames except the first.
 
     >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
     >>> cloud_warnings({"method": "agreement + pairs", "points": 900, "coverage": 0.12})[0][:75]
-    'frame 0 is partly a guess: the points on which cameras agree cover 12 % of '
+    'frame 0 is partly a guess: the points that cameras agree on cover only 12 %'
     """
     if cloud is None or cloud.get("coverage") is None:
         return []
@@ -153,27 +154,27 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
         "or a plain backdrop"
     )
     if cloud["coverage"] == 0:
-        return [f"frame 0 is a guess: no two cameras agree on any of its initial points; {remedy}"]
+        return [f"frame 0 is a guess: no two cameras agree on any initial point; {remedy}"]
     if cloud["coverage"] < COVERS_LITTLE:
-        share = f"cover {100 * cloud['coverage']:.0f} % of the images"
-        return [f"frame 0 is partly a guess: the points on which cameras agree {share}; {remedy}"]
+        share = f"cover only {100 * cloud['coverage']:.0f} % of the images"
+        return [f"frame 0 is partly a guess: the points that cameras agree on {share}; {remedy}"]
     return []
 
 
 def time_warnings(shortened: Sequence[str]) -> list[str]:
-    """Returns a warning about steps of frame 0 that were cut for lack of time; empty if the time was sufficient.
+    """Returns a list with a warning about steps of frame 0 that were cut for lack of time, or an empty list.
 
     >>> time_warnings(["no stereo", "1500 of 3000 iterations"])[0][:75]
-    'frame 0 had too little time: no stereo; 1500 of 3000 iterations; if its ren'
+    'frame 0 did not have enough time: no stereo; 1500 of 3000 iterations; if it'
     """
     if not shortened:
         return []
-    remedy = "if its renders are poor, restart the reconstruction with a larger static.seconds, or with points"
-    return [f"frame 0 had too little time: {'; '.join(shortened)}; {remedy}"]
+    remedy = "if its renders are poor, restart the reconstruction with a larger static.seconds or with points"
+    return [f"frame 0 did not have enough time: {'; '.join(shortened)}; {remedy}"]
 
 
 def grey_warnings(grey: Sequence[str]) -> list[str]:
-    """Returns a warning about grayscale cameras mixed with colour cameras; empty if there are none.
+    """Returns a list with a warning about grayscale cameras among colour cameras, or an empty list.
 
     Args:
         grey: names of the grayscale cameras.
@@ -185,7 +186,7 @@ def grey_warnings(grey: Sequence[str]) -> list[str]:
         return []
     return [
         f"grayscale cameras among colour ones: {', '.join(grey)}; their grey values are used for all three channels, "
-        "which dulls colours; if the other cameras suffice, hold them out (--test, or leave out their images)"
+        "which dulls colours; if the other cameras suffice, hold these out (use --test or omit their images)"
     ]
 
 
@@ -207,13 +208,13 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
 
 
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
-    """Returns a warning about cameras that are clearly out of step; empty if there are none.
+    """Returns a list with a warning about cameras that are clearly out of step, or an empty list.
 
     This is a lasting fault of the rig rather than of one frame. The scene status shows a constant message while the
     fault lasts; the report has the figures, which change from frame to frame.
 
     Args:
-        timing: ``timing`` entry of the newest report; None if it has none.
+        timing: ``timing`` entry of the newest report, or None if it has none.
 
     >>> in_step = {"frames": 0.02, "error": 0.03, "out_of_step": False}
     >>> late = {"frames": 0.41, "error": 0.03, "out_of_step": True}

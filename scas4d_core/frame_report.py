@@ -61,16 +61,17 @@ class FrameReport:
         index: index of the frame.
         time: time of the frame in seconds.
         iterations: number of iterations.
-        seconds: duration of each stage in seconds; ``report`` covers this report and the writing of the previous one.
+        seconds: duration of each stage in seconds; ``report`` covers compiling this report and writing the previous
+            one.
         loss: weighted loss of each iteration; for frame 0, at most ``REPORTED_LOSSES`` means.
         psnr: mean PSNR in dB over the views of the last iterations, as rendered at the time; NaN if not measured.
         moving: number of moving Gaussians.
         gaussians: number of present Gaussians.
-        cameras: how well each camera's image was matched when last rendered; reveals a bumped camera.
+        cameras: quality of the match with each camera's image when last rendered, which reveals bumped cameras.
         used: cameras from which the update learnt; empty for a rejected or skipped frame.
-        dropped: excluded cameras, with the reason.
+        dropped: maps each excluded camera to the reason.
         outcome: outcome of the frame.
-        degraded: user-facing explanation of a degraded outcome; None if the outcome is not degraded.
+        degraded: user-facing explanation of a degraded outcome, or None if the outcome is not degraded.
         attempts: description and result of each attempt at the frame.
         exposure: brightness of the frame relative to the lighting in which the colours were learnt. For a frame that
             was not attempted, it is estimated from the mean image brightness. A lasting light change is learnt into the
@@ -170,8 +171,8 @@ def report_of_first(
         names: names of the rig's cameras.
         moving: number of Gaussians in the hierarchy.
         seconds: duration of each stage in seconds.
-        dropped: cameras excluded by the caller, with the reason.
-        calibration: comparison of the calibration with the images; None if not measured.
+        dropped: maps each camera excluded by the caller to the reason.
+        calibration: comparison of the calibration with the images, or None if not measured.
     """
     return FrameReport(
         index=frame.index,
@@ -210,10 +211,10 @@ def report_of_update(
         frame: the updated frame.
         result: update result to be committed.
         before: previously committed state.
-        left_out: cameras excluded by the first checks, with the reason.
+        left_out: maps each camera excluded by the first checks to the reason.
         names: names of the rig's cameras.
         watch: stopwatch with the stages "decode", "judge", "update" and optionally "presence".
-        dropped: cameras excluded by the caller, with the reason.
+        dropped: maps each camera excluded by the caller to the reason.
         postponed: descriptions of work that exceeded the time budget.
     """
     trace, gaussians = result.trace, result.gaussians

@@ -1,4 +1,4 @@
-"""Θ, the state of a scene: an ordered, append-only set of 3D Gaussians. NumPy only."""
+"""Θ, the state of a scene: an ordered, append-only set of 3D Gaussians. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Gaussians:
             Gaussian was added.
         opacities: [N] float32 opacities as rendered: 0 for retired Gaussians, otherwise in (0, 1). Fixed after a
             Gaussian's first frame.
-        colours: [N, 3] float32 RGB colours, nominally 0…1; exclude the gloss if there is any.
+        colours: [N, 3] float32 RGB colours, nominally 0…1, without any gloss.
         foreground: [N] float32 learnt labels in 0…1; a Gaussian moves if its label is above 0.5.
         ids: [N] int64 permanent ids; −1 until a Gaussian's first frame is committed.
         retired: [N] bool, true for retired Gaussians; defaults to all false.
@@ -233,7 +233,7 @@ def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
 def moving_extent(gaussians: Gaussians) -> float:
     """Returns the longest side, in metres, of the box with the central 98 % of the moving Gaussians along each axis.
 
-    If none is moving, all present Gaussians are used; if none is present, all Gaussians.
+    If no Gaussian is moving, all present Gaussians are used; if none is present, all Gaussians are used.
 
     Tolerances and features use the extent as their unit, so that they do not depend on the scene size. A few stray
     Gaussians hardly affect it.

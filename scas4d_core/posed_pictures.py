@@ -1,4 +1,4 @@
-"""Images with camera poses, and visibility, occlusion and colour of points across several images. NumPy only."""
+"""Images with camera poses, and visibility, occlusion and colours of points in several images. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bool = NDArray[np.bool_]
 
 
 BLOCK = 32_768
-"""Number of points whose colours are sampled at once; limits memory."""
+"""Number of points whose colours are sampled at once, to limit memory use."""
 
 
 class InitialPointsError(ValueError):
@@ -30,7 +30,7 @@ class PosedPicture:
     Attributes:
         camera: calibrated camera in the user's world.
         image: [H, W, 3] uint8 RGB image.
-        mask: [H, W] bool, true on the foreground; None if the image has no mask.
+        mask: [H, W] bool, true on the foreground, or None if the image has no mask.
     """
 
     camera: Camera
@@ -44,7 +44,7 @@ def collect_views(
     """Returns the views of all cameras that have an image, in rig order.
 
     Raises:
-        InitialPointsError: there are fewer than two images, or an image or mask does not have its camera's size.
+        InitialPointsError: if there are fewer than two images, or an image or mask does not have its camera's size.
     """
     views = []
     for camera in rig.cameras:
@@ -53,18 +53,18 @@ def collect_views(
         image = np.ascontiguousarray(images[camera.name])
         if image.shape != (camera.height, camera.width, 3) or image.dtype != np.uint8:
             raise InitialPointsError(
-                f"images[{camera.name!r}]: {image.dtype} {image.shape}; "
-                f"give uint8 {(camera.height, camera.width, 3)}, the size of its camera"
+                f"images[{camera.name!r}] is {image.dtype} {image.shape}; "
+                f"expected uint8 {(camera.height, camera.width, 3)}, the size of its camera"
             )
         mask = masks.get(camera.name)
         if mask is not None and mask.shape != image.shape[:2]:
             raise InitialPointsError(
-                f"masks[{camera.name!r}]: shape {mask.shape}; give {image.shape[:2]}, the size of its image"
+                f"masks[{camera.name!r}] has shape {mask.shape}; expected {image.shape[:2]}, the size of its image"
             )
         views.append(PosedPicture(camera, image, None if mask is None else np.asarray(mask) > 0))
     if len(views) < 2:
         raise InitialPointsError(
-            f"images: {len(views)} of the rig's {len(rig)} cameras have an image; initial points need at least 2"
+            f"images: only {len(views)} of the rig's {len(rig)} cameras have an image; initial points require 2 or more"
         )
     return views
 
@@ -126,13 +126,14 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
         points: [P, 3] world positions of the points.
 
     Returns:
-        [P] depths; infinity if nothing occludes the point or the point is outside the image.
+        [P] depths, infinite if nothing occludes the point or the point is outside the image.
     """
     front = np.full(len(points), np.inf)
     column, line, depth, inside = pixels_inside(camera, occluders)
     if not inside.any():
         return front
-    # Cells are two discs wide: each contains a point of every surface that covers it, but slopes hardly change in it.
+    # Cells are two discs wide. Each contains a point of every surface that covers it, and slopes hardly change within
+    # it.
     cell = 2.0 * max(1.0, camera.fx * spacing / float(np.median(depth[inside])))
     shape = (int(camera.height / cell) + 1, int(camera.width / cell) + 1)
     nearest = np.full(shape, np.inf)
@@ -151,7 +152,7 @@ def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -
     seen at more than about 60 degrees from their normal may count as hidden, but their colour is unreliable anyway.
 
     Returns:
-        [V, P] bool; also false if the point projects outside the image.
+        [V, P] mask, which is also false if the point projects outside the image.
     """
     visible = np.zeros((len(views), len(points)), dtype=bool)
     for row, view in zip(visible, views, strict=True):
@@ -163,7 +164,7 @@ def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -
 
 @dataclass(frozen=True, eq=False)
 class PointColours:
-    """Colours of points, over all cameras that see them.
+    """Colours of points, combined over all cameras that see them.
 
     Attributes:
         colours: [P, 3] float32 median RGB over these cameras, 0…1.

@@ -1,8 +1,8 @@
 """Prepares the updates of a scene: clusters and neighbours of moving Gaussians, and the parts of active effects.
 
-They are rebuilt when more Gaussians are found to move, when an effect is switched, and when Gaussians are added or
-retired. They are built from the scene's *roots*: Θ_0 plus the Gaussians added since, at the positions they would have
-had in frame 0.
+They are rebuilt when more Gaussians are found to move, when an effect is switched on or off, and when Gaussians are
+added or retired. They are built from the scene's *roots*: Θ_0 plus the Gaussians added since, at the positions they
+would have had in frame 0.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ NEIGHBOUR_FALLOFF = 2000.0
 """Falloff of neighbour weights in 1/m²: a neighbour at distance d has weight exp(−falloff d²) (Dynamic3DGaussians)."""
 
 MAX_BORN_SHARE = 0.5
-"""Maximum number of Gaussians added to a scene, as a fraction of the number in frame 0; limits memory."""
+"""Maximum number of Gaussians added to a scene, as a fraction of the number in frame 0; this limits memory use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +196,8 @@ class Preparation:
         """Rebuilds the update with newly detected moving Gaussians, for scenes without masks.
 
         A Gaussian that has moved once stays in the hierarchy. The labels become part of the state when the frame is
-        committed. Changed labels give a new hierarchy to which the previous motion does not apply, so the update is a
-        cold start.
+        committed. Changed labels produce a new hierarchy to which the previous motion does not apply, so the update is
+        a cold start.
 
         Args:
             prepared: current input of the next update.
@@ -216,7 +216,7 @@ class Preparation:
         """Returns the result of a learnt frame, and the input of the next update.
 
         Args:
-            prepared: input of the update that gave the result.
+            prepared: input of the update that produced the result.
             seen: observation of the frame, with the result of its update.
             may_change_population: whether Gaussians may be added or retired.
         """
@@ -242,7 +242,7 @@ class Preparation:
             seen: observation of the frame, with the result of its update.
 
         Raises:
-            ValueError: an effect changed rows in a way that is not allowed.
+            ValueError: if an effect changed rows in a way that is not allowed.
         """
         for name in names:
             one = effect(name)
@@ -307,7 +307,7 @@ def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
     if (0 if after.parents is None else len(after.parents)) != had + born:
         raise ValueError(f"effect {name}: parents must have one entry for each of {had + born} new Gaussians")
     if after.parents is not None and not ((after.parents >= NO_PARENT) & (after.parents < count - had)).all():
-        raise ValueError(f"effect {name}: a parent is not a row of the previous frame")
+        raise ValueError(f"effect {name}: parents must be rows of the previous frame")
 
 
 def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Named presets of the settings, and functions that apply changes to settings."""
+"""Named settings presets, and functions that apply changes to settings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ PRESETS: dict[str, Settings] = {
         static=StaticSettings(detail=0.3),
         update=UpdateSettings(iterations=45, cold_start_iterations=6.0, skip_tolerance=0.02),
     ),
-    # The paper's choices instead of this project's (docs/method.md); learning rates that the paper does not give are
+    # The paper's choices instead of this project's (docs/method.md); learning rates that the paper does not specify are
     # ours.
     "paper": Settings(
         update=UpdateSettings(
@@ -99,7 +99,7 @@ class SettingError(InputError):
         value: rejected value.
         fault: user-facing description of the problem.
         remedy: user-facing description of valid input.
-        validation: error raised by pydantic; None for an unknown preset or contradictory effects.
+        validation: error raised by pydantic, or None for an unknown preset or contradictory effects.
     """
 
     def __init__(
@@ -113,10 +113,11 @@ class SettingError(InputError):
 
 
 def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
-    """Returns the preset ``name`` with changes as nested mappings; later changes take precedence.
+    """Returns the preset ``name`` after applying changes (nested mappings); later changes take precedence.
 
     Raises:
-        SettingError: the preset or a setting does not exist, a value is out of range, or effects contradict each other.
+        SettingError: if the preset or a setting does not exist, a value is out of range, or effects contradict each
+            other.
 
     >>> preset("adaptive").update.iterations
     50
@@ -125,15 +126,15 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
     """
     if name not in PRESETS:
         known = ", ".join(sorted(PRESETS))
-        raise SettingError("preset", name, "there is no preset with this name", f"give one of {known}")
+        raise SettingError("preset", name, "no such preset", f"choose from {known}")
     return changed(PRESETS[name], *changes)
 
 
 def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
-    """Returns the settings with changes as nested mappings; later changes take precedence.
+    """Returns the settings after applying changes (nested mappings); later changes take precedence.
 
     Raises:
-        SettingError: a setting does not exist, a value is out of range, or effects contradict each other.
+        SettingError: if a setting does not exist, a value is out of range, or effects contradict each other.
 
     >>> changed(preset("adaptive"), {"update": {"iterations": 20}}).update.iterations
     20
@@ -170,7 +171,7 @@ def _setting_error(error: ValidationError) -> SettingError:
     more = f" (and {others} more)" if others else ""
     remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":
-        fault = "there is no setting with this name"
+        fault = "no such setting"
         if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):
             remedy = f"did you mean {near[0]}? {remedy}"
     elif first["type"] == "value_error":
@@ -189,7 +190,7 @@ def _place(loc: Iterable[int | str]) -> str:
 
 
 def _description(loc: Iterable[int | str]) -> str:
-    """Returns the documented description of a setting; empty if it has none.
+    """Returns the documented description of a setting, or an empty string if it has none.
 
     >>> _description(("scene", "image_scale", "float"))
     'Factor by which images are resized before any other step.'

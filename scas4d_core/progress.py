@@ -1,4 +1,4 @@
-"""Progress reports of a long task, such as the fit of the first frame."""
+"""Progress reports for long tasks, such as the fit of the first frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Progress:
         stage: description of the current stage.
         done: number of completed steps.
         total: total number of steps.
-        detail: further named values, such as the loss.
+        detail: additional named values, such as the loss.
     """
 
     stage: str

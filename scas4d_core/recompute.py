@@ -41,22 +41,22 @@ def recompute(
         base: index of the previous committed frame.
         frame: damaged frame with its images.
         budget: budget that applied to the frame, as keyword arguments of ``Reconstruction.set_budget``.
-        dropped: cameras excluded by the caller, with the reason.
+        dropped: maps each camera excluded by the caller to the reason.
         notes: additional JSON data to commit.
 
     Returns:
         The report written with the state.
 
     Raises:
-        HistoryError: the first frame or ``base`` cannot be read.
-        StepError: the frame does not follow ``base``, or its images do not fit.
+        HistoryError: if the first frame or ``base`` cannot be read.
+        StepError: if the frame does not follow ``base``, or its images do not match the rig.
     """
     scratch = Reconstruction.fork(rig, settings, history, base)
     scratch.may_change_population = False  # later states already contain the Gaussians added and retired in this frame
     scratch.set_budget(**budget)
     made = scratch.step(frame, dropped=dropped, notes={**(notes or {}), RECOMPUTED: True})
     if made.outcome.rejected:  # nothing was learnt from the images
-        raise StepError(f"frame {frame.index} does not fit the frame before it: {made.degraded}")
+        raise StepError(f"frame {frame.index} does not fit the previous frame: {made.degraded}")
     report = scratch.history.report(frame.index)
     arrays = history.complete_state(frame.index, scratch.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}

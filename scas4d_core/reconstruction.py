@@ -70,7 +70,7 @@ class Reconstruction(CommittedScene):
     A process should call ``warm_up.compile_in_processes`` first; otherwise kernels may be compiled in this process.
 
     Attributes:
-        calibrated: training cameras in the user's world, as given or as refined with frame 0.
+        calibrated: training cameras in the user's world, either as given or as refined in frame 0.
         rig: training cameras in the internal world, at the scaled image size.
         settings: settings of the scene.
         device: device that fits and updates the scene.
@@ -99,7 +99,7 @@ class Reconstruction(CommittedScene):
             rig: training cameras in the user's world, at the size of the images.
             settings: settings of the scene.
             history: history to commit to.
-            found: calibration found in frame 0; None to use the calibration in the history.
+            found: calibration found in frame 0, or None to use the calibration in the history.
         """
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
@@ -143,20 +143,20 @@ class Reconstruction(CommittedScene):
             rig: training cameras in the user's world and units, at the size of the frame's images.
             frame: first frame, with images of all, or at least most, cameras; with masks if available.
             settings: settings of the scene.
-            points: initial point cloud in the user's world; None to compute it from the images.
+            points: initial point cloud in the user's world, or None to compute it from the images.
             progress: function called with the progress of each stage.
-            history: history to commit to; None for a new one in memory.
+            history: history to commit to, or None for a new one in memory.
             static: existing fit of frame 0, used unchanged.
-            dropped: cameras excluded by the caller, with the reason; committed with the report.
+            dropped: maps each camera excluded by the caller to the reason; committed with the report.
             notes: additional JSON data to commit.
             started: ``perf_counter`` value at which decoding and loading of kernels began, for the stage "load".
 
         Raises:
-            RigError: the rig cannot work with these settings.
-            ValueError: the time is not finite, or the images have a different size.
+            RigError: if the rig is unusable with these settings.
+            ValueError: if the time is not finite, or the images have a different size.
         """
         if not isfinite(frame.time):
-            raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
+            raise ValueError(f"frame {frame.index}: time must be finite; got {frame.time} s")
         if static is None:
             check_rig(rig, settings.scene, None if points is None else points.positions)
         began, on_progress = perf_counter(), progress or (lambda _: None)
@@ -201,13 +201,13 @@ class Reconstruction(CommittedScene):
         intact newest state is preferred to bit-identical results: the scene resumes from that state with a cold start.
 
         Args:
-            rig: training cameras as given to ``start``.
-            settings: settings as given to ``start``.
+            rig: training cameras that were passed to ``start``.
+            settings: settings that were passed to ``start``.
             history: history of the scene on disk, opened with ``History.open``.
-            held: returns whether the images of a committed frame can be sent again.
+            held: function that returns whether the images of a committed frame can be sent again.
 
         Raises:
-            ResumeError: the history has no frame, or its first state or every state is damaged.
+            ResumeError: if the history has no frame, or its first state or every state is damaged.
         """
         if history.directory is None or not history.indices:
             raise ResumeError("the history contains no committed frame; start the scene with its first frame")
@@ -222,7 +222,7 @@ class Reconstruction(CommittedScene):
             index, cold_start(history, index, self._fixed.masked) if left is None else left
         )
         if left is not None and not same:
-            faults.append("the clusters differ from those before the restart: the next update starts without motion")
+            faults.append("the clusters differ from those before the restart, so the next update starts without motion")
         self.resumed = ResumePoint(index, history.truncate(index), faults, cold=left is None or not same)
         self._checkpoints.clean(history.indices)
         if self.resumed.cold:
@@ -242,13 +242,13 @@ class Reconstruction(CommittedScene):
         """Returns an in-memory copy that continues from a committed frame with a cold start; ``history`` is only read.
 
         Args:
-            rig: training cameras as given to ``start``.
-            settings: settings as given to ``start``; the update settings may differ.
+            rig: training cameras that were passed to ``start``.
+            settings: settings that were passed to ``start``; the update settings may differ.
             history: history of the scene.
             index: index of a committed frame.
 
         Raises:
-            HistoryError: the frame or the first frame cannot be read.
+            HistoryError: if the frame or the first frame cannot be read.
         """
         copy = history.copy_frames((history.indices[0], index))
         self = cls(rig, with_recorded_background(settings, copy), copy)
@@ -257,7 +257,7 @@ class Reconstruction(CommittedScene):
         return self
 
     def _prepare_from_commit(self, index: int, carried: CarryOver) -> bool:
-        """Prepares the updates after a commit; returns False if its stored motion does not fit the current clusters."""
+        """Prepares the updates after a commit, and returns whether its stored motion fits the current clusters."""
         roots = self.history.roots(index)
         self._fixed = replace(self._fixed, lengths=axis_lengths(roots))
         self._prepared = self._preparation.rebuild(roots, carried)
@@ -275,13 +275,14 @@ class Reconstruction(CommittedScene):
 
         Args:
             frame: next frame, later than the last one, with an image of at least one camera.
-            dropped: cameras excluded by the caller, with the reason; committed with the report.
+            dropped: maps each camera excluded by the caller to the reason; committed with the report.
             notes: additional JSON data to commit.
-            started: ``perf_counter`` value at which work on the frame began and its time budget starts; None for now.
+            started: ``perf_counter`` value at which work on the frame began and its time budget starts, or None for the
+                current time.
 
         Raises:
-            StepError: the frame is not later than the last one, has no image of a camera of the rig, or an image has a
-                different size.
+            StepError: if the frame is not later than the last one, has no image of a camera of the rig, or an image has
+                a different size.
         """
         seconds, watch = self._seconds_to(frame), Stopwatch(started)
         frame = replace(frame, images=dict(frame.images))  # a capture decodes images on every access
@@ -308,7 +309,7 @@ class Reconstruction(CommittedScene):
         watch.lap("judge")
 
     def _prepare(self, context: FrameContext) -> None:
-        """Finds the moving Gaussians if there are no masks, and collects the input of the update."""
+        """Detects moving Gaussians if there are no masks, and collects the input of the update."""
         observed, frame, prepared, newest = context.frame_input, context.frame, self._prepared, self.history.newest
         believed, learns = observed.believed, observed.steady and self._learns_labels
         if learns and prepared.carried.seen:
@@ -400,7 +401,7 @@ class Reconstruction(CommittedScene):
 
     @property
     def _learns_labels(self) -> bool:
-        """Whether moving Gaussians are detected from motion: there are no masks, and an effect requires it."""
+        """Whether moving Gaussians are detected from motion, because there are no masks and an effect requires it."""
         return self._prepared.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
@@ -410,7 +411,9 @@ class Reconstruction(CommittedScene):
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
         seconds = frame.time - self.history.time(last)
         if not 0 < seconds < inf:
-            raise StepError(f"frame {frame.index}: time {frame.time} s is not after {self.history.time(last)} s")
+            raise StepError(
+                f"frame {frame.index}: time {frame.time} s is not after the last frame, at {self.history.time(last)} s"
+            )
         return seconds
 
     def _views(self, frame: Frame) -> list[TrainingView]:
@@ -428,7 +431,7 @@ class Reconstruction(CommittedScene):
         stop_gain: float | None = None,
         skip_tolerance: float | None = None,
     ) -> None:
-        """Changes the budget of later updates; each value that is None is reset to the settings.
+        """Changes the budget of later updates. Each value that is None is reset to the settings.
 
         Args:
             iterations: number of iterations per frame.
@@ -437,7 +440,7 @@ class Reconstruction(CommittedScene):
             skip_tolerance: relative increase of the error up to which an update is skipped.
 
         Raises:
-            ValueError: a value is out of the range given in ``UpdateSettings``.
+            ValueError: if a value is outside the range specified in ``UpdateSettings``.
         """
         given = {
             "iterations": iterations,

@@ -22,7 +22,7 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 Decode = Callable[[], tuple[Frame, Mapping[str, str]]]
-"""Decodes the images of a frame on each call; also returns the excluded cameras, with the reason."""
+"""Function that decodes the images of a frame on each call, and returns the reason for each excluded camera."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class ReplayResult:
     Attributes:
         iterations: number of iterations per frame.
         milliseconds: median time per frame from decoding to the end of the update, without writing.
-        error: mean image loss of the kept state on the probe views; None if the settings disable the checks.
-        psnr: mean PSNR in dB of the training views as last rendered; None if not measured.
+        error: mean image loss of the kept state on the probe views, or None if the settings disable the checks.
+        psnr: mean PSNR in dB of the training views as last rendered, or None if not measured.
         frames: number of measured frames.
     """
 
@@ -65,8 +65,8 @@ def replay(
         over: function called at the end of each update.
 
     Raises:
-        HistoryError: ``base`` cannot be read.
-        StepError: a frame does not follow the previous one.
+        HistoryError: if ``base`` cannot be read.
+        StepError: if a frame does not follow the previous one.
     """
     update = settings.update.model_copy(
         update={"iterations": iterations, "budget_ms": None, "stop_gain": 0.0, "skip_tolerance": -1.0}

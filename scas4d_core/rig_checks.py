@@ -1,4 +1,4 @@
-"""Checks of a rig before a scene starts: errors for rigs that cannot work, warnings for likely mistakes. NumPy only.
+"""Checks of a rig before a scene starts: errors for unusable rigs, warnings for likely mistakes. Requires only NumPy.
 
 Importers, the service and ``reconstruct`` use the same functions, so that their messages are identical.
 """
@@ -42,7 +42,7 @@ SEEN_AT_ALL = 0.1
 """Minimum fraction of a cloud that must be in view of at least one camera."""
 FAR = 100.0
 """Median distance of the points from the rig centre, in rig radii, above which their unit or world is probably wrong.
-Not used if all cameras look in the same direction, because the distance is then unlimited."""
+Not used if all cameras look in the same direction, because the distance is then unbounded."""
 ONE_WAY = 0.9
 """Length of the mean viewing direction above which the cameras count as looking in the same direction."""
 
@@ -51,7 +51,7 @@ USUAL_RADIUS = 60.0
 
 
 class RigError(CameraError):
-    """Raised if a rig, or settings for it, cannot work.
+    """Raised if a rig, or its settings, are unusable.
 
     Attributes:
         field: dotted name of the field, as in a request to the service.
@@ -64,11 +64,11 @@ class RigError(CameraError):
 
 
 def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
-    """Rejects rigs, settings and initial points that cannot work, before images are read.
+    """Rejects unusable rigs, settings and initial points before images are read.
 
     Args:
         rig: rig in the user's world, at image size.
-        scene: scene settings, of which the unit and the image scale are used.
+        scene: scene settings; only the unit and the image scale are used.
         positions: [P, 3] point cloud in the user's world, or None.
 
     Raises:
@@ -81,20 +81,20 @@ def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
 
 
 def check_scene(rig: Rig, scene: SceneSettings) -> None:
-    """Rejects rigs and settings that cannot work with any images.
+    """Rejects rigs and settings that are unusable with any images.
 
     Args:
         rig: rig in the user's world, at image size.
-        scene: scene settings, of which the unit and the image scale are used.
+        scene: scene settings; only the unit and the image scale are used.
 
     Raises:
-        RigError: the focal lengths, the image size or the extent of the rig are out of range.
+        RigError: if the focal lengths, the image size or the extent of the rig are out of range.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> check_scene(Rig((camera,)), SceneSettings(image_scale=0.25))
     >>> check_scene(Rig((camera,)), SceneSettings(image_scale=0.1))
     Traceback (most recent call last):
-    scas4d_core.rig_checks.RigError: image_scale 0.1 leaves 6x5 of 64x48 pixels for camera 'front'; give at least 0.23
+    scas4d_core.rig_checks.RigError: image_scale 0.1 reduces camera 'front' from 64x48 to 6x5 pixels; use at least 0.23
     """
     for number, camera in enumerate(rig.cameras):
         longer = max(camera.width, camera.height)
@@ -103,7 +103,7 @@ def check_scene(rig: Rig, scene: SceneSettings) -> None:
                 raise RigError(
                     f"camera {camera.name!r}: focal length {focal:g} px is {focal / longer:.3g} times the longer image "
                     f"side of {longer} px",
-                    f"give focal lengths in pixels, {FOCAL_LENGTHS[0] * longer:g} to {FOCAL_LENGTHS[1] * longer:g}",
+                    f"use focal lengths in pixels, {FOCAL_LENGTHS[0] * longer:g} to {FOCAL_LENGTHS[1] * longer:g}",
                     f"rig.cameras.{number}.intrinsics",
                     focal,
                 )
@@ -118,14 +118,14 @@ def _too_small(camera: Camera, small: Camera, number: int, scale: float) -> None
     if least > 1:
         raise RigError(
             f"camera {camera.name!r} has {camera.width}x{camera.height} pixels",
-            f"give images of at least {SMALLEST_SIDE} pixels per side",
+            f"use images of at least {SMALLEST_SIDE} pixels per side",
             f"rig.cameras.{number}",
             f"{camera.width}x{camera.height}",
         )
     raise RigError(
-        f"image_scale {scale:g} leaves {small.width}x{small.height} of {camera.width}x{camera.height} pixels for "
-        f"camera {camera.name!r}",
-        f"give at least {np.ceil(100 * least) / 100:g}",
+        f"image_scale {scale:g} reduces camera {camera.name!r} from {camera.width}x{camera.height} to "
+        f"{small.width}x{small.height} pixels",
+        f"use at least {np.ceil(100 * least) / 100:g}",
         "settings.scene.image_scale",
         scale,
     )
@@ -138,7 +138,7 @@ def _check_extent(rig: Rig, scene: SceneSettings) -> None:
     if not RADII[0] <= radius <= RADII[1]:
         raise RigError(
             f"metres_per_unit {scene.metres_per_unit:g} gives a rig radius of {radius:.3g} m",
-            "give the number of metres per calibration unit, or 'auto'",
+            "use the number of metres per calibration unit, or 'auto'",
             "settings.scene.metres_per_unit",
             scene.metres_per_unit,
         )
@@ -148,19 +148,19 @@ def check_start(rig: Rig, has_points: bool) -> None:
     """Rejects a start without points if all cameras are at the same position, because depth cannot be estimated.
 
     Raises:
-        RigError: there are no points, and only one camera or all cameras at the same position.
+        RigError: if there are no points, and all cameras (or the only one) are at the same position.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> check_start(Rig((Camera("front", lens, np.eye(4), 64, 48),)), has_points=False)
     Traceback (most recent call last):
-    scas4d_core.rig_checks.RigError: one camera, and no points: distances are unknown; give points ...
+    scas4d_core.rig_checks.RigError: there is only one camera and there are no points, so distances are unknown; ...
     """
     if has_points or not rig.at_one_place:
         return
-    which = "one camera" if len(rig) == 1 else f"all {len(rig)} cameras are at one place"
+    which = "there is only one camera" if len(rig) == 1 else f"all {len(rig)} cameras are at the same position"
     raise RigError(
-        f"{which}, and no points: distances are unknown",
-        "give points of the first frame, or cameras at different positions",
+        f"{which} and there are no points, so distances are unknown",
+        "provide points of the first frame, or cameras at different positions",
         "points",
         "nothing",
     )
@@ -170,15 +170,15 @@ def check_points(rig: Rig, positions: Float) -> None:
     """Rejects points [P, 3] in the user's world if all of them are behind all cameras.
 
     Raises:
-        RigError: no camera can see any point.
+        RigError: if no camera can see any point.
     """
     for cloud in (_some(positions), positions):  # a small sample is usually sufficient
         if any((camera.to_camera(cloud)[:, 2] > 0).any() for camera in rig.cameras):
             return
     raise RigError(
         "all points are behind all cameras",
-        "give world_to_camera with OpenCV axes (z forward), and points in the same world; camera-to-world poses must "
-        "be inverted",
+        "use world_to_camera with OpenCV axes (z forward) and points in the same world; camera-to-world poses must be "
+        "inverted",
         "points",
         f"{len(positions)} points",
     )
@@ -189,7 +189,7 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
 
     Args:
         rig: rig in the user's world.
-        scene: scene settings, of which the unit is used.
+        scene: scene settings; only the unit is used.
         positions: [P, 3] point cloud in the user's world, or None.
     """
     poses = pose_warnings(rig, positions)
@@ -198,13 +198,13 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
 
 
 def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
-    """Returns a warning if the size of the rig suggests that ``metres_per_unit`` is wrong; otherwise empty.
+    """Returns a list with a warning if the rig's size suggests that ``metres_per_unit`` is wrong, or an empty list.
 
     >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> there[0, 3] = 4000
     >>> rig = Rig((Camera("0", lens, np.eye(4), 64, 48), Camera("1", lens, there, 64, 48)))
     >>> unit_warnings(rig, SceneSettings())
-    ["the cameras are up to 2e+03 m from their centre with scene.metres_per_unit 1: for a calibration in milli..."]
+    ["the cameras are up to 2e+03 m from their centre with scene.metres_per_unit 1; use 0.001 for a calibration..."]
     >>> unit_warnings(rig, SceneSettings(metres_per_unit=0.001))
     []
     """
@@ -215,13 +215,13 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
     if radius <= USUAL_RADIUS:
         return []
     return [
-        f"the cameras are up to {radius:.3g} m from their centre with scene.metres_per_unit {unit:g}: "
-        "for a calibration in millimetres give 0.001, in centimetres 0.01, or 'auto'; some limits are in metres"
+        f"the cameras are up to {radius:.3g} m from their centre with scene.metres_per_unit {unit:g}; use 0.001 for "
+        "a calibration in millimetres, 0.01 for centimetres, or 'auto', because some limits are in metres"
     ]
 
 
 def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
-    """Returns a warning if hardly any points [P, 3] are in view, or if they are far away; otherwise empty.
+    """Returns a list with a warning if hardly any points [P, 3] are in view or they are far away, or an empty list.
 
     >>> lens, beside = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside[0, 3] = -0.2
@@ -229,29 +229,29 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
     >>> cloud_warnings(rig, np.array([[0.1, 0, 3]]))
     []
     >>> cloud_warnings(rig, np.array([[8, 0, 3]]))
-    ['the cameras see only 0% of the points: give points in the world and unit of the calibration']
+    ['the cameras see only 0% of the points; provide points in the world and unit of the calibration']
     """
     if len(rig) < 2 or rig.at_one_place or not len(positions):
         return []
     some = _some(positions)
-    world = "give points in the world and unit of the calibration"
+    world = "provide points in the world and unit of the calibration"
     away = float(np.median(np.linalg.norm(some - rig.centre, axis=1))) / rig.radius
     if away > FAR and np.linalg.norm(np.mean([camera.rotation[2] for camera in rig.cameras], axis=0)) < ONE_WAY:
-        return [f"the points are {away:.0f} rig radii away from the rig: {world}"]
+        return [f"the points are {away:.0f} rig radii away from the rig; {world}"]
     seen = float(np.mean(np.any(_seen(rig.cameras, some), axis=0)))
     if seen < SEEN_AT_ALL:
-        return [f"the cameras see only {seen:.0%} of the points: {world}"]
+        return [f"the cameras see only {seen:.0%} of the points; {world}"]
     return []
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
-    """Returns warnings about poses that appear to be inverted (camera to world); empty without evidence.
+    """Returns warnings about poses that appear to be inverted (camera to world), or an empty list without evidence.
 
-    The evidence with points: few of them are in view, but many would be with inverted poses. The evidence without
-    points: the viewing axes meet neither in front of nor behind the cameras, but would meet in nearly all images with
-    inverted poses. The axes of outward-looking rigs meet behind the cameras; those of rigs that look in one direction
-    never meet. With poses relative to one of the cameras, the axes often meet in both cases. Nothing is reported then,
-    because only the images could decide.
+    With points, the evidence is that few of them are in view, but many would be with inverted poses. Without points,
+    the evidence is that the viewing axes meet neither in front of nor behind the cameras, but would meet in nearly all
+    images with inverted poses. The axes of outward-looking rigs meet behind the cameras; those of rigs that look in one
+    direction never meet. With poses relative to one of the cameras, the axes often meet in both cases. Nothing is
+    reported then, because only the images could decide.
 
     Args:
         rig: rig in the user's world; without points, it is checked only if it has at least three cameras.
@@ -266,7 +266,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     >>> pose_warnings(Rig(tuple(ring)))
     []
     >>> pose_warnings(Rig(tuple(_inverted(camera) for camera in ring)))[0]
-    'the poses seem to be inverted, camera to world instead of world to camera: the viewing axes ...'
+    'the poses seem to be inverted (camera to world instead of world to camera): the viewing axes ...'
     """
     if positions is not None and len(positions):
         some = _some(positions)
@@ -276,7 +276,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
         other = float(np.mean(_seen([_inverted(camera) for camera in rig.cameras], some)))
         if other < POINTS_SEEN or given > FEW_SEE * other:
             return []
-        evidence = f"{given:.0%} of the points are in view of a camera on average, {other:.0%} with inverted poses"
+        evidence = f"a camera sees {given:.0%} of the points on average, but {other:.0%} with inverted poses"
     else:
         if len(rig) < LEAST_CAMERAS:
             return []
@@ -284,9 +284,9 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
         given, other = _come_together(rig.cameras, behind=True), _come_together(turned, behind=False)
         if given > FEW_SEE or other < MAX_SEE:
             return []
-        evidence = f"the viewing axes of {given:.0%} of the cameras meet, {other:.0%} with inverted poses"
+        evidence = f"the viewing axes of {given:.0%} of the cameras meet, but {other:.0%} with inverted poses"
     return [
-        f"the poses seem to be inverted, camera to world instead of world to camera: {evidence}; if so, invert them"
+        f"the poses seem to be inverted (camera to world instead of world to camera): {evidence}; if so, invert them"
     ]
 
 

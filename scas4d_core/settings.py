@@ -39,7 +39,7 @@ class SceneSettings(SettingsModel):
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
         description="Metres per unit of the calibration. 'auto' scales the rig radius to 3 m. A single camera does not "
-        "determine the scale: give a number that places the subject about 3 m away.",
+        "determine the scale: set a number that puts the subject about 3 m away.",
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Factor by which images are resized before any other step.")
     background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
@@ -66,7 +66,7 @@ class SceneSettings(SettingsModel):
     @classmethod
     def _points_somewhere(cls, floor: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if floor is not None and not any(floor[:3]):
-            raise InputError(f"floor {floor} has no direction", "give (a, b, c, d) with (a, b, c) pointing down")
+            raise InputError(f"floor {floor} has a zero normal", "use (a, b, c, d) with (a, b, c) pointing down")
         return floor
 
 
@@ -81,18 +81,18 @@ class StaticSettings(SettingsModel):
     seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
         110.0,
         description="Time limit for frame 0 in seconds, covering the initial points and the fit. If it is too short, "
-        "points are searched coarsely and the fit has fewer iterations (at least 500), so the result depends on the "
-        "machine. No limit if None.",
+        "the search for points is coarser and the fit has fewer iterations (at least 500), so the result depends on "
+        "the machine. No limit if None.",
     )
     stop_gain: Share = Field(
         0.0,
         description="Frame 0 stops early when no more Gaussians are added and five passes over all views reduce the "
-        "mean training loss by less than this fraction. 0 never stops early; 0.01 saves time on simple scenes.",
+        "mean training loss by less than this fraction. 0 disables early stopping; 0.01 saves time on simple scenes.",
     )
     max_gaussians: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
         None,
         description="Maximum number of Gaussians, at which densification stops. If None, 0.34 per pixel of a training "
-        "image and 0.27 more per foreground pixel, at most 100,000 (25,000 for an object at 256x256).",
+        "image plus 0.27 per foreground pixel, at most 100,000 (25,000 for an object at 256x256).",
     )
     detail: float = Field(
         1.0, gt=0, le=1, description="Factor on the default number of Gaussians, used if max_gaussians is None."
@@ -105,8 +105,8 @@ class StaticSettings(SettingsModel):
     )
     refine_calibration: bool = Field(
         default=False,
-        description="Refine the camera poses on image features of frame 0. The result is used only if it reduces the "
-        "error of held-out features.",
+        description="Refine the camera poses using image features of frame 0. The result is used only if it reduces "
+        "the error of held-out features.",
     )
     seed: int = Field(0, ge=0, description="Random seed for the order of views and the splitting of Gaussians.")
 
@@ -123,8 +123,8 @@ class Weights(SettingsModel):
 
     mask: NotNegative = Field(
         1.0,
-        description="Weight of the image loss between the rendered label and the mask, if masks are given and at least "
-        "a tenth of the Gaussians are static. It separates moving from static Gaussians.",
+        description="Weight of the image loss between the rendered label and the mask, which separates moving from "
+        "static Gaussians; used if masks are given and at least a tenth of the Gaussians are static.",
     )
     mask_alone: NotNegative = Field(
         0.3,
@@ -138,8 +138,8 @@ class Weights(SettingsModel):
     )
     isometry: NotNegative = Field(
         6.0,
-        description="Weight of the isometry loss, three times the authors' weight: it preserves distances, allows "
-        "bending, and only helps.",
+        description="Weight of the isometry loss, three times the authors' weight. It preserves distances and allows "
+        "bending.",
     )
     rotation: NotNegative = Field(4.0, description="Weight of the rotation loss, as in Dynamic3DGaussians.")
     scale: NotNegative = Field(
@@ -170,7 +170,7 @@ class UpdateSettings(SettingsModel):
     stop_gain: Share = Field(
         0.0,
         description="An update decays its learning rates and ends once ten iterations reduce its error on the probe "
-        "views by less than this fraction, after all layers have started. 0 never ends an update early.",
+        "views by less than this fraction, after all layers have started. 0 disables early stopping.",
     )
     skip_tolerance: float = Field(
         0.0,
@@ -187,8 +187,8 @@ class UpdateSettings(SettingsModel):
         10,
         ge=1,
         le=1_000_000,
-        description="After this many consecutive rejected frames, accept the next one as a new scene. Dark frames do "
-        "not count. Lighting that lasts this long is learnt as that of the scene.",
+        description="Number of consecutive frames that do not fit; the last one is accepted as a new scene. Dark "
+        "frames do not count. A lighting change that lasts this long is accepted as the scene's normal lighting.",
     )
     clusters: tuple[Count, ...] = Field(
         (64, 320, 1280),
@@ -250,14 +250,16 @@ class UpdateSettings(SettingsModel):
         0.0, description="Fraction of the previous residual motion, beyond that of the layers, with which Δp starts."
     )
     weights: Weights = Field(default_factory=Weights)
-    use_masks: bool = Field(True, description="Use the masks of frames that have any.")
+    use_masks: bool = Field(True, description="Use masks in frames that have them.")
     seed: int = Field(0, ge=0, description="Random seed for the order of views and the sampling of neighbours.")
 
     @field_validator("clusters")
     @classmethod
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
         if list(clusters) != sorted(set(clusters)):
-            raise InputError(f"clusters {clusters} are not ascending", "give the coarsest layer first, the finest last")
+            raise InputError(
+                f"clusters {clusters} are not ascending", "list the coarsest layer first and the finest last"
+            )
         return clusters
 
 
@@ -279,7 +281,7 @@ class Settings(SettingsModel):
     update: UpdateSettings = Field(default_factory=UpdateSettings)
     effects: dict[str, Mode] = Field(
         default_factory=dict,
-        description='Effects (docs/effects.md) that are pinned "on" or "off", keyed by name; all others are "auto" and '
+        description='Effects (docs/effects.md) pinned to "on" or "off", keyed by name; all others are "auto" and are '
         "switched on if the scene needs them.",
     )
     device: Literal["auto", "cpu", "gpu"] = Field(
@@ -291,7 +293,7 @@ class Settings(SettingsModel):
     @classmethod
     def _has_an_engine(cls, device: object) -> object:
         if device not in ("auto", "cpu", "gpu"):
-            raise InputError(f"device {device!r} is not supported", "give 'auto', 'cpu' or 'gpu'")
+            raise InputError(f"device {device!r} is not supported", "choose 'auto', 'cpu' or 'gpu'")
         return device
 
     @field_validator("effects")
@@ -301,5 +303,5 @@ class Settings(SettingsModel):
             if name not in EFFECTS:
                 near = difflib.get_close_matches(name, EFFECTS, 1)
                 remedy = f"did you mean {near[0]}? " if near else ""
-                raise InputError(f"{name} is not an effect", f"{remedy}docs/effects.md lists all effects")
+                raise InputError(f"unknown effect {name!r}", f"{remedy}docs/effects.md lists all effects")
         return effects

@@ -20,7 +20,7 @@ _settled: set[KernelGroup] = set()
 def compile_in_processes(
     wanted: Iterable[KernelGroup] = EVERY, *, then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> None:
-    """Waits until all kernels of the groups ``wanted`` are in the cache; requests each group once per process.
+    """Waits until all kernels of the groups ``wanted`` are in the cache; each group is requested once per process.
 
     Args:
         wanted: kernel groups to wait for.
@@ -44,7 +44,7 @@ def update_groups(covariance: str) -> tuple[KernelGroup, ...]:
 
 
 def warm_up(on_progress: OnProgress) -> None:
-    """Waits until the kernels of a first frame are in the cache; those of updates are compiled afterwards."""
+    """Waits until the kernels of a first frame are in the cache; the kernels of updates are compiled afterwards."""
     compile_in_processes((KernelGroup.FIRST_FRAME,), then=groups_of_update("entangled"), on_progress=on_progress)
 
 

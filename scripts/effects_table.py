@@ -10,13 +10,20 @@ from scas4d_core.effects.effect import effect
 
 PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
 BEGIN, END = "<!-- effects -->\n", "<!-- end -->"
+CONDITIONS = {
+    "floor": "with a floor plane",
+    "mask_term": "with masks",
+    "shadows": "with static Gaussians; later by evidence",
+    "static_colour": "no, only if pinned",
+}
+"""When an effect is on by default, if neither always nor only by evidence."""
 
 
 def table() -> str:
     """Returns a Markdown table with one row per effect, in registry order."""
     lines = ["| effect | group | models | on by default |", "|---|---|---|---|"]
     for one in map(effect, EFFECTS):
-        on = "by evidence" if one.auto else "yes"
+        on = CONDITIONS.get(one.name, "by evidence" if one.auto else "yes")
         lines.append(f"| `{one.name}` | {one.group.value} | {one.description} | {on} |")
     return "\n".join(lines) + "\n"
 

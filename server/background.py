@@ -1,4 +1,4 @@
-"""Background tasks of a scene, kept alive until they finish and cancelled when the scene ends."""
+"""A scene's background tasks, kept alive until they finish and cancelled when the scene is closed."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 
 class Background:
-    """Background tasks of a scene, with strong references so that they are not garbage-collected.
+    """A scene's background tasks, held by strong references to prevent garbage collection.
 
     Args:
-        failed: called with the exception if a task raises one.
+        failed: callback for exceptions raised by tasks.
     """
 
     def __init__(self, failed: Callable[[BaseException], None]) -> None:

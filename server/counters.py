@@ -48,7 +48,8 @@ UPDATE_SECONDS = Histogram(
 )
 QUERY_SECONDS = Histogram(
     "scas4d_query_seconds",
-    "Time until a scene's reader answers a query, by kind (render, tracks, parts, gaussians, ply) and outcome.",
+    "Time until a scene's reader answers a query, by outcome and kind: render, tracks, parts, labels, gaussians, ply, "
+    "compact.",
     ["kind", "outcome"],
     buckets=SECONDS,
     registry=registry,

@@ -49,7 +49,7 @@ class Listener(Protocol):
         """Handles the deletion of the scene."""
 
     def on_restart(self) -> None:
-        """Handles the restart of the scene, after which the listener can join again."""
+        """Handles the restart of the scene; the listener can rejoin afterwards."""
 
 
 L = TypeVar("L", bound=Listener)
@@ -95,10 +95,10 @@ class Hub:
         if len(channel.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"this scene already has the maximum number of subscribers, {len(channel.listeners)}",
+                f"this scene already has the maximum number of subscribers ({len(channel.listeners)})",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
-                remedy="close another subscriber of the scene, or raise the limit",
+                remedy="disconnect another subscriber of the scene, or raise the limit",
                 headers={"Retry-After": "5"},
             )
         self._channels[scene] = channel
@@ -123,7 +123,7 @@ class Hub:
     def publish(self, scene: str, event: Event) -> None:
         """Notifies every listener of a scene.
 
-        Never blocks and never raises, because a listener must not disturb the scene's own work.
+        Never blocks and never raises, because listeners must not disturb the scene's own work.
         """
         channel = self._channels.get(scene)
         if channel is None:
@@ -133,7 +133,7 @@ class Hub:
             try:
                 listener.on_event(event)
             except Exception:
-                log.exception("scene %s: a subscriber could not handle the event %s", scene, type(event).__name__)
+                log.exception("scene %s: a subscriber failed to handle event %s", scene, type(event).__name__)
 
     def close(self, scene: str, reason: str) -> None:
         """Closes the channel of a deleted scene and notifies its listeners."""
@@ -154,8 +154,8 @@ class Publisher:
     """Publisher of one scene's events that also updates the frame metrics.
 
     Args:
-        hub: hub of the service.
-        scene: id of the scene.
+        hub: the service's event hub.
+        scene: scene id.
     """
 
     def __init__(self, hub: Hub, scene: str) -> None:

@@ -31,7 +31,7 @@ class SceneSpec:
     retention: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
     nodes: Mapping[str, str] = field(default_factory=dict)
-    """Labels required of a node that runs the scene's processes."""
+    """Labels that a node must have to run the scene's processes."""
 
 
 # Messages to the worker.
@@ -178,7 +178,7 @@ class RepairOutcome(StrEnum):
     REPORT_LOST = "report_lost"
     """The state was rewritten with identical contents; its report was damaged and is not in memory."""
     DAMAGED = "damaged"
-    """The file is damaged, and there is no copy in memory from which to rewrite it."""
+    """The file is damaged, and no copy in memory is available to rewrite it."""
     GONE = "gone"
     """The file is no longer needed: retention deleted its frame, or the frame was rolled back."""
     RECOMPUTED = "recomputed"

@@ -19,7 +19,7 @@ from scas4d_core.rig_checks import RigError
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
 """Maximum number of characters of a value quoted in a response, since the value may be a whole point cloud."""
-SERVICE_FAULT = "this is a bug in the service; the traceback is in its log"
+SERVICE_FAULT = "this is a bug in the service; see the traceback in the service log"
 """Remedy reported when the service itself failed."""
 
 
@@ -144,7 +144,10 @@ def openapi_document(app: FastAPI) -> dict[str, Any]:
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {"description": "The request is invalid; see field, value and remedy.", "model": ProblemDetails},
-    "5XX": {"description": "The service failed or is temporarily unavailable.", "model": ProblemDetails},
+    "5XX": {
+        "description": "An internal error occurred, or the service is temporarily unavailable.",
+        "model": ProblemDetails,
+    },
     422: {"description": "A field has an invalid value.", "model": ProblemDetails},
 }
 """Error responses that the OpenAPI document lists for every route."""

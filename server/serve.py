@@ -48,9 +48,9 @@ class Server(uvicorn.Server):
 def serve(settings: ServerSettings) -> None:
     """Runs the service until SIGTERM or SIGINT.
 
-    On a signal, it stops accepting connections, closes WebSockets (1012), responds to pending requests, and asks the
-    scenes' processes to exit within `STOP_SECONDS`. Unfinished frames remain in the frame log and are processed after
-    the next start.
+    On a signal, the service stops accepting connections, closes WebSockets (1012), completes in-flight requests, and
+    asks the scenes' processes to exit within `STOP_SECONDS`. Unfinished frames remain in the frame log and are
+    processed after the next start.
 
     Raises:
         RuntimeError: the address or the data folder is unavailable or already in use.
@@ -58,7 +58,7 @@ def serve(settings: ServerSettings) -> None:
     prepare = partial(logs.configure, settings.log_format, settings.log_level)
     prepare()
     for name in unknown_names(os.environ):
-        log.warning("%s is not a setting and was ignored; docs/service-settings.md lists all settings", name)
+        log.warning("ignoring unknown setting %s; docs/service-settings.md lists all settings", name)
     try:
         lock_data(settings.data).release()  # early check; the application takes the lock at startup
     except OSError as error:
@@ -97,7 +97,7 @@ def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placeme
         from server.cluster.ray_placement import RayPlacement
     except ModuleNotFoundError:
         raise RuntimeError(
-            "placement is ray, but Ray is not installed; pip install 'scas4d[ray]', or use --placement local"
+            "placement is ray, but Ray is not installed; run pip install 'scas4d[ray]', or use --placement local"
         ) from None
     return RayPlacement(prepare, settings.placement.partition("=")[2] or None, settings)
 
@@ -146,7 +146,7 @@ def listen(host: str, port: int) -> list[socket.socket]:
 
 
 class _AddressUnavailableError(Exception):
-    """Error for an address that this machine does not have, such as ::1 if IPv6 is disabled."""
+    """Error for an address that is unavailable on this machine, such as ::1 if IPv6 is disabled."""
 
 
 def _bind(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> socket.socket:

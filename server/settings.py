@@ -43,7 +43,7 @@ class SettingsError(ValueError):
 
 
 class ServerSettings(BaseSettings):
-    """Settings of the service, made by its operator."""
+    """Settings of the service, chosen by its operator."""
 
     model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
@@ -80,7 +80,8 @@ class ServerSettings(BaseSettings):
         gt=0,
         le=600,
         description=(
-            "Maximum seconds to send a header, from opening the connection or from the first byte of a later request."
+            "Time limit in seconds for sending a header, counted from the opening of the connection or the first byte "
+            "of a later request."
         ),
     )
     header_kb: int = Field(
@@ -93,26 +94,29 @@ class ServerSettings(BaseSettings):
         default=20.0,
         gt=0,
         le=3600,
-        description="Maximum seconds for every 16 kB of a request body, or for the rest if it is shorter.",
+        description="Time limit in seconds for every 16 kB of a request body, or for the remainder if it is shorter.",
     )
     keep_alive_seconds: float = Field(
         default=15.0,
         gt=0,
         le=3600,
         description=(
-            "Seconds until an idle connection is closed. Clients and proxies should close theirs earlier (httpx: 5 s)."
+            "Time in seconds until an idle connection is closed. Clients and proxies should close theirs "
+            "earlier (httpx: 5 s)."
         ),
     )
     unread_seconds: float = Field(
         default=30.0,
         gt=0,
         le=3600,
-        description=("Maximum seconds for a peer to read 16 kB of pending data before its connection is aborted."),
+        description=(
+            "Time limit in seconds for a peer to read 16 kB of pending data; after that, its connection is aborted."
+        ),
     )
     max_connections: int = Field(
         default=1024,
         ge=8,
-        description="Maximum number of open connections, limited to half of the open files allowed.",
+        description="Maximum number of open connections, reduced to half of the limit on open files if that is lower.",
     )
     max_connections_per_peer: int = Field(
         default=256,
@@ -133,8 +137,8 @@ class ServerSettings(BaseSettings):
     log_format: Literal["auto", "json", "text"] = Field(
         default="auto",
         description=(
-            "json: one object per line. text: plain lines, without successful reads. auto: text in a "
-            "terminal, otherwise json."
+            "Log format: json (one object per line), text (plain lines, without successful reads) or auto (text in a "
+            "terminal, otherwise json)."
         ),
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
@@ -144,25 +148,25 @@ class ServerSettings(BaseSettings):
     placement: str = Field(
         default="local",
         description=(
-            "Where the scenes' processes run. `local`: on this machine. `ray`: on the local Ray cluster, or "
-            "the one in RAY_ADDRESS. `ray=HOST:6379`: on that cluster (docs/cluster.md)."
+            "Where the scenes' processes run: `local` (this machine), `ray` (the local Ray cluster, or the one in "
+            "RAY_ADDRESS) or `ray=HOST:6379` (the cluster at that address; see docs/cluster.md)."
         ),
     )
     max_scenes: int = Field(
         default=8,
         ge=1,
-        description="Maximum number of awake scenes, each with up to three processes. The others are asleep.",
+        description="Maximum number of awake scenes, each with up to three processes; all others are asleep.",
     )
     sleep_seconds: float = Field(
         default=600.0,
         ge=0,
-        description="Seconds after which an unused scene falls asleep. 0: never.",
+        description="Time in seconds after which an unused scene falls asleep; 0 disables sleep.",
     )
     max_scene_memory_mb: float | None = Field(
         default=None,
         gt=0,
-        description="Maximum estimated memory of a scene, in MB; larger scenes are refused. Default: the machine's "
-        "memory.",
+        description="Maximum estimated memory of a scene, in MB; larger scenes are refused. Defaults to the "
+        "machine's memory.",
     )
     queue_frames: int = Field(
         default=4,
@@ -191,10 +195,12 @@ class ServerSettings(BaseSettings):
         ge=0,
         description=(
             "Rate at which each scene's files are reread to verify their checksums, reduced to a quarter "
-            "during updates. 0: never. 4 MB/s take half a percent of a core."
+            "during updates; 0 disables this check. Reading 4 MB/s takes half a percent of a core."
         ),
     )
-    scrub_pause_seconds: float = Field(default=600.0, gt=0, description="Seconds between scrub passes over a scene.")
+    scrub_pause_seconds: float = Field(
+        default=600.0, gt=0, description="Pause in seconds between scrub passes over a scene."
+    )
     warm_up: bool = Field(
         default=True,
         description=(
@@ -243,15 +249,15 @@ class ServerSettings(BaseSettings):
     @model_validator(mode="after")
     def _guarded(self) -> ServerSettings:
         if not re.fullmatch(r"local|ray(=\S+:\d+)?", self.placement):
-            raise ValueError(f"placement is {self.placement!r}; give local, ray, or ray=HOST:PORT")
+            raise ValueError(f"placement must be local, ray or ray=HOST:PORT; got {self.placement!r}")
         if self.token is not None and self.token_file is not None:
-            raise ValueError("token and token_file are both set; give only one")
+            raise ValueError("token and token_file are both set; set only one")
         if self.token_file is not None and not self.token_file.is_file():
             raise ValueError(f"token_file: file {self.token_file} does not exist")
         secret = self.secret
         if secret is not None and not TOKEN.fullmatch(secret):
             raise ValueError(
-                "the token must have 16 to 512 characters out of A-Z a-z 0-9 . _ ~ + / = -; generate one with: "
+                "the token must consist of 16 to 512 characters from A-Z a-z 0-9 . _ ~ + / = -; generate one with: "
                 'python -c "import secrets; print(secrets.token_urlsafe(32))"'
             )
         if secret is None and not is_loopback(self.host):
@@ -281,7 +287,7 @@ class ServerSettings(BaseSettings):
         read = source()
         file = environment.get(CONFIG)
         if file is not None and not Path(file).is_file():
-            raise SettingsError(f"{CONFIG}: file {file} does not exist; give the path of a TOML file")
+            raise SettingsError(f"{CONFIG}: file {file} does not exist; set it to the path of a TOML file")
         try:
             written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
         except ValueError as error:  # tomllib's message has the line and column
@@ -292,11 +298,13 @@ class ServerSettings(BaseSettings):
         except ValidationError as error:
             first = error.errors(include_input=False)[0]
             name = ".".join(str(part) for part in first["loc"])
-            known = "" if first["type"] != "extra_forbidden" else f"; the settings are {', '.join(cls.model_fields)}"
+            known = (
+                "" if first["type"] != "extra_forbidden" else f"; the valid settings are {', '.join(cls.model_fields)}"
+            )
             ours = first["type"] == "value_error"
             fault = str(first["ctx"]["error"] if ours else first["msg"])
             quotable = name in cls.model_fields and name != "token"
-            value = f" is {merged[name]!r}, which is invalid" if quotable and name in merged else ""
+            value = f" has the invalid value {merged[name]!r}" if quotable and name in merged else ""
             raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None
 
 

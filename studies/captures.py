@@ -15,7 +15,7 @@ def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS,
     """Opens a capture for a study. If it has no test cameras, uses the training cameras instead and prints a note.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         options: how the capture is read.
         more: further arguments, as for `open_source`.
 
@@ -25,5 +25,5 @@ def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS,
     capture = options.open(folder, **more)
     if capture.full_test_rig is not None:
         return capture
-    print(f"{capture.name} has no test cameras: measured on its training cameras", file=sys.stderr)
+    print(f"{capture.name} has no test cameras; measuring on its training cameras", file=sys.stderr)
     return capture.with_training_as_test()

@@ -32,7 +32,7 @@ from studies.variants.commands import variants
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
-    "What comes out": (compact, opening, exports),
+    "Quality of the output": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
     "Hard cases": (stability, timing),
@@ -44,7 +44,7 @@ app = typer.Typer(
     name="scripts/bench",
     no_args_is_help=True,
     add_completion=False,
-    help="Studies that measure the method and the service. Figures and pages in docs/ come from these commands.",
+    help="Studies that measure the method and the service, and generate the figures and pages in docs/.",
 )
 for heading, commands in STUDIES.items():
     for command in commands:

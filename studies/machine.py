@@ -34,7 +34,7 @@ def in_words(of: Mapping[str, Any]) -> str:
     if "threads" in of:
         words.append(f"{of['threads']} thread{'s' if of['threads'] != 1 else ''} used")
     if "memory_gb" in of:
-        words.append(f"{of['memory_gb']:g} GB")
+        words.append(f"{of['memory_gb']:g} GB RAM")
     words += [str(of["system"])] if "system" in of else []
     words += [f"Python {of['python']}"] if "python" in of else []
     return ", ".join(words)

@@ -15,17 +15,19 @@ QUALITY = Path("out/quality")
 FRONTIER = Path("out/frontier")
 """Folder of the study of accuracy against time, which the paper and effort studies share."""
 
-Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
+Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")]
 Repeated = Annotated[
-    Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; a short capture is played back and forth.")
+    Path, typer.Argument(metavar="CAPTURE", help="Capture folder; a short capture is played back and forth.")
 ]
-Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders of captures.")]
+Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Capture folders.")]
 Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a setting: update.iterations=20. May be repeated."),
 ]
-Again = Annotated[bool, typer.Option("--again", help="Measure existing rows again, from their stored frames 0.")]
+Again = Annotated[
+    bool, typer.Option("--again", help="Measure existing rows again, starting from their stored frame 0.")
+]
 
 
 def write_part(path: Path, text: str) -> None:

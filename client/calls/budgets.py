@@ -23,7 +23,7 @@ def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
     """Sets the budget for all frames whose reconstruction has not started.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, skip_tolerance. Fields that are
             omitted or None default to the scene's settings.
 
@@ -51,7 +51,7 @@ def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) 
     `tradeoff` reports the progress and, once the replay has finished, the results.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         iterations: iteration counts per frame to measure, one replay each; the scene's own count is always included.
         frames: number of frames to replay; their images must still be stored.
 

@@ -73,6 +73,6 @@ def read_picture(response: httpx.Response) -> NDArray[Any]:
 
 
 def read_npz(response: httpx.Response) -> dict[str, NDArray[Any]]:
-    """Returns the arrays in an npz response, keyed by name; refuses pickled data."""
+    """Returns the arrays in an npz response, keyed by name; rejects pickled data."""
     with np.load(io.BytesIO(response.content), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

@@ -18,10 +18,10 @@ def begin_export(
     """Starts a background export of committed frames to a file on the service; `export` reports its progress.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         format: format name from docs/exports.md.
         first, last: first and last frame, inclusive; None for the first or last committed frame.
-        ids: ids of the Gaussians to export in the format `tracks`; None for all moving Gaussians.
+        ids: ids of the Gaussians to export in the `tracks` format; None for all moving Gaussians.
 
     Raises:
         Conflict: no frame is committed, or the scene already has the maximum number of exports.
@@ -65,8 +65,8 @@ def export_file(id: str, export_id: str, begin: int = 0, count: int | None = Non
     """Returns the file of a finished export, or a byte range of it, so that large files can be read in chunks.
 
     Args:
-        id: id of the scene.
-        export_id: id of the export.
+        id: scene id.
+        export_id: export id.
         begin: offset of the first byte.
         count: number of bytes; None to read to the end.
 

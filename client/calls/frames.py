@@ -28,7 +28,7 @@ def put_frame(
     """Sends a frame with the images of all cameras; waits while the queue is full.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         index: frame index: 0, 1, 2, …
         images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
         masks: PNG mask of each camera, keyed by camera name; required for all cameras or none.
@@ -57,8 +57,8 @@ def put_camera(
     A camera may be a few frames ahead of the others.
 
     Args:
-        id: id of the scene.
-        index: index of the frame.
+        id: scene id.
+        index: frame index.
         camera: name of a camera in the rig.
         image: contents of a JPEG, PNG or WebP file.
         mask: contents of a PNG file; None for no mask.
@@ -117,7 +117,7 @@ def frame(id: str, index: int) -> Call[FrameReportModel]:
 
 
 def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
-    """Returns the reports of up to `limit` frames starting at `first`; `next` is the `first` of the next page.
+    """Returns the reports of up to `limit` frames from `first` on; `next` is the value of `first` for the next page.
 
     >>> listed = client.frames(scene, limit=1)
     >>> [report.index for report in listed.frames], listed.next

@@ -36,12 +36,12 @@ def create_scene(
     ingest: IngestSettings | None = None,
     nodes: Mapping[str, str] | None = None,
 ) -> Call[SceneStatus]:
-    """Creates a scene; the request is not retried after it was sent, because that could create two scenes.
+    """Creates a scene; the request is not retried once it has been sent, because that could create two scenes.
 
     Args:
         rig: camera rig, calibrated for the resolution of the images that will be sent.
         name: display name; the service assigns the id.
-        preset: name of a settings preset.
+        preset: settings preset name.
         settings: nested settings that override the preset.
         frames_per_second: frame rate; frame n without a timestamp gets the time n / frames_per_second.
         ingest: rules for accepting frames and retaining data; None for the defaults.
@@ -134,12 +134,12 @@ def edit_scene(
     """Renames, archives or unarchives a scene, or changes its retention rules; None leaves a value unchanged.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         name: display name.
         archived: whether to archive the scene, which then refuses frames and sleeps unless it is viewed.
         keep_frames, keep_states: retention rules for images and committed states, as in `IngestSettings`; changes take
             effect immediately.
-        exact_states: number of newest states to keep exactly; older states are moved to compact files.
+        exact_states: number of newest states to store exactly; older states are moved to compact files.
 
     >>> from client.wire import Retention
     >>> new = client.create_scene(rig)
@@ -190,7 +190,7 @@ def begin_again(
     reassigned.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         n: number of the new reconstruction, `scene(id).reconstruction + 1`; makes the call idempotent.
         settings: nested changes to the scene's settings.
         frame: index of the first frame, already received or still to come; None keeps the current first frame. Earlier
@@ -216,7 +216,7 @@ def put_points(id: str, points: InitialPoints, *, reconstruction: int | None = N
     """Uploads the initial point cloud for frame 0; must be called before that frame is sent.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         points: initial points in the rig's world frame and units.
         reconstruction: number of the reconstruction that starts from the points (`begin_again`); None for the current
             one.

@@ -27,15 +27,15 @@ def tracks(
     """Returns trajectories for exactly one of `ids`, `pixels` and `points`.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         ids: ids of the Gaussians to follow.
         pixels: [Q, 2] pixel coordinates (u, v) in the image of `camera` at frame `at`; (0.5, 0.5) is the centre of the
             first pixel.
-        camera: camera to whose image the pixels belong.
+        camera: camera that `pixels` refers to.
         points: [Q, 3] points in the rig's world frame and units, at frame `at`.
-        at: index of the frame to which the pixels or points refer; None for the first committed frame.
+        at: frame that the pixels or points refer to; None for the first committed frame.
         frames: first and last frame, inclusive; None for all committed frames.
-        project: cameras into which the trajectories are projected, including their visibility.
+        project: cameras to project the trajectories into, with the visibility in each camera.
 
     >>> found = client.tracks(scene, ids=[0, 1], frames=(0, 1))
     >>> np.array(found.positions).shape

@@ -28,7 +28,7 @@ def render(
     """Renders a view and returns the image: [H, W, 3] uint8 for colour, otherwise [H, W].
 
     Args:
-        id: id of the scene.
+        id: scene id.
         camera: any camera in the rig's world frame, or the name of a camera in the rig.
         frame: index of a committed frame; None for the last one.
         kind: type of image: colour, depth, alpha or parts.

@@ -40,7 +40,7 @@ def _options(
         PicturesFrom | None, typer.Option(help="Kind of image files to use, if the capture has several kinds.")
     ] = None,
     capture_fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frame rate, if the files do not specify it.")
+        float | None, typer.Option(min=0.001, help="Frame rate; default: as specified by the files, or 30.")
     ] = None,
     masks: Annotated[bool, typer.Option(help="Use the capture's masks.")] = True,
     test: Annotated[

@@ -25,7 +25,7 @@ Labels = Annotated[
     typer.Option(
         "--node",
         metavar="LABEL=VALUE",
-        help="On a cluster: run the new scene on nodes with this label. May be repeated.",
+        help="On a cluster, run the new scene only on nodes with this label. May be repeated.",
     ),
 ]
 
@@ -43,9 +43,9 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
     for label in labels or ():
         name, sign, value = (part.strip() for part in label.partition("="))
         if not (name and sign and value):
-            raise ValueError(f"label {label!r} is not valid; use the form rig=stage-a")
+            raise ValueError(f"invalid label {label!r}; use the form NAME=VALUE, such as rig=stage-a")
         if result.setdefault(name, value) != value:
-            raise ValueError(f"label {name!r} has two values, {result[name]!r} and {value!r}; give only one")
+            raise ValueError(f"label {name!r} is set to both {result[name]!r} and {value!r}; set it only once")
     return check_labels(result)
 
 
@@ -63,12 +63,14 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
         path, sign, text = change.partition("=")
         *groups, last = path.strip().split(".")
         if not sign or not last:
-            raise ValueError(f"setting {change!r} is not valid; use the form update.iterations=200")
+            raise ValueError(f"invalid setting {change!r}; use the form NAME=VALUE, such as update.iterations=200")
         inner = result
         for group in groups:
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
-                raise ValueError(f"setting {change!r}: {group!r} already has a value; give only one of the two")
+                raise ValueError(
+                    f"setting {change!r} conflicts with the value set for {group!r}; set only one of the two"
+                )
         try:
             inner[last] = json.loads(text)
         except json.JSONDecodeError:

@@ -22,7 +22,7 @@ from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
 PUSH_OUTAGE_S = 600.0
-"""How long a rig keeps retrying, in seconds, so that a service restart does not end a day's capture."""
+"""How long a rig keeps retrying, in seconds; long enough to survive a restart of the service."""
 
 
 class Encoding(StrEnum):
@@ -39,13 +39,13 @@ class WhenFull(StrEnum):
     SKIP = "skip"
 
 
-CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; see docs/captures.md.")]
-Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; see docs/captures.md.")]
+Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Service URL.")]
 Token = Annotated[
     str | None,
-    typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the environment variable SCAS4D_TOKEN."),
+    typer.Option(envvar="SCAS4D_TOKEN", help="Access token; prefer the environment variable SCAS4D_TOKEN."),
 ]
-Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
+Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")]
 Encode = Annotated[
     Encoding, typer.Option(help="Encoding of undistorted images and video frames; jpeg uses quality 95.")
 ]
@@ -98,7 +98,7 @@ def push(
     """Sends a capture to a running service as a live rig would, and waits until the last frame is finished."""
     settings, labels = parse_changes(changes), parse_labels(nodes)
     if labels and scene is not None:
-        raise ValueError("--node applies only to new scenes and cannot be combined with --scene; leave one out")
+        raise ValueError("--node applies only to new scenes and cannot be combined with --scene; omit one of them")
     source = open_capture(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address fails immediately; only later outages are retried
@@ -175,7 +175,7 @@ def budget(
         float | None,
         typer.Option(
             min=-1,
-            help="Skip the update if the previous state's error is at most (1 + this) × the usual error.",
+            help="Skip the update if the previous state's error is at most (1 + this value) × the usual error.",
         ),
     ] = None,
     reset: Annotated[bool, typer.Option("--reset", help="Reset the budget to the scene's settings.")] = False,
@@ -185,7 +185,7 @@ def budget(
     """Prints the compute budget for a scene's updates; with options, changes it from the next frame on."""
     given = (iterations, milliseconds, stop_gain, skip_tolerance)
     if reset and any(value is not None for value in given):
-        raise ValueError("--reset cannot be combined with a budget; leave one out")
+        raise ValueError("--reset cannot be combined with a budget; omit one of them")
     with Client(url, token=token, outage=0) as client:
         if reset or any(value is not None for value in given):
             budget_now = client.set_budget(
@@ -224,7 +224,8 @@ def begin_again(
         Path | None,
         typer.Option(
             help=(
-                "npz file with positions and colours (and foreground), or init_pt_cld.npz; default: the scene's points."
+                "npz file with positions, colours and optionally foreground, or init_pt_cld.npz; default: the scene's "
+                "points."
             )
         ),
     ] = None,
@@ -235,7 +236,7 @@ def begin_again(
 ) -> None:
     """Restarts the reconstruction of a scene, e.g. if its first frame failed or is of poor quality."""
     if points is not None and no_points:
-        raise ValueError("--points and --no-points contradict each other; give only one")
+        raise ValueError("--points and --no-points are mutually exclusive; use only one of them")
     settings = parse_changes(changes)
     with Client(url, token=token) as client:
         number = client.scene(scene).reconstruction + 1
@@ -248,14 +249,15 @@ def begin_again(
                     given |= {"foreground": columns[2][:, 0].astype(np.float32)} if columns[2].size else {}
             if missing := {"positions", "colours"} - given.keys():
                 raise ValueError(
-                    f"{points} has no {' and no '.join(sorted(missing))}; use numpy.savez(positions=…, colours=…)"
+                    f"{points}: missing {' and '.join(sorted(missing))}; create it with numpy.savez(positions=…, "
+                    "colours=…)"
                 )
             client.put_points(scene, InitialPoints(**given), reconstruction=number)
         status = client.begin_again(
             scene, number, settings=settings, frame=frame, points=not no_points, discard=discard
         )
     console.print(
-        f"scene {scene} restarts at frame {status.first_frame}, reconstruction {number}; {status.queued} queued",
+        f"scene {scene}: reconstruction {number} starts at frame {status.first_frame}; {status.queued} queued",
         highlight=False,
     )
 
@@ -275,11 +277,11 @@ def import_(
     with Bars() as bars:
         write_dynamic3dgs(source, out, frames=frames, on_progress=bars)
     count = len(source.rig) + (0 if source.test_rig is None else len(source.test_rig))
-    console.print(f"{out}: {count} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
+    console.print(f"wrote {count} cameras to {out}; to send them: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
 REPORT_LINE_PARTS = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
-"""Alarms that are already covered by other parts of a frame's line."""
+"""Alarms that other parts of a frame's output line already report."""
 
 
 def out_of_step(report: FrameReportModel) -> set[str]:
@@ -291,7 +293,7 @@ def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] =
     """Formats the report of a finished frame as a single line.
 
     Args:
-        report: report of the frame.
+        report: report of a finished frame.
         missed: number of preceding frames that are not shown.
         off: cameras already reported as out of step, which are not reported again.
     """
@@ -312,12 +314,12 @@ def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] =
     if report.error:
         parts.append(report.error)
     if missed:
-        parts.append(f"({missed} before it not shown)")
+        parts.append(f"({missed} earlier not shown)")
     return "  ".join(parts)
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands of this module to the app."""
+    """Adds this module's commands to the app."""
     app.command()(push)
     app.command(name="import")(import_)
     app.add_typer(scenes.app, name="scenes")

@@ -22,7 +22,7 @@ from client.sdk import Client
 from scas4d_core.captures import Capture
 
 POLL_S = 0.5
-"""Interval in seconds at which the readiness of the service is polled."""
+"""Interval in seconds at which the service's readiness is polled."""
 PREPARING = "preparing the kernels"
 
 
@@ -75,9 +75,9 @@ def _free(port: int) -> int:
 
 
 def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
-    """Returns the numbers of compiled kernels and of all kernels, or None once the service is ready.
+    """Returns the numbers of compiled and total kernels, or None once the service is ready.
 
-    The result is (0, 1) while the numbers are unknown.
+    Returns (0, 1) while the numbers are unknown.
     """
     try:
         with Client(url, token=_token(), outage=0) as client:
@@ -88,7 +88,7 @@ def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
         said = error.problem.model_extra or {}
         if said.get("warming_up") or said.get("recovering"):  # it becomes ready on its own
             return int(said.get("kernels_compiled", 0)), int(said.get("kernels", 1))
-        raise RuntimeError(f"the service cannot become ready: {error}; see the log at {log}") from None
+        raise RuntimeError(f"the service failed to become ready: {error}; see the log at {log}") from None
     return None
 
 
@@ -125,7 +125,7 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
         scores = save_views(capture, client, status.id, status.next_frame, out)
     mean = np.mean(scores[1:]) if len(scores) > 1 else scores[0]
     kind = "held-out test" if capture.full_test_rig is not None else "training"
-    console.print(f"{kind} cameras: frame 0 {scores[0]:.2f} dB, mean of the updates {mean:.2f} dB PSNR")
+    console.print(f"{kind} cameras: frame 0 {scores[0]:.2f} dB, mean over the updates {mean:.2f} dB PSNR")
     return status.id
 
 
@@ -162,7 +162,7 @@ def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path
         try:
             views = client.render_arrays(id, cameras[0], None, kinds=["depth", "parts"])
         except ServiceError as error:
-            console.print(f"[red]no depth and parts: {error}")
+            console.print(f"[red]cannot render depth and parts: {error}")
         else:
             pictures.save(out / "depth.png", pictures.depth_to_grey(views["depth"]))
             pictures.save(out / "parts.png", pictures.colour_labels(views["parts"]))

@@ -15,11 +15,11 @@ from client import __version__
 from client.cli import extras
 
 LEAST_FREE_GB = 5
-"""Free space below which a data folder is reported as small."""
+"""Free disk space in GB below which a warning is printed."""
 DRIVER_FILE = Path("/proc/driver/nvidia/version")
 """File in which the NVIDIA driver reports its version on Linux."""
 LEAST_DRIVER = 580
-"""Oldest NVIDIA driver that the packages of NVIDIA Warp support; its release page has builds for older ones."""
+"""Oldest NVIDIA driver supported by the NVIDIA Warp packages; Warp's release page has builds for older drivers."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Check:
 
     Attributes:
         name: what was checked.
-        text: what was found, and the remedy if something is missing.
-        fault: whether the service cannot run.
+        text: result of the check, with a remedy if something is missing.
+        fault: whether the problem prevents the service from running.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Check:
 
 
 def checks(data: Path) -> Iterator[Check]:
-    """Checks the machine; ``data`` is the data folder of the service, which need not exist yet."""
+    """Checks the machine; ``data`` is the service's data folder, which need not exist yet."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     python = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}, {cores} cores"
     yield Check("scas4d", f"{__version__}, {python}")
@@ -52,40 +52,42 @@ def installed() -> Iterator[Check]:
     for extra, modules in extras.EXTRAS.items():
         missing = [module for module in modules if find_spec(module) is None]
         if missing:
-            text = f"not installed ({', '.join(missing)}); in the project folder: pip install -e '.[{extra}]'"
+            text = f"not installed ({', '.join(missing)}); run in the project folder: pip install -e '.[{extra}]'"
             yield Check(f"extra {extra}", text, fault=extra == "server")
         else:
             yield Check(f"extra {extra}", "installed")
 
 
 def disk(data: Path) -> Check:
-    """Checks the free space for the data folder."""
+    """Checks the free disk space for the data folder."""
     existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
     free = shutil.disk_usage(existing).free / 1e9
     small = (
-        "; a day of frames takes more (docs/operations.md), so use another disk: --data" if free < LEAST_FREE_GB else ""
+        "; one day of frames needs more (see docs/operations.md): choose another disk with --data"
+        if free < LEAST_FREE_GB
+        else ""
     )
     return Check("disk", f"{free:.0f} GB free for {data}{small}")
 
 
 def gpu() -> Check:
-    """Checks whether scenes with device 'auto' use a GPU, and what is missing otherwise."""
+    """Checks whether scenes with device 'auto' use a GPU and, if not, what is missing."""
     from scas4d_core.engines.choose import gpu_fault, warp_device
 
     driver = driver_version(DRIVER_FILE.read_text()) if DRIVER_FILE.exists() else None
     if fault := gpu_fault():
         old = driver is not None and driver[0] < LEAST_DRIVER
         remedy = (
-            f"; the driver is {'.'.join(map(str, driver or ()))}, NVIDIA Warp asks for {LEAST_DRIVER}" if old else ""
+            f"; NVIDIA Warp requires driver {LEAST_DRIVER}, found {'.'.join(map(str, driver or ()))}" if old else ""
         )
-        return Check("GPU", f"not used: {fault}{remedy}; scenes run on the CPU (docs/gpu.md)")
+        return Check("GPU", f"not used: {fault}{remedy}; scenes run on the CPU (see docs/gpu.md)")
     from scas4d_core.engines.warp.device import describe
 
     return Check("GPU", describe(warp_device()))
 
 
 def driver_version(text: str) -> tuple[int, ...] | None:
-    """Reads the version from the driver's own file.
+    """Parses the driver version from the text of ``DRIVER_FILE``; returns None if it contains none.
 
     >>> driver_version("NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.159.04  Tue Jan  6")
     (580, 159, 4)

@@ -43,9 +43,9 @@ class Job:
     """Evaluation job that produces one row of the score table.
 
     Attributes:
-        capture: folder of the capture.
-        preset: name of the preset, shown in the table.
-        settings: complete settings of the reconstruction.
+        capture: capture folder.
+        preset: preset name, shown in the table.
+        settings: complete reconstruction settings.
         frames: number of frames to reconstruct; None for all.
         masks: whether the method is given the masks (the evaluation always uses them).
         points: whether the method is given the initial point cloud.
@@ -134,11 +134,11 @@ def evaluate(
     """Scores a capture, prints the table, and writes the row, per-frame lines, images and table.md to `out`.
 
     Args:
-        folder: folder of the capture. Without test cameras, its training cameras are scored and the row is marked.
+        folder: capture folder. Without test cameras, its training cameras are scored and the row is marked.
         out: output folder; if it already contains the scores, they are printed without another reconstruction.
         options: options for reading the capture.
         frames: number of frames; None for all.
-        preset_name: name of the preset.
+        preset_name: preset name.
         changes: nested settings that override the preset.
         again: whether to measure again even if `out` already contains the scores.
         report: callback that receives each printed line.
@@ -168,7 +168,7 @@ def score_tables(rows: Sequence[Row], stages_of: Sequence[Row] | None = None) ->
     """Returns the Markdown table of scores, followed by the table of seconds per stage if there were updates."""
     table = markdown(rows)
     if stages := stage_table(rows if stages_of is None else stages_of):
-        table += f"\n\nMedian seconds of an update by stage:\n\n{stages}"
+        table += f"\n\nMedian seconds per update, by stage:\n\n{stages}"
     return table
 
 

@@ -51,7 +51,7 @@ def evaluate_states(
 
     Args:
         source: compact file, folder that contains one, or export with Gaussian ids.
-        folder: folder of the capture.
+        folder: capture folder.
         out: output folder.
         options: options for reading the capture.
         frames: maximum number of frames to score; None for all.
@@ -64,7 +64,7 @@ def evaluate_states(
     """
     if not source.exists():
         raise InputError(
-            f"states {str(source)!r} does not exist", "give a .s4d file, or an export with ids (docs/exports.md)"
+            f"states {str(source)!r} does not exist", "use a .s4d file, or an export with ids (see docs/exports.md)"
         )
     states = of_path(source, rate)
     truth = options.open(folder, image_scale=Settings().scene.image_scale)
@@ -99,7 +99,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
             f"{found.name} starts at frame {given.frames[0]}, but the capture ends at frame {last}"
             if given.frames
             else f"{found.name} has no frames",
-            "give states of this capture",
+            "use states of this capture",
         )
     world, history = given.head.world, History()
     limits = rig_limits(Settings().scene.near, world, truth.rig.cameras)

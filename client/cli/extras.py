@@ -25,7 +25,7 @@ EXTRAS = {
 
 
 def need_server() -> None:
-    """Checks that the dependencies of the service are installed, for commands that start it in another process.
+    """Checks that the service's dependencies are installed, for commands that start it in another process.
 
     Raises:
         ModuleNotFoundError: a module of the extra `server` is not installed.
@@ -41,4 +41,7 @@ def install_hint(missing: ModuleNotFoundError) -> str | None:
     extra = next((name for name, packages in EXTRAS.items() if package in packages), None)
     if extra is None:
         return None
-    return f"this needs {package}, which is not installed; run in the project folder: pip install -e '.[{extra}]'"
+    return (
+        f"this command requires {package}, which is not installed; run in the project folder: pip install -e "
+        f"'.[{extra}]'"
+    )

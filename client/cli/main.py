@@ -21,30 +21,31 @@ from client.progress import console
 from client.sdk import DEFAULT_URL
 from scas4d_core.captures import CaptureError, ImageError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction from multi-camera rigs.")
 commands.register(app)
 viewing.register(app)
 
-CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")]
 Frames = Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")]
-Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Out = Annotated[Path, typer.Option(help="Output folder.")]
 
 
 @app.command()
 def serve(
     host: Annotated[
-        str | None, typer.Option(help="Address to listen on; anything but loopback requires a token (SCAS4D_TOKEN).")
+        str | None, typer.Option(help="Address to listen on; non-loopback addresses require a token (SCAS4D_TOKEN).")
     ] = None,
     port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port; default: the configured port, or 8000.")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="Data folder; default: the configured one, or ./data.")] = None,
     placement: Annotated[
-        str | None, typer.Option(help="`local`, or `ray[=HOST:PORT]` to run scenes on a Ray cluster (docs/cluster.md).")
+        str | None,
+        typer.Option(help="`local`, or `ray[=HOST:PORT]` to run scenes on a Ray cluster (see docs/cluster.md)."),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help=("TOML settings file, see docs/service-settings.md. Environment variables take precedence.")),
+        typer.Option(help=("TOML settings file; see docs/service-settings.md. Environment variables take precedence.")),
     ] = None,
 ) -> None:
     """Starts the service. Settings not given here are read from the environment (SCAS4D_...), then from the file."""
@@ -58,9 +59,9 @@ def serve(
 
 @app.command()
 def doctor(
-    data: Annotated[Path, typer.Option(help="Data folder of the service.")] = Path("data"),
+    data: Annotated[Path, typer.Option(help="The service's data folder.")] = Path("data"),
 ) -> None:
-    """Checks this machine: packages, disk and GPU. Says what is missing and how to install it."""
+    """Checks this machine: packages, disk and GPU. Reports what is missing and how to install it."""
     from client.cli.doctor import run as check
 
     raise typer.Exit(check(data))
@@ -131,7 +132,9 @@ def evaluate(
     frames: Frames = None,
     preset: Preset = "scas4d",
     changes: Changes = None,
-    again: Annotated[bool, typer.Option("--again", help="Measure again even if --out already has the scores.")] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Measure again even if --out already contains the scores.")
+    ] = False,
     states: Annotated[
         Path | None,
         typer.Option(help="Score existing states instead of reconstructing: a .s4d file, USD, or numbered .glb files."),
@@ -195,12 +198,12 @@ def export(
     """
     if player is not None:
         if format is not None or out is not None or ids:
-            raise typer.BadParameter("--player cannot be combined with --format, --out or --id; leave them out")
+            raise typer.BadParameter("--player cannot be combined with --format, --out or --id; omit them")
         from client.exports.player import export_player
 
         return export_player(source, player, frames, url=url, token=token)
     if format is None:
-        raise typer.BadParameter("give --format, or --player OUT.html")
+        raise typer.BadParameter("specify --format, or --player OUT.html")
     from client.exports.export import export as run
 
     run(source, format, out, frames, ids, rate, url=url, token=token)
@@ -238,7 +241,7 @@ def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError]
             raise
         raise SystemExit(f"{name}: {install}") from None
     except ServiceUnreachable as error:
-        raise SystemExit(f"{name}: {error}; start one with: scas4d serve") from None
+        raise SystemExit(f"{name}: {error}; start a service with: scas4d serve") from None
     except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError, OSError) as error:
         raise SystemExit(f"{name}: {error}") from None
 

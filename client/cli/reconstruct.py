@@ -37,7 +37,7 @@ class ReconstructedFrame:
     """A committed frame, which may be degraded.
 
     Attributes:
-        index: index of the frame in the capture.
+        index: frame index in the capture.
         seconds: wall-clock time of this frame alone, including decoding.
         cpu_seconds: CPU time of this frame, summed over all threads.
         report: report on the update; None for frame 0.
@@ -108,7 +108,7 @@ def reconstruct(
         given: capture at full size; the reconstruction resizes its images itself.
         out: output folder; created if missing.
         frames: number of frames; None for all.
-        preset: name of the preset.
+        preset: preset name.
         changes: nested settings that override the preset.
         videos: whether to also write each camera's comparison images as a video at the capture's frame rate.
     """
@@ -172,7 +172,9 @@ def reconstruct(
             writer.add_parts(history.indices[-1], parts(history))
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
     seen = (
-        "" if capture.test_rig is not None else f" (PSNR of training camera {cameras[0].name}; --test holds out others)"
+        ""
+        if capture.test_rig is not None
+        else f" (PSNR of training camera {cameras[0].name}; use --test to hold out others)"
     )
     console.print(f"images, states, states.s4d and last.ply: {out}{seen}")
 

@@ -11,14 +11,14 @@ from client.progress import console
 from client.sdk import DEFAULT_URL, Client
 from client.wire import Retention, SceneStatus
 
-Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
+Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Service URL.")]
 Token = Annotated[
     str | None,
-    typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the environment variable SCAS4D_TOKEN."),
+    typer.Option(envvar="SCAS4D_TOKEN", help="Access token; prefer the environment variable SCAS4D_TOKEN."),
 ]
-Scenes = Annotated[list[str], typer.Argument(metavar="SCENE...", help="Ids of scenes.")]
+Scenes = Annotated[list[str], typer.Argument(metavar="SCENE...", help="Scene ids.")]
 
-app = typer.Typer(help="Lists and manages the scenes of the service.", invoke_without_command=True)
+app = typer.Typer(help="Lists and manages the service's scenes.", invoke_without_command=True)
 
 
 HEAD = ("scene", "name", "state", "cameras", "next frame", "queued", "committed", "awake", "error")
@@ -45,7 +45,7 @@ def listed(
     token: Token = None,
     all: Annotated[bool, typer.Option("--all", help="Include archived scenes.")] = False,
 ) -> None:
-    """Lists the scenes of the service, oldest first. Other commands take the id shown here as SCENE."""
+    """Lists the service's scenes, oldest first. Other commands take the id shown here as SCENE."""
     if context.invoked_subcommand is not None:
         return
     with Client(url, token=token, outage=0) as client:
@@ -60,7 +60,7 @@ def listed(
 
 @app.command()
 def rename(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")],
     name: Annotated[str, typer.Argument(metavar="NAME", help="New name; the id does not change.")],
     url: Url = DEFAULT_URL,
     token: Token = None,
@@ -104,21 +104,24 @@ def restore(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None
 
 @app.command()
 def keep(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")],
     frames: Annotated[
         str | None,
-        typer.Option(metavar="COUNT|all", help="Keep the images of this many newest frames, or of all."),
+        typer.Option(metavar="COUNT|all", help="Number of newest frames whose images to keep, or all."),
     ] = None,
     states: Annotated[
         str | None,
         typer.Option(
-            metavar="COUNT|all", help="Keep this many newest committed states; the others are permanently deleted."
+            metavar="COUNT|all",
+            help="Number of newest committed states to keep, or all; the others are permanently deleted.",
         ),
     ] = None,
     exact: Annotated[
         int | None,
         typer.Option(
-            min=24, metavar="COUNT", help="Store this many newest states exactly; move older ones to compact files."
+            min=24,
+            metavar="COUNT",
+            help="Number of newest states to store exactly; older ones are moved to compact files.",
         ),
     ] = None,
     url: Url = DEFAULT_URL,
@@ -140,13 +143,13 @@ def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 @app.command()
 def share(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene, or all.")],
-    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="Lifetime of the link in hours.")] = 168,
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene id, or all.")],
+    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="Link lifetime in hours.")] = 168,
     only_token: Annotated[bool, typer.Option("--only-token", help="Print only the token, for use in scripts.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Prints a read-only link to a scene; a link cannot be revoked."""
+    """Prints a read-only link to a scene; links cannot be revoked."""
     with Client(url, token=token) as client:
         made = client.share(None if scene == "all" else scene, round(3600 * hours))
     _say(made.token) if only_token else _say(url.rstrip("/") + made.address, f"valid until {made.ends}")
@@ -164,16 +167,16 @@ def delete(
         for status in [client.scene(scene) for scene in scenes]:
             named = f"scene {status.id}" + (f" ({status.name})" if status.name else "")
             if not yes:
-                typer.confirm(f"delete {named} with {status.committed} committed frames?", abort=True)
+                typer.confirm(f"delete {named} and its {status.committed} committed frames?", abort=True)
             client.delete_scene(status.id)
-            _say(f"{named} is deleted")
+            _say(f"deleted {named}")
 
 
 def _rule(option: str, given: str | None) -> Retention | None:
     if given is None or given == "all":
         return None if given is None else Retention()
     if not given.isdecimal():
-        raise ValueError(f"{option} {given} is neither a number of frames nor all; use the form {option} 100")
+        raise ValueError(f"{option} must be a number of frames or all, such as {option} 100; got {given!r}")
     return Retention(last=int(given))
 
 

@@ -39,9 +39,7 @@ def video(
         typer.Option(help="Camera to render from, or at which the orbit starts; default: the first.", metavar="CAMERA"),
     ] = None,
     frames: Frames = None,
-    fps: Annotated[
-        float | None, typer.Option(min=0.1, max=240, help="Frame rate of the video; default: that of the scene.")
-    ] = None,
+    fps: Annotated[float | None, typer.Option(min=0.1, max=240, help="Video frame rate; default: the scene's.")] = None,
     speed: Annotated[
         float,
         typer.Option(min=0.001, max=1000, help="Seconds of the scene per second of video; 0.25 is slow motion."),
@@ -54,7 +52,7 @@ def video(
     ] = None,
     size: Annotated[
         str | None,
-        typer.Option(metavar="WxH", help="Size of the render, such as 1280x720; default: that of the camera."),
+        typer.Option(metavar="WxH", help="Render size, such as 1280x720; default: the camera's."),
     ] = None,
     orbit_speed: Annotated[
         float, typer.Option(min=-3600, max=3600, help="Orbit speed in degrees per second; negative values turn left.")
@@ -68,7 +66,7 @@ def video(
     ] = 1.0,
     parts: Annotated[bool, typer.Option("--parts", help="Colour Gaussians by part.")] = False,
     compare: Annotated[
-        Path | None, typer.Option(metavar="CAPTURE", help="Show the ground-truth image from this capture to the right.")
+        Path | None, typer.Option(metavar="CAPTURE", help="Show the ground-truth image from this capture on the right.")
     ] = None,
     background: Annotated[
         str | None, typer.Option(help="Background colour, such as white or #202020; default: the scene's.")
@@ -106,11 +104,11 @@ def video(
 def rerun(
     source: Source,
     out: Annotated[
-        Path | None, typer.Option(help="Output file (.rrd); default: next to SOURCE, with its name.")
+        Path | None, typer.Option(help="Output file (.rrd); default: next to SOURCE, with the same name.")
     ] = None,
     frames: Frames = None,
     tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Number of moving points to draw trails for.")] = 30,
-    trail: Annotated[float, typer.Option(min=0, help="Length of the trails in seconds of scene time.")] = 0.5,
+    trail: Annotated[float, typer.Option(min=0, help="Trail length in seconds of scene time.")] = 0.5,
     parts: Annotated[bool, typer.Option("--parts", help="Colour points by part.")] = False,
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
@@ -125,6 +123,6 @@ def rerun(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands of this module to the app."""
+    """Adds this module's commands to the app."""
     app.command()(video)
     app.command()(rerun)

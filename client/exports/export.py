@@ -28,10 +28,10 @@ def export(
         out: output folder or `.zip` for numbered files, otherwise output file. If None, the name is derived from source
             and format, and the output is written next to the source, or to the current folder for a scene.
         frames: inclusive range `A:B`; either end may be omitted. None for all frames.
-        ids: ids of the Gaussians to export in the format `tracks`.
+        ids: ids of the Gaussians to export in the `tracks` format.
         rate: frame rate of a source that consists of numbered files; None for the default of 30.
-        url: address of the service.
-        token: token of the service.
+        url: service URL.
+        token: access token for the service.
 
     Raises:
         InputError: the source, format, range or output is invalid.
@@ -43,14 +43,14 @@ def export(
     low, high = frame_range(frames)
     if ids and format != "tracks":
         raise InputError(
-            f"id is given for format {format!r}", "leave --id out; it selects Gaussians for the format tracks"
+            f"id cannot be used with format {format!r}", "omit --id; it selects Gaussians for the tracks format"
         )
     if out is not None and not wanted.numbered:
         check_suffix(out, wanted)
     elif out is not None and out.suffix.lower() in wanted.suffixes:
         raise InputError(
             f"out {str(out)!r} is a file name, but {format} writes one file per frame",
-            f"give a folder, or {out.stem}.zip",
+            f"use a folder, or {out.stem}.zip",
         )
     with_parts = wanted.needs_parts or format in WITH_PARTS
     with opened(source, low, high, with_parts, url, token, rate) as states, Bars() as bars:
@@ -70,7 +70,7 @@ def export(
             )
         parts = given.parts() if with_parts else None
         if wanted.needs_parts and parts is None:
-            raise InputError(f"{source} has no parts, which the format {format} requires", "use a source with parts")
+            raise InputError(f"{source} has no parts, but format {format!r} requires them", "use a source with parts")
         paths = export_sequence(
             given.states(low, high),
             format,

@@ -19,7 +19,7 @@ def script(entry: Path, root: Path) -> str:
     """Returns a script that contains a module and everything it imports.
 
     Args:
-        entry: path of the entry module.
+        entry: path to the entry module.
         root: folder to which module names are relative.
 
     Returns:
@@ -73,7 +73,7 @@ def _link(path: Path, root: Path, linked: dict[Path, str], within: tuple[Path, .
 
     body = _LIST.sub("", _EXPORT.sub("", _IMPORT.sub(imported, text)))
     if other := _OTHER.search(body):
-        raise ValueError(f"{path.name}: {other.group()!r} is not a supported form of import or export")
+        raise ValueError(f"{path.name}: unsupported form of import or export: {other.group()!r}")
     returned = f"return {{ {', '.join(exported)} }};"
     linked[path] = f"modules[{_quoted(path, root)}] = (() => {{\n{body.rstrip()}\n{returned}\n}})();"
 

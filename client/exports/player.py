@@ -26,7 +26,7 @@ VIEWER = Path(__file__).parents[2] / "server" / "viewer"
 PIECE = 3 << 18
 """Chunk size in bytes; a multiple of 3, so that each base64 chunk can be decoded separately."""
 LARGE, LARGEST = 100 << 20, 1 << 30
-"""Total sizes of the compact files in bytes above which a player opens slowly and above which browsers refuse it."""
+"""Total sizes of the compact files, in bytes, above which a player opens slowly and above which browsers refuse it."""
 
 
 def export_player(source: str, out: Path, frames: str | None = None, *, url: str, token: str | None) -> None:
@@ -34,16 +34,16 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
 
     Args:
         source: compact file, output folder of `scas4d reconstruct`, or id of a scene on the service.
-        out: path of the HTML file.
+        out: HTML file to write.
         frames: inclusive range `A:B`; None for all frames.
-        url: address of the service.
-        token: token of the service.
+        url: service URL.
+        token: access token for the service.
 
     Raises:
         InputError: the range or output is invalid, or the data is larger than browsers can open.
     """
     if out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"player={str(out)!r} is not an HTML file name", "give a name that ends in .html")
+        raise InputError(f"player={str(out)!r} is not an HTML file name", "use a name that ends in .html")
     low, high = frame_range(frames)
     with opened(source, low, high, True, url, token) as given:
         if given.of.damage is not None:
@@ -53,7 +53,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
             size = sum(file.stat().st_size for file in files)
             if size > LARGEST:
                 raise InputError(
-                    f"{size / 1e6:.0f} MB of frames are more than browsers can open in one page",
+                    f"the frames take {size / 1e6:.0f} MB, which is more than browsers can open in one page",
                     "export fewer with --frames A:B",
                 )
             folder = given.beside.resolve().name  # `scas4d reconstruct` always uses the same file name
@@ -67,8 +67,8 @@ def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
     """Writes an HTML page with embedded compact files, holding one chunk in memory at a time.
 
     Args:
-        out: path of the HTML file.
-        title: title of the page.
+        out: HTML file to write.
+        title: page title.
         files: compact files in frame order.
     """
     from scas4d_core.exports.atomic_files import atomic_path  # imported lazily: it loads the dependencies of exports

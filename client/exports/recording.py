@@ -24,7 +24,7 @@ SUFFIX = ".rrd"
 FAINT = 0.1
 """Opacity below which Gaussians are omitted; points are drawn opaque, so haze would hide the surfaces behind it."""
 THIN = -0.7
-"""Radius of a track; the viewer interprets negative values as screen-space points."""
+"""Radius of the track lines; the viewer interprets negative values as screen-space points."""
 PLANE = 0.15
 """Distance of a camera's image plane in the viewer, as a fraction of the rig's radius."""
 
@@ -47,10 +47,10 @@ def make_recording(
         out: path that ends in `.rrd`; None for a file next to the source, named after it.
         frames: inclusive range `A:B`; None for all frames.
         tracks: number of moving Gaussians whose trajectories are drawn.
-        trail: length of the trajectories in seconds of scene time.
+        trail: trajectory length in seconds of scene time.
         parts: whether to colour points by part instead of using their own colours. Part labels are always recorded.
-        url: address of the service.
-        token: token of the service.
+        url: service URL.
+        token: access token for the service.
 
     Raises:
         InputError: the range or output is invalid.
@@ -58,7 +58,7 @@ def make_recording(
     """
     low, high = frame_range(frames)
     if out is not None and out.suffix.lower() != SUFFIX:
-        raise InputError(f"out {str(out)!r} ends in {out.suffix!r}", f"give a name that ends in {SUFFIX}")
+        raise InputError(f"out {str(out)!r} has the unsupported suffix {out.suffix!r}", f"use {SUFFIX}")
     with opened(source, low, high, parts, url, token) as given, Bars() as bars:
         if given.of.damage is not None:
             console.print(f"only part of the source can be read: {given.of.damage}", soft_wrap=True)
@@ -67,7 +67,7 @@ def make_recording(
         labels = given.parts()
         if parts and labels is None:
             raise InputError(
-                f"parts: {given.name} contains no parts", "leave --parts out; a scene without motion has no parts"
+                f"parts: {given.name} contains no parts", "omit --parts; a scene without motion has no parts"
             )
         rows = moving_rows(given.some(list(times)), tracks)
         with _stream(target) as stream:
@@ -173,7 +173,7 @@ def _longer(
     seconds: float,
     trail: float,
 ) -> NDArray[np.float64]:
-    """Appends the positions of a state to the trails and returns those of the last `trail` seconds.
+    """Appends the positions of a state to the trails and returns the positions within the last `trail` seconds.
 
     Returns:
         Positions [S, K, 3]; NaN where a Gaussian is not present.

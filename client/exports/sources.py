@@ -31,7 +31,7 @@ class States(Protocol):
     Attributes:
         head: world frame, rig, frame rate and background.
         frames: frame indices in ascending order.
-        times: times of the frames in seconds.
+        times: frame times in seconds.
         damage: reason why only part of the source can be read; None if all of it can be read.
         remarks: sentences that describe data missing from the source.
     """
@@ -68,8 +68,8 @@ class Source:
     """States of a source, with the default name and folder for exported files.
 
     Attributes:
-        name: base name of exported files.
-        beside: folder next to the source, for exported files.
+        name: default base name of exported files.
+        beside: default folder for exported files, next to the source.
         of: states of the source.
     """
 
@@ -98,9 +98,9 @@ class Source:
         """
         times = {index: time for index, time in zip(self.of.frames, self.of.times, strict=True) if low <= index <= high}
         if not times:
-            held = f"frames {self.of.frames[0]} to {self.of.frames[-1]}" if self.of.frames else "no frame"
+            held = f"frames {self.of.frames[0]} to {self.of.frames[-1]}" if self.of.frames else "no frames"
             asked = f"{low}:{'' if high == LAST else high}"
-            raise InputError(f"frames {asked} are not in {self.name}", f"it has {held}")
+            raise InputError(f"{self.name} has no frames in the range {asked}", f"it contains {held}")
         return times
 
     def some(self, indices: Sequence[int]) -> list[Gaussians]:
@@ -129,8 +129,8 @@ def opened(
         low: first frame.
         high: last frame.
         parts: whether to also download the part labels of a scene.
-        url: address of the service.
-        token: token of the service.
+        url: service URL.
+        token: access token for the service.
         rate: frame rate of numbered files; None for the default of 30.
 
     Raises:
@@ -141,7 +141,7 @@ def opened(
         yield of_path(path, rate)
     elif not is_scene_id(source):
         raise InputError(
-            f"source {source!r} does not exist", "give a compact file, its folder, an export, or a scene's id"
+            f"source {source!r} does not exist", "use a compact file, its folder, an export, or a scene id"
         )
     else:
         with of_scene(source, low, high, parts, url, token) as given:
@@ -232,12 +232,12 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
     """Yields the states of a scene, downloaded from the service to temporary files.
 
     Args:
-        id: id of the scene.
+        id: scene id.
         low: first frame.
         high: last frame.
         parts: whether to include part labels.
-        url: address of the service.
-        token: token of the service.
+        url: service URL.
+        token: access token for the service.
     """
     with Client(url, token=token, outage=0) as client, TemporaryDirectory() as folder:
         files: list[Path] = []
@@ -263,8 +263,8 @@ def frame_range(text: str | None) -> tuple[int, int]:
         high = int(last or LAST) if colon else low
     except ValueError:
         raise InputError(
-            f"frames {text!r} is not a range", "give A:B, such as 0:99; either end may be omitted"
+            f"frames {text!r} is not a valid range", "use A:B, such as 0:99; either end may be omitted"
         ) from None
     if not 0 <= low <= high:
-        raise InputError(f"frames {text!r} contains no frame", "give A:B with 0 ≤ A ≤ B")
+        raise InputError(f"frames {text!r} is an empty range", "use A:B with 0 ≤ A ≤ B")
     return low, high

@@ -17,7 +17,10 @@ STATIC_TOLERANCE = 1e-6
 """Maximum relative change, between images, of any entry in a static camera's pose, intrinsics or distortion."""
 
 
-NAMES = "a camera name consists of at most 64 letters, digits, dots, dashes and underscores, and is not `time`"
+NAMES = (
+    "names must have at most 64 letters, digits, dots, dashes and underscores, and must not be `time` or start with "
+    "a dot, a dash or `mask.`"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class Calibration:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the cameras."""
+        """Camera names."""
         return tuple(camera.name for camera in self.cameras)
 
 
@@ -80,7 +83,7 @@ def calibration(
         CaptureError: there are no views, a camera moves, or a camera name is invalid.
     """
     if not views:
-        raise CaptureError(f"{source}: contains no cameras")
+        raise CaptureError(f"{source} contains no cameras")
     one_folder = len({view.path.parent for view in views}) == 1
     by_name: dict[str, list[CalibratedImage]] = {}
     for view in views:
@@ -89,7 +92,8 @@ def calibration(
     for name in sorted(by_name, key=natural):
         if not can_be_named(name):
             raise CaptureError(
-                f"{source}: camera {name!r} (of {by_name[name][0].path}): {NAMES}; rename its images or their folder"
+                f"{source}: invalid camera name {name!r} (from {by_name[name][0].path}): {NAMES}; rename the images or "
+                "their folder"
             )
         by_name[name].sort(key=lambda view: (view.time is not None, view.time or 0.0, natural(str(view.path))))
         cameras.append(_still(source, name, by_name[name]))
@@ -115,11 +119,11 @@ def calibration_of_cameras(
         CaptureError: there are no cameras, a name occurs twice, or a name is invalid.
     """
     if not cameras:
-        raise CaptureError(f"{source}: contains no camera with a pose; calibrate the rig's poses (extrinsics) too")
+        raise CaptureError(f"{source} contains no camera with a pose; calibrate the rig's extrinsics too")
     names = [camera.name for camera in cameras]
     for name in names:
         if not can_be_named(name):
-            raise CaptureError(f"{source}: camera {name!r}: {NAMES}; rename the camera and its images")
+            raise CaptureError(f"{source}: invalid camera name {name!r}: {NAMES}; rename the camera and its images")
         if names.count(name) > 1:
             raise CaptureError(f"{source}: two cameras are named {name!r}; rename one of them and its images")
     ordered = tuple(sorted(cameras, key=lambda camera: natural(camera.name)))
@@ -140,9 +144,9 @@ def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCam
             old, new = getattr(first, field), getattr(view.lens, field)
             if old.shape != new.shape or np.abs(new - old).max() > STATIC_TOLERANCE * max(1.0, np.abs(old).max()):
                 raise CaptureError(
-                    f"{source}: camera {name!r} has a different {field} in {view.path} and {views[0].path}; a rig's "
-                    "cameras must not move: calibrate with one image per camera, or put each camera's images into "
-                    "a separate folder"
+                    f"{source}: {field} of camera {name!r} differs between {views[0].path} and {view.path}; the "
+                    "cameras of a rig must not move: calibrate with one image per camera, or put each camera's images "
+                    "into a separate folder"
                 )
     return LensCamera(
         name, first.model, first.intrinsics, first.distortion, first.world_to_camera, first.width, first.height

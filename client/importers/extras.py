@@ -23,7 +23,7 @@ def load(module: str, *, needed: str) -> Any:
     except ImportError as fault:
         packages = {"cv2": "OpenCV (opencv-python-headless)", "av": "PyAV (av)"}
         raise MissingExtraError(
-            f"{needed} needs {packages.get(module, module)}, which cannot be imported ({fault}): {INSTALL}"
+            f"{needed} requires {packages.get(module, module)}, which cannot be imported ({fault}); {INSTALL}"
         ) from fault
 
 

@@ -38,8 +38,8 @@ class LensCamera:
     """A calibrated camera with lens distortion.
 
     Attributes:
-        name: name of the camera, unique within its rig.
-        model: name of the camera model, one of `MODELS`.
+        name: camera name, unique within its rig.
+        model: camera model, one of `MODELS`.
         intrinsics: [3, 3] in pixels, with the principal point relative to the upper left corner of the image.
         distortion: coefficients in OpenCV's order, [8] as in `PERSPECTIVE` or [4] as in `FISHEYE`.
         world_to_camera: [4, 4] pose matrix with OpenCV axes.
@@ -65,7 +65,7 @@ class LensCamera:
         return not self.fisheye and not self.distortion.any()
 
     def pinhole(self, intrinsics: Float | None = None) -> Camera:
-        """Returns a pinhole camera at the same pose, with the given intrinsics or those of the lens.
+        """Returns a pinhole camera at the same pose, with the given intrinsics or the lens's own.
 
         Raises:
             CameraError: the camera is not valid.
@@ -86,27 +86,28 @@ def lens_camera(
     """Creates and validates a camera from the named parameters of its model (`MODELS`).
 
     Args:
-        name: name of the camera.
-        model: name of the camera model.
+        name: camera name.
+        model: camera model.
         parameters: parameter values, keyed by name. Models with a single focal length also accept `fx` and `fy`.
             Missing coefficients are 0.
         world_to_camera: [4, 4] pose matrix with OpenCV axes.
         size: (width, height) in pixels.
-        source: name of the file, for messages.
+        source: file name, for messages.
 
     Raises:
         CaptureError: the model is not supported, or the camera is not valid.
     """
     if model not in MODELS:
         raise CaptureError(
-            f"{source}: camera {name!r} has the model {model}, which is not supported; "
-            f"calibrate with one of {', '.join(MODELS)}"
+            f"{source}: camera {name!r} has the unsupported model {model}; calibrate with one of {', '.join(MODELS)}"
         )
     known = {*MODELS[model], "fx", "fy"} | ({"k3"} if model == "OPENCV" else set())
     strange = {key: value for key, value in parameters.items() if key not in known and value != 0}
     if strange:
         listed = ", ".join(f"{key} = {value:g}" for key, value in strange.items())
-        raise CaptureError(f"{source}: camera {name!r} has {listed}, which the model {model} lacks; use FULL_OPENCV")
+        raise CaptureError(
+            f"{source}: camera {name!r} has {listed}, which model {model} does not support; use FULL_OPENCV"
+        )
     focal = {key: parameters.get(key, parameters.get("f", 0.0)) for key in ("fx", "fy")}
     intrinsics = np.array(
         [[focal["fx"], 0, parameters["cx"]], [0, focal["fy"], parameters["cy"]], [0, 0, 1]], dtype=np.float64
@@ -115,7 +116,7 @@ def lens_camera(
     distortion = np.array([parameters.get(key, 0.0) for key in order], dtype=np.float64)
     if not np.isfinite(distortion).all():
         listed = ", ".join(key for key, value in zip(order, distortion, strict=True) if not np.isfinite(value))
-        raise CaptureError(f"{source}: camera {name!r}: {listed} is NaN or infinity; give finite numbers")
+        raise CaptureError(f"{source}: camera {name!r}: {listed} must be finite; got NaN or infinity")
     camera = LensCamera(name, model, intrinsics, distortion, np.asarray(world_to_camera, np.float64), *size)
     try:
         camera.pinhole()

@@ -75,12 +75,12 @@ def open_source(
     Lens distortion is removed in memory when an image is read.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         calibration: transforms.json, COLMAP model folder, or calibration file of another tool
             (`client/importers/formats/`); None to search the folder.
         pictures: source of the images: `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
             names. None to use the named files if there are several per camera, otherwise whichever exist.
-        fps: frame rate, overriding that of the files; None to use that of the files, or 30 if they have none.
+        fps: frame rate that overrides the files; None for the files' frame rate, or 30 if they specify none.
         encoding: format in which undistorted images and video frames are encoded for sending or writing.
         use_masks: whether to use the masks in `masks/` (`seg/`).
         use_points: whether to use the point cloud.
@@ -103,11 +103,11 @@ def open_source(
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder")
     if fps is not None and not 0 < fps < 1e6:
-        raise CaptureError(f"fps {fps!r} must be a positive number of frames per second")
+        raise CaptureError(f"fps must be a positive number; got {fps!r}")
     if calibration is None and (folder / TRAIN_META).exists():
         if pictures is not None:
             raise CaptureError(
-                f"{folder / TRAIN_META}: lists the images of this capture; leave --pictures {pictures} out, or choose "
+                f"{folder / TRAIN_META} already lists this capture's images; omit --pictures {pictures}, or choose "
                 "another calibration with --calibration"
             )
         given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, size_mismatch=size_mismatch)
@@ -138,8 +138,8 @@ def _imported(
         raw.check_same_frames(files)
     elif files and len(files) != raw.frame_count:
         raise CaptureError(
-            f"{masks}: has masks for {len(files)} of {raw.frame_count} frames; give one for every image, "
-            "or none (--no-masks)"
+            f"{masks} contains masks for {len(files)} of {raw.frame_count} frames; add one for every image, "
+            "or use --no-masks"
         )
     reader = ImportedPictures(found, raw, masks=files, encoding=encoding)
     capture = Capture(
@@ -171,7 +171,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
             return read_colmap(given)
         if is_calibration(given):
             return read_calibration_file(given, folder)
-        raise CaptureError(f"{given}: is neither a transforms.json, nor the folder of a COLMAP model, nor {READ}")
+        raise CaptureError(f"{given} is neither a transforms.json, nor a COLMAP model folder, nor {READ}")
     others = find_calibrations(folder)
     if (folder / FILE).is_file():
         return _with_unread_remark(others, folder, read_transforms(folder / FILE))
@@ -181,7 +181,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
     if others:
         return read_calibration_file(single_calibration(others, folder), folder)
     raise CaptureError(
-        f"{folder}: no known capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), no "
+        f"{folder}: unknown capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), no "
         f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}, nor, here or in calibration/, {READ}; "
         "choose the calibration with --calibration"
     )
@@ -192,7 +192,9 @@ def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) ->
     if not others:
         return found
     listed = ", ".join(str(path.relative_to(folder)) for path in others)
-    remark = f"calibration: {found.source.relative_to(folder)}, not {listed}; choose another with --calibration FILE"
+    remark = (
+        f"using calibration {found.source.relative_to(folder)}, not {listed}; choose another with --calibration FILE"
+    )
     return replace(found, remarks=(*found.remarks, remark))
 
 
@@ -206,7 +208,7 @@ def uncalibrated_remark(folder: Path, calibration: Calibration) -> list[str]:
     left = sorted(name for name in unknown if not name.startswith("."))
     if not left or not there.intersection(calibration.names):  # otherwise these folders are not cameras
         return []
-    return [f"left out cameras that are not in {calibration.source.name}: {', '.join(left)}"]
+    return [f"skipped cameras that are not in {calibration.source.name}: {', '.join(left)}"]
 
 
 def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> RawReader:
@@ -215,14 +217,16 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
     if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):
         return _named(folder, calibration)
     if wanted is None and has_images and videos.is_dir():
-        raise CaptureError(f"{folder}: has images/ and videos/; choose one: --pictures images or --pictures videos")
+        raise CaptureError(
+            f"{folder} contains images/ and videos/; choose one with --pictures images or --pictures videos"
+        )
     if wanted == "images" or (wanted is None and has_images):
         if not images.is_dir():
-            raise CaptureError(f"{images}: no such folder; put each camera's images into images/<camera>/")
+            raise CaptureError(f"{images}: no such folder; put each camera's images in images/<camera>/")
         return PictureFiles(calibration, folders_of(images, calibration))
     if wanted == "videos" or (wanted is None and videos.is_dir()):
         if not videos.is_dir():
-            raise CaptureError(f"{videos}: no such folder; put each camera's video into videos/<camera>.mp4")
+            raise CaptureError(f"{videos}: no such folder; put each camera's video in videos/<camera>.mp4")
         return Videos(calibration, find_videos(videos, calibration))
     return _named(folder, calibration)
 
@@ -230,7 +234,8 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
 def _named(folder: Path, calibration: Calibration) -> PictureFiles:
     if not any(calibration.views.values()):
         raise CaptureError(
-            f"{folder}: there is neither images/ nor videos/, and {calibration.source.name} lists no images; put "
-            f"them into images/<camera>/ or videos/<camera>.mp4 (cameras: {', '.join(calibration.names)})"
+            f"{folder} contains neither images/ nor videos/, and {calibration.source.name} lists no images; put "
+            "each camera's images in images/<camera>/ or its video in videos/<camera>.mp4 (cameras: "
+            f"{', '.join(calibration.names)})"
         )
     return PictureFiles(calibration, *named_files(folder, calibration))

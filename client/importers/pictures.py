@@ -69,12 +69,12 @@ class PictureFiles:
             mask = next(iter(masks[index].values())) if index < len(masks) else None
             if picture is None or mask is None or picture.stem != mask.stem:
                 raise CaptureError(
-                    f"frame {index}: its image is {picture} and its mask is {mask}; name masks like the images and "
-                    "give one for every image, or none (--no-masks)"
+                    f"frame {index}: its image is {picture}, but its mask is {mask}; name each mask like its image and "
+                    "add one for every image, or use --no-masks"
                 )
 
 
-def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") -> list[dict[str, Path]]:
+def folders_of(root: Path, calibration: Calibration, *, what: str = "images") -> list[dict[str, Path]]:
     """Returns the files in ``root/<camera>/`` for each frame [T], keyed by camera name.
 
     Raises:
@@ -86,20 +86,20 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") 
         if not folder.is_dir():
             there = sorted((path.name for path in root.iterdir() if path.is_dir()), key=natural)
             raise CaptureError(
-                f"{folder}: no such folder, but {calibration.source} has a camera {camera!r}; {root.name}/ has "
-                f"{_some(there) or 'no folders'}: name the folders after the cameras"
+                f"{folder}: no such folder, although {calibration.source} has a camera {camera!r}; {root.name}/ "
+                f"contains {_some(there) or 'no folders'}; name each folder after its camera"
             )
         by_camera[camera] = _pictures_in(folder)
         if not by_camera[camera]:
-            raise CaptureError(f"{folder}: has no {what}; give files ending in {', '.join(READ)}")
+            raise CaptureError(f"{folder} contains no {what}; supported file types: {', '.join(READ)}")
     frames = sorted({frame for files in by_camera.values() for frame in files}, key=natural)
     for camera, files in by_camera.items():
         missing = [frame for frame in frames if frame not in files]
         if missing:
             others = next(name for name, paths in by_camera.items() if missing[0] in paths)
             raise CaptureError(
-                f"{root / camera}: has no {what} for {len(missing)} of {len(frames)} frames ({_some(missing)}), which "
-                f"{others!r} has; the files of a frame must have the same name in all camera folders"
+                f"{root / camera} has no {what} for {len(missing)} of {len(frames)} frames ({_some(missing)}), but "
+                f"{others!r} has them; the files of a frame must have the same name in all camera folders"
             )
     return [{camera: files[frame] for camera, files in by_camera.items()} for frame in frames]
 
@@ -113,7 +113,7 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
         if end not in READ:
             raise CaptureError(f"{path}: {end} is not supported; use JPEG, PNG, WebP or BMP")
         if path.stem in pictures:
-            raise CaptureError(f"{path}: {pictures[path.stem].name} is the same frame; keep only one of them")
+            raise CaptureError(f"{path} and {pictures[path.stem].name} are the same frame; keep only one of them")
         pictures[path.stem] = path
     return pictures
 
@@ -132,7 +132,7 @@ def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, 
         if count != counts[most]:
             raise CaptureError(
                 f"{calibration.source}: camera {camera!r} has {count} images, but {most!r} has {counts[most]}; "
-                "give one image per camera and frame"
+                "provide one image per camera and frame"
             )
     frames: list[dict[str, Path]] = []
     times: list[float] = []
@@ -155,7 +155,7 @@ def _below(folder: Path, source: Path, name: str) -> Path:
         path = root / name
         if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
             return path
-    raise CaptureError(f"{folder / name}: no such file, but {source} names it")
+    raise CaptureError(f"{folder / name}: no such file, although {source} lists it")
 
 
 def _some(names: Sequence[str]) -> str:

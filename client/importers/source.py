@@ -1,4 +1,4 @@
-"""Reader for imported captures, which undistorts the images of a calibrated rig to those of pinhole cameras."""
+"""Reader for imported captures, which undistorts the images of a calibrated rig to pinhole images."""
 
 from __future__ import annotations
 

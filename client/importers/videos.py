@@ -54,15 +54,15 @@ class Video:
         try:
             self._container = self._av.open(str(path))
             if not self._container.streams.video:
-                raise CaptureError(f"{path}: has no video stream")
+                raise CaptureError(f"{path} has no video stream")
             self._stream = self._container.streams.video[0]
             self._stamps = sorted(
                 packet.pts for packet in self._container.demux(self._stream) if packet.pts is not None
             )
         except self._av.FFmpegError as fault:
-            raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
+            raise CaptureError(f"{path} cannot be read as video: {fault}") from fault
         if not self._stamps:
-            raise CaptureError(f"{path}: has no frames with timestamps")
+            raise CaptureError(f"{path} has no frames with timestamps")
         base = float(self._stream.time_base)
         self.times: NDArray[np.float64] = (np.array(self._stamps) - self._stamps[0]) * base
         self.size = (int(self._stream.codec_context.width), int(self._stream.codec_context.height))
@@ -148,7 +148,8 @@ class Videos:
         for video in self._videos.values():
             self._check_together(video, first)
         self.remarks = [
-            f"{video.path.name} has {len(video) - self.frame_count} more frames than the shortest; they are left out"
+            f"{video.path.name} has {len(video) - self.frame_count} more frames than the shortest video; they are "
+            "ignored"
             for video in self._videos.values()
             if len(video) > self.frame_count
         ] + mixed_colours({camera: video.grey for camera, video in self._videos.items()})
@@ -161,12 +162,13 @@ class Videos:
             if apart[late] > first.interval / 2:
                 raise CaptureError(
                     f"{video.path}: frame {late} is at {video.times[late]:.3f} s, but in {first.path.name} at "
-                    f"{first.times[late]:.3f} s, over half a frame apart: frames were dropped, or the rates differ "
-                    f"({video.fps:.5g} and {first.fps:.5g} frames per second); trim the videos to match, or repair them"
+                    f"{first.times[late]:.3f} s, more than half a frame apart: frames were dropped, or the rates "
+                    f"differ ({video.fps:.5g} and {first.fps:.5g} frames per second); trim the videos to match, or "
+                    "repair them"
                 )
         if abs(video.fps - first.fps) >= RATE_TOLERANCE * first.fps:
             raise CaptureError(
-                f"{video.path}: has {video.fps:.4g} frames per second, but {first.path.name} has {first.fps:.4g}; "
+                f"{video.path} has {video.fps:.4g} frames per second, but {first.path.name} has {first.fps:.4g}; "
                 "the cameras of a rig must be synchronized: convert the videos to one frame rate"
             )
 
@@ -200,12 +202,12 @@ def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
         if not own:
             listed = ", ".join(path.name for path in there[:3]) or "no videos"
             raise CaptureError(
-                f"{folder}: has no video for camera {camera!r} of {calibration.source}, only {listed}; "
-                f"name it {camera}.mp4"
+                f"{folder}: no video for camera {camera!r} of {calibration.source} (found only {listed}); "
+                f"the file must be named {camera}.mp4"
             )
         if len(own) > 1:
             raise CaptureError(
-                f"{folder}: has {own[0].name} and {own[1].name} for the same camera; keep only one of them"
+                f"{folder} contains {own[0].name} and {own[1].name} for the same camera; keep only one of them"
             )
         videos[camera] = own[0]
     return videos

@@ -46,7 +46,7 @@ def write_dynamic3dgs(
     ['ims', 'init_pt_cld.npz', 'seg', 'test_meta.json', 'train_meta.json']
     """
     if out.exists() and any(out.iterdir()):
-        raise CaptureError(f"{out}: is not empty; name a new folder")
+        raise CaptureError(f"{out} is not empty; choose a new folder")
     held_out = () if source.full_test_rig is None else source.full_test_rig.cameras
     cameras = [*source.full_rig.cameras, *held_out]
     count = min(frames or source.frame_count, source.frame_count)
@@ -88,7 +88,8 @@ def _rate(source: Capture, count: int) -> float:
     if off.max() > UNEVEN:
         raise CaptureError(
             f"{source.name}: frame {int(off.argmax())} is {off.max():.2g} frames off a constant rate of {fps:.5g} "
-            "per second, and this layout stores no times; skip the import: every command reads the original capture"
+            "per second, and this layout stores no times; skip the import, because every command can read the original "
+            "capture"
         )
     return fps
 

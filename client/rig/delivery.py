@@ -14,8 +14,8 @@ class Lateness:
 
     Attributes:
         late: delay of each frame's acknowledgement relative to the due time of the next frame; negative if early.
-        busy: time spent waiting for a full queue.
-        busy_count: number of waits for a full queue.
+        busy: time spent waiting for space in the queue.
+        busy_count: number of waits for space in the queue.
         outage: time spent waiting for a service that did not respond.
         outage_count: number of retries during outages.
         began: `time.monotonic()` when the rig's clock started: at the first frame, or when frame 0 was finished.
@@ -44,12 +44,12 @@ class Lateness:
             parts[0] += f"{which} at {(timed - 1) / seconds:.2f}{asked} per second"
         if fps and timed:
             behind = [value for value in self.late[self.before :] if value > 0]
-            worst = f", at most {max(behind):.2f} s" if behind else ""
+            worst = f", by at most {max(behind):.2f} s" if behind else ""
             parts.append(f"{len(behind)} acknowledged after the next frame was due{worst}")
         if self.busy_count:
-            parts.append(f"waited {self.busy:.1f} s for a full queue ({self.busy_count} times)")
+            parts.append(f"waited {self.busy:.1f} s for space in the queue ({self.busy_count} times)")
         if self.outage_count:
-            parts.append(f"waited {self.outage:.1f} s for the service ({self.outage_count} tries)")
+            parts.append(f"waited {self.outage:.1f} s for the service ({self.outage_count} retries)")
         return "; ".join(parts)
 
 
@@ -58,10 +58,10 @@ class Delivery:
     """Result of a push.
 
     Attributes:
-        scene: id of the scene.
+        scene: scene id.
         lateness: sending delays and waiting times.
         lost: indices of frames that the rig lost and declared missing.
-        status: status of the scene after the last frame; None while the push is running.
+        status: scene status after the last frame; None while the push is running.
     """
 
     scene: str

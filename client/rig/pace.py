@@ -14,7 +14,7 @@ class Pace:
         fps: frames per second; None sends as fast as the service accepts frames.
         jitter: maximum delay of a frame in seconds, uniformly distributed; models cables, encoders and switches.
         drop: fraction of frames that the rig loses, in 0…1. Frame 0 is never lost.
-        seed: random seed of the jitter and the losses.
+        seed: random seed for the jitter and losses.
 
     >>> pace = Pace(fps=30, drop=0.5)
     >>> [pace.drops(index) for index in range(4)] == [pace.drops(index) for index in range(4)]
@@ -30,11 +30,11 @@ class Pace:
 
     def __post_init__(self) -> None:
         if self.fps is not None and not self.fps > 0:
-            raise ValueError(f"fps {self.fps!r} must be above 0")
+            raise ValueError(f"fps must be positive; got {self.fps!r}")
         if not self.jitter >= 0:
-            raise ValueError(f"jitter {self.jitter!r} must be 0 seconds or more")
+            raise ValueError(f"jitter must be at least 0 seconds; got {self.jitter!r}")
         if not 0 <= self.drop < 1:
-            raise ValueError(f"drop {self.drop!r} must be a fraction from 0 to below 1")
+            raise ValueError(f"drop must be a fraction in [0, 1); got {self.drop!r}")
 
     def drops(self, index: int, camera: str = "") -> bool:
         """Returns True if this frame, or this camera's image of it, is lost; deterministic."""

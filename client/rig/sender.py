@@ -97,7 +97,7 @@ class Sender:
     def send_all(self, first: int, count: int) -> Iterator[int]:
         """Sends frames in order and yields each index once it is acknowledged or lost.
 
-        If the service expects another index, sending continues there.
+        If the service expects a different index, sending continues from that index.
         """
         index = first
         while index < count:
@@ -107,7 +107,7 @@ class Sender:
             except FrameGap as gap:
                 if gap.expected == index:
                     raise
-                self._on_message(f"the service expects frame {gap.expected} next, not {index}; continuing there")
+                self._on_message(f"the service expects frame {gap.expected} next, not {index}; continuing from there")
                 index = gap.expected
                 continue
             if due is not None:

@@ -40,7 +40,7 @@ class Sequence:
 
     def __init__(self, source: Capture, *, start: int = 0, loop: bool = False) -> None:
         if not 0 <= start < source.frame_count:
-            raise ValueError(f"start {start} is not one of the frames 0…{source.frame_count - 1} of {source.name}")
+            raise ValueError(f"start must be a frame of {source.name}, 0…{source.frame_count - 1}; got {start}")
         self.source = source
         self.start = start
         self.loop = loop
@@ -63,7 +63,7 @@ class Sequence:
         return self.time(self._last) + (index - self._last) / self.source.fps
 
     def files(self, index: int) -> EncodedFrame:
-        """Returns the files of a frame and prefetches those of the next one."""
+        """Returns the files of a frame and prefetches the next frame."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
         files = future.result()
         if index + 1 < len(self):

@@ -42,23 +42,23 @@ def push(
 ) -> Delivery:
     """Creates a scene, sends its point cloud and all frames at the given pace, and waits until the last is finished.
 
-    The clock of the rig starts when frame 0 is finished. Restarts of the service are tolerated within the outage
-    timeout of the client. Sending then continues with the frame that the service expects.
+    The rig's clock starts when frame 0 is finished. Service restarts are tolerated within the client's outage
+    timeout. Sending then continues with the frame that the service expects.
 
     Args:
         source: capture whose training cameras are sent, at the resolution of the files. The service scales the images
             if `settings` requests it.
-        client: client of the service.
+        client: client that sends the requests.
         scene: id of an existing scene to continue from its next frame; None to create a new scene.
         name: name for a new scene; None for the name of the source.
-        pace: pace of the rig; None to send as fast as the service accepts frames. In either case, timestamps are those
-            of the capture.
+        pace: pace of the rig; None to send as fast as the service accepts frames. Timestamps always come from the
+            capture.
         frames: total number of frames in the scene; None for all frames, or for no limit with `loop`.
         start: capture index of the scene's frame 0.
         loop: whether to run back and forth through the capture until `frames` is reached or the push is interrupted.
         per_camera: whether each camera sends its own images over its own connection.
         websocket: whether to use a WebSocket (one per camera with `per_camera`) instead of HTTP requests.
-        preset: name of a settings preset.
+        preset: settings preset name.
         settings: nested settings that override the preset.
         ingest: rules by which a new scene accepts frames; None for the defaults.
         nodes: labels that a cluster node must have in order to run a new scene.
@@ -69,8 +69,8 @@ def push(
         The id and status of the scene, the delays and the lost frames.
 
     Raises:
-        ServiceError, ServiceUnreachable: a request of the client failed.
-        RuntimeError: the scene failed, or its cameras differ from those of the capture.
+        ServiceError, ServiceUnreachable: a request failed.
+        RuntimeError: the scene failed, or its cameras differ from the capture's.
 
     >>> from client.importers.open_source import open_source
     >>> delivery = push(open_source(folder), client, frames=2)

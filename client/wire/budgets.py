@@ -48,7 +48,7 @@ class Budget(Model):
         le=1000,
         allow_inf_nan=False,
         description=(
-            "Skip the update if the previous state's error on the probe views is at most (1 + this) × "
+            "Skip the update if the previous state's error on the probe views is at most (1 + this value) × "
             "the usual error; -1 to never skip."
         ),
     )

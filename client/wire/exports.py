@@ -52,7 +52,7 @@ class ExportRequest(Model):
     ids: (
         Annotated[list[Annotated[int, Field(ge=0, le=LARGEST_ID)]], Field(min_length=1, max_length=MOST_IDS)] | None
     ) = Field(
-        default=None, description="Ids of the Gaussians to export in the format `tracks`; null for all moving ones."
+        default=None, description="Ids of the Gaussians to export in the `tracks` format; null for all moving ones."
     )
 
 

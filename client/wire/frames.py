@@ -65,7 +65,8 @@ class CameraFitModel(Model):
     health: float | None = Field(
         default=None,
         description=(
-            "From 1 (fits as usual relative to the other cameras) to 0 (would be discarded); null if not evaluated."
+            "Score from 1 (fits as usual relative to the other cameras) to 0 (would be discarded); null if not "
+            "evaluated."
         ),
     )
 
@@ -238,7 +239,9 @@ class FrameReportModel(Model):
     )
     degraded: str | None = Field(
         default=None,
-        description="Reason why the committed state shows the frame only partly or not at all; null if it does.",
+        description=(
+            "Reason why the committed state shows the frame only partly or not at all; null if it shows all of it."
+        ),
     )
     candidate: Literal["end", "previous", "warm"] | None = Field(
         default=None,
@@ -279,7 +282,7 @@ class FrameReportModel(Model):
     )
     write_seconds: float | None = Field(
         default=None,
-        description="Duration of writing the previous commit; this report is written before its own commit ends.",
+        description="Seconds taken to write the previous commit; a report is written before its own commit ends.",
     )
     device: Literal["cpu", "gpu"] | None = Field(default=None, description="Device that computed the update.")
     threads: int | None = Field(default=None, description="Number of threads used for the update.")
@@ -327,7 +330,9 @@ class FrameReportModel(Model):
     )
     postponed: list[str] = Field(
         default_factory=list,
-        description="Births of Gaussians for which the budget left no time; the next frame reserves time for them.",
+        description=(
+            "Descriptions of Gaussian births that the budget left no time for; the next frame reserves time for them."
+        ),
     )
 
 

@@ -91,7 +91,7 @@ def frame_chunks(
     """Returns the bytes of a frame without copying the files: the prefix and header, then each file.
 
     Args:
-        index: index of the frame.
+        index: frame index.
         images: encoded image of each camera, keyed by camera name.
         masks: encoded masks, keyed by camera name; cameras may be omitted.
         time: timestamp in seconds; derived from the scene's frame rate if None.
@@ -115,10 +115,11 @@ def head_length(prefix: bytes | bytearray | memoryview) -> int:
     magic, length = PREFIX.unpack_from(prefix)
     if magic != MAGIC:
         raise FramingError(
-            f"begins with {bytes(magic).hex(' ')}, not with S4DF", "send a frame in the format described in docs/api.md"
+            f"begins with the bytes {bytes(magic).hex(' ')} instead of S4DF",
+            "send a frame in the format described in docs/api.md",
         )
     if length > MAX_HEAD:
-        raise FramingError(f"declares a header of {length} bytes", f"a header has at most {MAX_HEAD} bytes")
+        raise FramingError(f"declares a header of {length} bytes", f"use a header of at most {MAX_HEAD} bytes")
     return int(length)
 
 
@@ -133,7 +134,9 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
-        raise FramingError(f"head{'.' + field if field else ''}: {first['msg']}", "correct the header") from None
+        raise FramingError(
+            f"has an invalid header{' field ' + field if field else ''}: {first['msg']}", "correct the header"
+        ) from None
 
 
 def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
@@ -150,7 +153,7 @@ def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[m
     expected = at + sum(file.size for file in head.files)
     if len(view) != expected:
         raise FramingError(
-            f"has {len(view)} bytes, but its header declares {expected}", "send the files that the header lists"
+            f"has {len(view)} bytes, but its header declares {expected}", "send exactly the files that the header lists"
         )
     pieces = []
     for file in head.files:

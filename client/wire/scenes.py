@@ -27,7 +27,7 @@ class Retention(Model):
     @model_validator(mode="after")
     def _one_rule(self) -> Retention:
         if self.last is not None and self.bytes is not None:
-            raise InputError("last and bytes cannot be combined", "give one of them, or neither to keep all")
+            raise InputError("last and bytes cannot be combined", "set one of them, or neither to keep all frames")
         return self
 
 
@@ -79,7 +79,7 @@ class IngestSettings(Model):
         gt=0,
         le=86_400,
         description=(
-            "Seconds after its first image at which a frame sent camera by camera is closed; null to leave it open."
+            "Seconds after its first image until a frame sent camera by camera is closed; null to leave it open."
         ),
     )
     keep_frames: Retention = Field(
@@ -155,7 +155,7 @@ class SceneEdit(Model):
     def _changes_something(self) -> SceneEdit:
         if all(value is None for _, value in self):
             raise InputError(
-                "the request changes nothing", "give name, archived, keep_frames, keep_states, exact_states"
+                "the request changes nothing", "set name, archived, keep_frames, keep_states or exact_states"
             )
         return self
 
@@ -252,7 +252,7 @@ class SceneStatus(Model):
     reconstruction: int = Field(description="Number of the reconstruction, increased at each restart.")
     first_frame: int = Field(description="First frame of the reconstruction; earlier frames failed.")
     paused: bool = Field(
-        description="Whether no further frame is started, regardless of `state`; one may still be running."
+        description="Whether the scene starts no further frames, regardless of `state`; one frame may still be running."
     )
     asleep: bool = Field(
         description=(

@@ -19,7 +19,7 @@ class Health(Model):
         default=None, description="Seconds from the start of the service until its kernels were compiled."
     )
     ingest_ready: bool | None = Field(
-        default=None, description="Whether the disk has room for frames; null if not checked."
+        default=None, description="Whether the disk has space for frames; null if not checked."
     )
 
 
@@ -106,5 +106,5 @@ class Cluster(Model):
     waiting: list[WaitingProcess]
     head_responds: bool = Field(
         default=True,
-        description="Whether the head of the cluster responds; if not, the nodes are those of its last response.",
+        description="Whether the cluster's head node responds; if not, the nodes are those from its last response.",
     )

@@ -226,8 +226,6 @@ def unpack(message: bytes) -> tuple[BinaryHead, bytes]:
         raise ValueError(f"a binary message of {len(message)} bytes is too short for its header")
     magic, length = _PREFIX.unpack_from(message)
     if magic != MAGIC or _PREFIX.size + length > len(message):
-        raise ValueError(
-            f"a binary message of {len(message)} bytes has the magic {magic!r} and a header of {length} bytes"
-        )
+        raise ValueError(f"invalid binary message of {len(message)} bytes: magic {magic!r}, header of {length} bytes")
     head = BinaryHead.model_validate_json(message[_PREFIX.size : _PREFIX.size + length])
     return head, message[_PREFIX.size + length :]

@@ -60,7 +60,7 @@ class RenderRequest(Model):
         default=None,
         ge=1,
         le=MAX_PIXELS_A_SIDE,
-        description="Width of the image in pixels, to which the camera is scaled; the height follows in proportion.",
+        description="Image width in pixels; the camera is scaled to this width, and the height in proportion.",
     )
     quality: int | None = Field(default=None, ge=1, le=100, description="Quality of JPEG and WebP; default: 92.")
     background: tuple[Unit, Unit, Unit] | None = Field(

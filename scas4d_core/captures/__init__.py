@@ -1,4 +1,4 @@
-"""Reads captures from disk: cameras, images, masks and ground truth. Needs only numpy and Pillow."""
+"""Reads captures (cameras, images, masks and ground truth) from disk. Requires only NumPy and Pillow."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
     """Opens a capture, detecting its layout from the files in the folder.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         options: keyword arguments for `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
 
     Raises:
-        CaptureError: the folder does not exist, its layout is unknown, or one of its files is invalid.
+        CaptureError: if the folder does not exist, its layout is unknown, or one of its files is invalid.
 
     >>> capture = open_capture("samples/robot", image_scale=0.25)
     >>> capture.rig.names[:3], capture.frame_count
@@ -53,4 +53,4 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
         raise CaptureError(f"{folder}: no such folder")
     if (folder / TRAIN_META).exists():
         return read_dynamic3dgs(folder, **options)
-    raise CaptureError(f"{folder}: no known capture layout; Dynamic3DGaussians captures contain {TRAIN_META}")
+    raise CaptureError(f"{folder}: unknown capture layout; Dynamic3DGaussians captures contain {TRAIN_META}")

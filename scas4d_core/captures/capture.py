@@ -1,4 +1,4 @@
-"""`Capture`: images of a rig over time, decoded lazily on access."""
+"""`Capture`, a sequence of images from one rig that are decoded lazily on access."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scas4d_core.captures.reader import PictureReader
 
 
 class LazyPictures(Mapping[str, NDArray[np.uint8]]):
-    """Maps camera names to images, which are decoded on every access and not cached, to limit memory use."""
+    """Maps camera names to images. To limit memory use, images are decoded on every access and not cached."""
 
     def __init__(self, cameras: Collection[str], decode: Callable[[str], NDArray[np.uint8]]) -> None:
         self._cameras = cameras
@@ -40,7 +40,7 @@ class Capture:
     """A sequence of frames from one rig, optionally with a point cloud and ground truth.
 
     Attributes:
-        name: name of the capture's folder.
+        name: name of the capture folder.
         full_rig: training cameras at the full image size.
         full_test_rig: test cameras at the full image size, or None.
         pictures: reader for the images and masks of all cameras.
@@ -91,7 +91,7 @@ class Capture:
         return self.pictures.frame_count
 
     def time(self, index: int) -> float:
-        """Returns the time of a frame in seconds, from image timestamps if available, else from the frame rate."""
+        """Returns a frame's time in seconds, from image timestamps if available, otherwise from the frame rate."""
         given = self.pictures.time(index)
         return index / self.fps if given is None else given
 
@@ -99,28 +99,28 @@ class Capture:
         """Returns the training images and masks of one frame.
 
         Raises:
-            IndexError: the frame does not exist. Accessing an image may also raise ImageError.
+            IndexError: if the frame does not exist. Accessing an image may also raise ImageError.
         """
         return self._frame(index, self.full_rig)
 
     def test_frame(self, index: int) -> Frame:
-        """Returns the test images of one frame, and their masks if any, for evaluation only.
+        """Returns the test images of one frame, with any masks. They must only be used for evaluation.
 
         Raises:
-            IndexError: the frame does not exist.
-            CaptureError: the capture has no test cameras. Accessing an image may also raise ImageError.
+            IndexError: if the frame does not exist.
+            CaptureError: if the capture has no test cameras. Accessing an image may also raise ImageError.
         """
         if self.full_test_rig is None:
-            raise CaptureError(f"capture {self.name}: has no test cameras; hold some out (--test)")
+            raise CaptureError(f"capture {self.name} has no test cameras; hold some out with --test")
         return self._frame(index, self.full_test_rig)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the image file of a training or test camera as bytes, at full size regardless of ``image_scale``.
+        """Returns a training or test camera's image file as bytes, at full size regardless of ``image_scale``.
 
         Raises:
-            IndexError: the frame does not exist.
-            KeyError: the camera does not exist.
-            CaptureError: the file cannot be read.
+            IndexError: if the frame does not exist.
+            KeyError: if the camera does not exist.
+            CaptureError: if the file cannot be read.
         """
         self._check(index)
         return self.pictures.encoded_image(index, camera)
@@ -129,8 +129,8 @@ class Capture:
         """Returns a mask file as bytes, at full size regardless of ``image_scale``, or None if there is no mask.
 
         Raises:
-            IndexError: the frame does not exist.
-            CaptureError: the file cannot be read.
+            IndexError: if the frame does not exist.
+            CaptureError: if the file cannot be read.
         """
         self._check(index)
         return self.pictures.encoded_mask(index, camera)
@@ -147,7 +147,7 @@ class Capture:
         """Returns the capture with the named cameras moved from the training to the test cameras.
 
         Raises:
-            CaptureError: a camera does not exist, or no training camera would be left.
+            CaptureError: if a camera does not exist, or no training camera would be left.
         """
         if not names:
             return self
@@ -155,24 +155,24 @@ class Capture:
         known = [*self.full_rig.names, *(camera.name for camera in others)]
         unknown = sorted(set(names) - set(known))
         if unknown:
-            raise CaptureError(f"test camera {unknown[0]!r} is not one of {', '.join(known)}")
+            raise CaptureError(f"unknown test camera {unknown[0]!r}; choose from {', '.join(known)}")
         train = tuple(camera for camera in self.full_rig.cameras if camera.name not in names)
         if not train:
-            raise CaptureError("every camera is a test camera; leave some cameras for training")
+            raise CaptureError("all cameras are test cameras; leave at least one for training")
         held = tuple(camera for camera in self.full_rig.cameras if camera.name in names)
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
     def with_training_as_test(self, rig: Rig | None = None) -> Capture:
-        """Returns the capture with its training cameras as test cameras, to measure the fit to the training images.
+        """Returns a copy whose test cameras are the training cameras, to measure the fit to the training images.
 
         Args:
-            rig: training cameras as refined by a scene; if None, the capture's own cameras.
+            rig: training cameras refined by a scene, or None to use the capture's own cameras.
         """
         return replace(self, full_test_rig=self.full_rig if rig is None else rig)
 
     def _check(self, index: int) -> None:
         if not 0 <= index < self.frame_count:
-            raise IndexError(f"capture {self.name}: frame {index} is not one of 0…{self.frame_count - 1}")
+            raise IndexError(f"capture {self.name}: frame {index} is out of range 0…{self.frame_count - 1}")
 
     def _frame(self, index: int, rig: Rig) -> Frame:
         self._check(index)

@@ -1,4 +1,4 @@
-"""Reads the Dynamic3DGaussians data layout. Needs only numpy and Pillow.
+"""Reads the Dynamic3DGaussians data layout. Requires only NumPy and Pillow.
 
 ``train_meta.json`` and ``test_meta.json`` contain ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
 axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are in ``seg/`` under the same paths, with the
@@ -30,7 +30,7 @@ from scas4d_core.captures.size_mismatch import SizeMismatch, adapt_intrinsics
 
 TRAIN_META = "train_meta.json"
 STATIC_TOLERANCE = 1e-6
-"""Maximum relative change of any entry of k or w2c over time for a camera to count as static."""
+"""Maximum relative change over time of any entry of k or w2c for which a camera counts as static."""
 
 
 def read_dynamic3dgs(
@@ -50,29 +50,29 @@ def read_dynamic3dgs(
     Args:
         folder: folder that contains ``train_meta.json``.
         image_scale: factor by which images, masks, labels and cameras are scaled.
-        fps: frames per second. If None, ``fps`` from ``train_meta.json`` (written by ``scas4d import``), or 30 if
-            it is missing there.
+        fps: frames per second, or None to use ``fps`` from ``train_meta.json`` (written by ``scas4d import``), which
+            defaults to 30.
         use_masks: whether to read the masks in ``seg/``.
         use_points: whether to read ``init_pt_cld.npz``.
-        size_mismatch: how images whose aspect ratio differs from ``w``:``h`` were produced (see `adapt_intrinsics`).
-            If None, such images are rejected.
+        size_mismatch: how images with an aspect ratio other than ``w``:``h`` were produced (see `adapt_intrinsics`), or
+            None to reject such images.
 
     Raises:
-        CaptureError: a file is missing, damaged or inconsistent with the others, or a camera moves.
+        CaptureError: if a file is missing, damaged or inconsistent with the others, or a camera moves.
     """
     folder = Path(folder)
     train = _read_cameras(folder, TRAIN_META, size_mismatch)
     rate = train.fps if fps is None else fps
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not (np.isfinite(rate) and rate > 0):
-        raise CaptureError(f"{folder}: fps {rate!r} must be a positive number of frames per second")
+        raise CaptureError(f"{folder}: fps must be a positive number of frames per second; got {rate!r}")
     test = _read_cameras(folder, "test_meta.json", size_mismatch) if (folder / "test_meta.json").exists() else None
     if test is not None:
         both = sorted(set(train.rig.names) & set(test.rig.names))
         if both:
-            raise CaptureError(f"{folder / 'test_meta.json'}: cam_id {', '.join(both)} is also in {TRAIN_META}")
+            raise CaptureError(f"{folder / 'test_meta.json'}: cam_id {', '.join(both)} is also used in {TRAIN_META}")
         if len(test.images) != len(train.images):
             raise CaptureError(
-                f"{folder / 'test_meta.json'}: has {len(test.images)} frames, but {TRAIN_META} has {len(train.images)}"
+                f"{folder / 'test_meta.json'} has {len(test.images)} frames, but {TRAIN_META} has {len(train.images)}"
             )
     given = [train] if test is None else [train, test]
     sizes = {camera.name: (camera.width, camera.height) for one in given for camera in one.rig.cameras}
@@ -121,7 +121,7 @@ def _read_cameras(folder: Path, file: str, size_mismatch: SizeMismatch | None) -
     meta = read_json(path)
     missing = [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in meta]
     if missing:
-        raise CaptureError(f"{path}: has no {', '.join(missing)}")
+        raise CaptureError(f"{path}: missing {', '.join(missing)}")
     names = _camera_names(path, meta["cam_id"])
     widths, heights = (_sizes(path, key, meta[key], len(names)) for key in ("w", "h"))
     intrinsics = _require_static(path, "k", meta["k"], (len(meta["cam_id"]), len(names), 3, 3))
@@ -135,7 +135,7 @@ def _read_cameras(folder: Path, file: str, size_mismatch: SizeMismatch | None) -
     for frame in images:
         absent = next((file for file in frame.values() if not file.is_file()), None)
         if absent:
-            raise CaptureError(f"{absent}: no such file, but {file} refers to it")
+            raise CaptureError(f"{absent}: no such file (listed in {file})")
     fitted = [_adapt_camera(camera, images[0][camera.name], size_mismatch) for camera in rig.cameras]
     remarks = [remark for _, remark in fitted if remark is not None]
     return _Cameras(Rig(tuple(camera for camera, _ in fitted)), images, relative, meta.get("fps", 30.0), remarks)
@@ -158,29 +158,29 @@ def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
     if not isinstance(value, list):
         return [_parse_pixels(path, key, value)] * cameras
     if len(value) != cameras:
-        raise CaptureError(f"{path}: {key} has {len(value)} values for {cameras} cameras (cam_id); give one per camera")
+        raise CaptureError(f"{path}: {key} has {len(value)} values, but cam_id lists {cameras} cameras")
     return [_parse_pixels(path, f"{key}[{number}]", one) for number, one in enumerate(value)]
 
 
 def _parse_pixels(path: Path, key: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float) or value != round(value) or value < 1:
-        raise CaptureError(f"{path}: {key} is {value!r}; give a whole number of pixels")
+        raise CaptureError(f"{path}: {key} must be a positive whole number of pixels; got {value!r}")
     return int(value)
 
 
 def _camera_names(path: Path, cam_id: Any) -> list[str]:
     if not isinstance(cam_id, list) or not cam_id or not all(isinstance(row, list) and row for row in cam_id):
-        raise CaptureError(f"{path}: cam_id must be a list of frames, each a list of cameras; no list may be empty")
+        raise CaptureError(f"{path}: cam_id must be a non-empty list with a non-empty list of cameras per frame")
     changed = next((t for t, row in enumerate(cam_id) if row != cam_id[0]), None)
     if changed is not None:
         raise CaptureError(
-            f"{path}: cam_id of frame {changed} differs from frame 0; list the same cameras in every frame"
+            f"{path}: cam_id of frame {changed} differs from that of frame 0; list the same cameras in every frame"
         )
     names = [str(name) for name in cam_id[0]]
     for name in names:
         if not re.fullmatch(CAMERA_NAME, name):
             raise CaptureError(
-                f"{path}: cam_id {name!r} cannot be used in file names; give a number, or at most 64 letters, digits, "
+                f"{path}: cam_id {name!r} cannot be used in file names; use a number, or at most 64 letters, digits, "
                 "dots, dashes and underscores"
             )
     return names
@@ -190,15 +190,17 @@ def _require_static(path: Path, key: str, value: Any, shape: tuple[int, ...]) ->
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as fault:
-        raise CaptureError(f"{path}: {key} must be numbers of shape {list(shape)} to match cam_id; {fault}") from fault
+        raise CaptureError(
+            f"{path}: {key} must be numeric with shape {list(shape)} to match cam_id: {fault}"
+        ) from fault
     if array.shape != shape:
-        raise CaptureError(f"{path}: {key} must have shape {list(shape)} to match cam_id; found {list(array.shape)}")
+        raise CaptureError(f"{path}: {key} must have shape {list(shape)} to match cam_id; got {list(array.shape)}")
     moved = np.abs(array - array[:1]).max(axis=(2, 3)) > STATIC_TOLERANCE * np.maximum(1, np.abs(array[:1])).max()
     if moved.any():
         frame, camera = np.argwhere(moved)[0]
         raise CaptureError(
-            f"{path}: {key} of camera number {camera} changes at frame {frame}; the cameras of a rig must not move: "
-            "split the capture where they do"
+            f"{path}: {key} of camera number {camera} changes at frame {frame}, but cameras must not move; "
+            "split the capture at this frame"
         )
     still: NDArray[np.float64] = array[0]
     return still
@@ -215,7 +217,7 @@ def _relative_paths(path: Path, fn: Any, frames: int, names: list[str]) -> tuple
         for name, entry in zip(names, row, strict=True):
             file = PurePosixPath(entry)
             if file.is_absolute() or ".." in file.parts or "\\" in entry or not file.name:
-                raise CaptureError(f"{path}: fn[{number}] {entry!r} points outside ims/; give a path below it")
+                raise CaptureError(f"{path}: fn[{number}] {entry!r} points outside ims/; use a path under ims/")
             files[name] = file
         result.append(files)
     return tuple(result)
@@ -228,8 +230,8 @@ def _masks(folder: Path, cameras: _Cameras, *, required: bool) -> tuple[Files, .
         absent = [name for name, file in files.items() if not file.is_file()]
         if absent and required:
             raise CaptureError(
-                f"{files[absent[0]]}: no mask for camera {absent[0]}; give masks for every training camera and frame, "
-                "or ignore all masks (use_masks=False)"
+                f"{files[absent[0]]}: no mask for camera {absent[0]}; provide masks for all training cameras and "
+                "frames, or ignore all masks (use_masks=False)"
             )
         frames.append({name: file for name, file in files.items() if name not in absent})
     return tuple(frames)
@@ -241,16 +243,18 @@ def _read_points(path: Path) -> InitialPoints | None:
     data = read_npz(path, ("data",))["data"]
     if data.ndim != 2 or data.shape[1] not in (6, 7) or len(data) == 0 or data.dtype.kind not in "fiu":
         raise CaptureError(
-            f"{path}: data must be [P, 7] numbers, x y z r g b foreground ([P, 6] without the last); "
-            f"found {data.dtype} {list(data.shape)}"
+            f"{path}: data must be a numeric array of shape [P, 7] (x, y, z, r, g, b, foreground) or [P, 6] (without "
+            f"foreground); got {data.dtype} {list(data.shape)}"
         )
     if not np.isfinite(data).all():
-        raise CaptureError(f"{path}: data has NaN or infinity in row {int(np.argmin(np.isfinite(data).all(axis=1)))}")
+        raise CaptureError(
+            f"{path}: data contains NaN or infinity in row {int(np.argmin(np.isfinite(data).all(axis=1)))}"
+        )
     shown = data[:, 3:]
     if shown.min() < -1e-3 or shown.max() > 1 + 1e-3:
         raise CaptureError(
-            f"{path}: colours and foreground must be in 0…1; found {shown.min():g}…{shown.max():g}; "
-            "divide values in 0…255 by 255"
+            f"{path}: colours and foreground must be in 0…1; got {shown.min():g}…{shown.max():g}; "
+            "divide 8-bit values by 255"
         )
     shown = np.clip(shown, 0, 1).astype(np.float32)
     foreground = shown[:, 3] if shown.shape[1] == 4 else None

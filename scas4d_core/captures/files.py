@@ -1,4 +1,4 @@
-"""Reads the JSON and npz files of a capture and explains what is wrong with invalid ones. Needs only numpy."""
+"""Reads a capture's JSON and npz files, with detailed error messages for invalid files. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def read_json(path: Path) -> dict[str, Any]:
     """Reads a JSON file that contains an object.
 
     Raises:
-        CaptureError: the file is missing, not JSON, or not an object.
+        CaptureError: if the file is missing, not JSON, or not an object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as fault:
         raise CaptureError(f"{path}: no such file") from fault
     except (OSError, ValueError, RecursionError) as fault:
-        raise CaptureError(f"{path}: is not valid JSON ({fault})") from fault
+        raise CaptureError(f"{path} is not valid JSON ({fault})") from fault
     if not isinstance(content, dict):
-        raise CaptureError(f"{path}: must contain a JSON object; found {type(content).__name__}")
+        raise CaptureError(f"{path} must contain a JSON object; got {type(content).__name__}")
     return content
 
 
@@ -35,13 +35,15 @@ def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Reads the named arrays from an npz file; pickled objects are not allowed.
 
     Raises:
-        CaptureError: the file is missing or damaged, or lacks one of the keys.
+        CaptureError: if the file is missing or damaged, or lacks one of the keys.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {key: file[key] for key in keys}
     except KeyError as fault:
-        raise CaptureError(f"{path}: has no array {fault}; needed: {', '.join(keys)}") from fault
+        raise CaptureError(f"{path}: missing array {fault}; required arrays: {', '.join(keys)}") from fault
     except Exception as fault:  # zipfile, zlib and numpy raise different exceptions
-        raise CaptureError(f"{path}: is not an npz file without pickle ({type(fault).__name__}: {fault})") from fault
+        raise CaptureError(
+            f"{path} cannot be read as an npz file without pickles ({type(fault).__name__}: {fault})"
+        ) from fault
     return arrays

@@ -1,4 +1,4 @@
-"""`Frame`, the images and masks of one time step, and `InitialPoints`, a point cloud. Needs only numpy."""
+"""`Frame`, the images and masks of one time step, and `InitialPoints`, a point cloud. Requires only NumPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic capture: point tracks, visibility, parts and part labels. Needs only numpy."""
+"""Ground truth of a synthetic capture: point tracks, visibility, parts and part labels. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class TruePart:
         rigid: whether the part moves as a rigid body.
         static: whether the part never moves.
         foreground: whether the masks include the part.
-        pose: [T, 4, 4] part-to-world transforms of a rigid part, else None; ``pose[t] @ inv(pose[s])`` moves a point
-            from frame s to frame t.
+        pose: [T, 4, 4] part-to-world transforms if the part is rigid, otherwise None; ``pose[t] @ inv(pose[s])`` moves
+            a point from frame s to frame t.
     """
 
     id: int
@@ -80,7 +80,7 @@ class GroundTruth:
         """Returns the visibility [T, P] in one camera.
 
         Raises:
-            KeyError: the ground truth does not include the camera.
+            KeyError: if the ground truth does not include the camera.
         """
         if camera not in self.cameras:
             raise KeyError(camera)
@@ -92,13 +92,13 @@ class GroundTruth:
         return tuple(self.label_files)
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint8]:
-        """Returns the part id of each pixel of a frame, [H, W] uint8, 0 for no part.
+        """Returns the part id of each pixel in a frame, [H, W] uint8, with 0 for no part.
 
         Labels are resized by sampling, not averaging.
 
         Raises:
-            KeyError: the camera has no labels.
-            ImageError: the label image is invalid.
+            KeyError: if the camera has no labels.
+            ImageError: if the label image is invalid.
         """
         full, scaled = self.image_size[camera]
         return decode_labels(self.label_files[camera][index], size=full, target=scaled)
@@ -108,15 +108,15 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
     """Reads a capture's ground truth: ``gt_tracks.npz`` and, if present, ``scene.json`` and ``gt_parts/``.
 
     Args:
-        folder: folder of the capture.
-        frame_count: number of frames T of the capture.
+        folder: capture folder.
+        frame_count: number of frames in the capture, T.
         sizes: maps each camera name to its full and scaled (width, height).
 
     Returns:
         The ground truth, or None if ``gt_tracks.npz`` does not exist.
 
     Raises:
-        CaptureError: a file is damaged or does not match the capture.
+        CaptureError: if a file is damaged or does not match the capture.
     """
     path = folder / "gt_tracks.npz"
     if not path.exists():
@@ -125,18 +125,20 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
     points, part_id, visible = arrays["points"], arrays["part_id"], arrays["visible"]
     shape = (frame_count, points.shape[1] if points.ndim == 3 else -1, 3)
     if points.shape != shape or not np.isfinite(points).all():
-        raise CaptureError(f"{path}: points must be finite [T={frame_count}, P, 3]; found shape {points.shape}")
+        raise CaptureError(
+            f"{path}: points must be finite with shape [T={frame_count}, P, 3]; got shape {points.shape}"
+        )
     if part_id.shape != shape[1:2]:
-        raise CaptureError(f"{path}: part_id must be [P={shape[1]}]; found shape {part_id.shape}")
+        raise CaptureError(f"{path}: part_id must have shape [P={shape[1]}]; got {part_id.shape}")
     if visible.ndim != 3 or visible.shape[::2] != shape[:2]:
-        raise CaptureError(f"{path}: visible must be [T={frame_count}, C, P={shape[1]}]; found shape {visible.shape}")
+        raise CaptureError(f"{path}: visible must have shape [T={frame_count}, C, P={shape[1]}]; got {visible.shape}")
     label_files = {}
     for name in sizes:
         files = tuple(folder / "gt_parts" / name / f"{index:06d}.png" for index in range(frame_count))
         if files[0].parent.is_dir():
             missing = next((file for file in files if not file.is_file()), None)
             if missing:
-                raise CaptureError(f"{missing}: no such file; label every frame of camera {name} or none")
+                raise CaptureError(f"{missing}: no such file; label all frames of camera {name}, or none")
             label_files[name] = files
     return GroundTruth(
         points=points.astype(np.float64),
@@ -160,7 +162,7 @@ def read_extent(folder: Path) -> float | None:
     if value is None:
         return None
     if not isinstance(value, int | float) or not (np.isfinite(value) and value > 0):
-        raise CaptureError(f"{path}: extent {value!r} must be a positive number")
+        raise CaptureError(f"{path}: extent must be a positive number; got {value!r}")
     return float(value)
 
 
@@ -180,8 +182,12 @@ def _read_parts(path: Path, frame_count: int) -> tuple[TruePart, ...]:
                 pose=pose,
             )
         except (KeyError, TypeError, ValueError, AttributeError) as fault:
-            raise CaptureError(f"{path}: parts[{number}] is not a part ({type(fault).__name__}: {fault})") from fault
+            raise CaptureError(
+                f"{path}: parts[{number}] is not a valid part ({type(fault).__name__}: {fault})"
+            ) from fault
         if pose is not None and pose.shape != (frame_count, 4, 4):
-            raise CaptureError(f"{path}: parts[{number}].pose must be [T={frame_count}, 4, 4]; found {pose.shape}")
+            raise CaptureError(
+                f"{path}: parts[{number}].pose must have shape [T={frame_count}, 4, 4]; got {pose.shape}"
+            )
         parts.append(part)
     return tuple(parts)

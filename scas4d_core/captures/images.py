@@ -1,4 +1,4 @@
-"""Decodes and resizes images and masks. Needs only numpy and Pillow.
+"""Decodes and resizes images and masks. Requires only NumPy and Pillow.
 
 How the content of an image file is handled:
 
@@ -45,7 +45,7 @@ class ImageError(ValueError):
 def scaled_size(size: Size, image_scale: float) -> Size:
     """Returns width and height multiplied by ``image_scale``, rounded as in `Camera.scaled`."""
     if not (np.isfinite(image_scale) and image_scale > 0):
-        raise ImageError(f"image_scale {image_scale!r} must be a positive number")
+        raise ImageError(f"image_scale must be a positive number; got {image_scale!r}")
     return max(1, round(size[0] * image_scale)), max(1, round(size[1] * image_scale))
 
 
@@ -64,7 +64,8 @@ def decode_image(
         Image [H, W, 3] uint8.
 
     Raises:
-        ImageError: the file is missing, is not an image, has the wrong size, or is rejected (see the module docstring).
+        ImageError: if the file is missing, is not an image, has the wrong size, or is rejected (see the module
+            docstring).
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
@@ -86,7 +87,7 @@ def decode_mask(
     """Decodes a foreground mask. Takes the same arguments as `decode_image` and raises the same errors.
 
     A pixel is foreground if any stored value is nonzero. After scaling, it is foreground if at least half of its area
-    is.
+    is foreground.
 
     Returns:
         Mask [H, W] uint8, 1 on the foreground and 0 elsewhere.
@@ -99,7 +100,9 @@ def decode_mask(
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
     if picture.mode in ("LA", "PA", "RGBA", "La", "RGBa"):
-        raise ImageError(f"{name}: a mask with an alpha channel is ambiguous; give one channel, 0 for background")
+        raise ImageError(
+            f"{name}: a mask with an alpha channel is ambiguous; use a single channel, with 0 for background"
+        )
     values = np.asarray(picture)  # palette images give the index, not the colour
     foreground = values != 0
     if foreground.ndim == 3:
@@ -120,7 +123,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
         Labels [H, W] uint8.
 
     Raises:
-        ImageError: the file is missing or invalid, has the wrong size, or has more than one channel.
+        ImageError: if the file is missing or invalid, has the wrong size, or has more than one channel.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.array([[3, 3, 7, 7]], np.uint8)).save(file, "PNG")
@@ -130,7 +133,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
     if picture.mode not in ("L", "P"):
-        raise ImageError(f"{name}: labels have colour mode {picture.mode}; give one channel of 8 bits")
+        raise ImageError(f"{name}: labels must have a single 8-bit channel; got colour mode {picture.mode}")
     columns, rows = (
         np.floor((np.arange(count) + 0.5) * (length / count)).astype(np.intp)
         for count, length in zip(target, size, strict=True)
@@ -140,7 +143,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
 
 
 def picture_size(source: bytes | Path, name: str | None = None) -> Size:
-    """Returns width and height in pixels from the file header, without decoding the image.
+    """Returns an image's width and height in pixels, reading only the file header.
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2)).save(file, "JPEG")
@@ -185,7 +188,7 @@ def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
     """Returns an 8-bit JPEG, PNG or WebP file unchanged; any other image is re-encoded as an 8-bit PNG.
 
     Raises:
-        ImageError: the image must be re-encoded but cannot be decoded.
+        ImageError: if the image must be re-encoded but cannot be decoded.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
@@ -206,13 +209,13 @@ def is_sixteen_bit(head: bytes) -> bool:
 
 
 def describe_pictures(files: Mapping[str, Path]) -> list[str]:
-    """Returns user-facing remarks on 16-bit images and on grey cameras among colour cameras, from the image headers.
+    """Returns user-facing remarks on 16-bit images and on greyscale cameras in colour rigs, based on the image headers.
 
     Args:
         files: maps each camera name to one of its image files.
 
     Raises:
-        ImageError: an image cannot be read.
+        ImageError: if an image cannot be read.
     """
     remarks, grey = [], {}
     for camera, path in files.items():
@@ -224,19 +227,19 @@ def describe_pictures(files: Mapping[str, Path]) -> list[str]:
         except Exception as fault:
             raise _unreadable(str(path), fault) from fault
         if deep:
-            remarks.append(f"camera {camera!r}: its 16-bit images are rounded to 8 bits (value / 257)")
+            remarks.append(f"camera {camera!r}: 16-bit images are rounded to 8 bits (value / 257)")
     return remarks + mixed_colours(grey)
 
 
 def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
-    """Returns a remark if some cameras are grey and others are not, else an empty list."""
+    """Returns a list with one remark if some cameras are greyscale and others are not, otherwise an empty list."""
     if len(set(grey.values())) < 2:
         return []
     return grey_warnings([name for name, is_grey in grey.items() if is_grey])
 
 
 def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
-    """Returns the names of grey images among colour images; images without contrast are ignored.
+    """Returns the names of cameras with greyscale images if others have colour images. Ignores images without contrast.
 
     Args:
         images: maps each camera name to its image [H, W, 3]. Because of sensor noise, an image from a colour camera is
@@ -269,7 +272,7 @@ def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64
 
 
 def _name(source: bytes | Path) -> str:
-    return "picture" if isinstance(source, bytes) else str(source)
+    return "image data" if isinstance(source, bytes) else str(source)
 
 
 def _stream(source: bytes | Path) -> io.BytesIO:
@@ -281,7 +284,7 @@ def _unreadable(name: str, fault: Exception) -> ImageError:
         return fault
     if isinstance(fault, FileNotFoundError):
         return ImageError(f"{name}: no such file")
-    return ImageError(f"{name}: cannot be read as a picture ({type(fault).__name__}: {fault})")
+    return ImageError(f"{name} cannot be read as an image ({type(fault).__name__}: {fault})")
 
 
 def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size | None) -> Image.Image:
@@ -291,17 +294,17 @@ def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size 
         # Check before decoding, because a small file can decompress to gigabytes.
         if size is not None and picture.size != size:
             raise ImageError(
-                f"{name}: is {picture.width}x{picture.height} pixels, but the camera is {size[0]}x{size[1]}; "
-                "give images at the size that the camera was calibrated for (image_scale resizes both)"
+                f"{name} is {picture.width}x{picture.height} pixels, but its camera requires {size[0]}x{size[1]}; "
+                "use images of the size for which the camera was calibrated (image_scale resizes both)"
             )
         count = getattr(picture, "n_frames", 1)
         if count > 1:
-            raise ImageError(f"{name}: contains {count} images; give a file with a single image")
+            raise ImageError(f"{name} contains {count} images; use a file with a single image")
         orientation = picture.getexif().get(EXIF_ORIENTATION, 1)
         if orientation != 1:
             raise ImageError(
                 f"{name}: EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not "
-                "match a rotated image; store the pixels as calibrated and remove the tag"
+                "match a rotated image; store the pixels in the calibrated orientation and remove the tag"
             )
         picture.load()
     except Exception as fault:
@@ -314,10 +317,12 @@ def _rgb(picture: Image.Image, name: str) -> NDArray[np.uint8]:
     if picture.mode in ("I;16", "I;16B", "I;16L", "I"):
         grey = np.asarray(picture).astype(np.int64)
         if grey.min() < 0 or grey.max() > 65535:
-            raise ImageError(f"{name}: grey values {grey.min()}…{grey.max()} exceed 16 bits; give 8 or 16 bits")
+            raise ImageError(
+                f"{name}: grey values {grey.min()}…{grey.max()} exceed 16 bits; use 8-bit or 16-bit values"
+            )
         picture = Image.fromarray(((grey + 128) // 257).astype(np.uint8))
     if picture.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-        raise ImageError(f"{name}: colour mode {picture.mode} is not supported; give RGB or grey")
+        raise ImageError(f"{name}: colour mode {picture.mode} is not supported; use RGB or grayscale")
     transparent = picture.mode in ("LA", "PA", "RGBA") or "transparency" in picture.info
     picture = picture.convert("RGBA" if transparent else "RGB")
     alpha = np.asarray(picture.getchannel("A")).astype(np.uint32)[..., None] if transparent else None

@@ -1,4 +1,4 @@
-"""`PictureReader`, the interface for reading a capture's images, and `FileReader`. Needs only numpy and Pillow."""
+"""`PictureReader`, the interface for reading a capture's images, and `FileReader`. Requires only NumPy and Pillow."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Files = Mapping[str, Path]
 
 
 class PictureReader(Protocol):
-    """Interface for reading the images and masks of pinhole cameras, both training and test cameras.
+    """Interface for reading the images and masks of training and test cameras, all of which are pinhole cameras.
 
     Images have the size of their camera in the full rig, regardless of the capture's `image_scale`. A reader keeps at
     most a few images per camera in memory, and decodes each image once if frames are read in order.
@@ -36,7 +36,7 @@ class PictureReader(Protocol):
         """Returns a decoded image, [H, W, 3] sRGB values.
 
         Raises:
-            ImageError: the image cannot be decoded, or its size differs from that of its camera.
+            ImageError: if the image cannot be decoded, or its size differs from that of its camera.
         """
 
     def has_mask(self, index: int, camera: str) -> bool:
@@ -49,8 +49,8 @@ class PictureReader(Protocol):
         """Returns an image as an 8-bit file that the service accepts: JPEG, PNG or WebP.
 
         Raises:
-            KeyError: the camera does not exist.
-            CaptureError: the file cannot be read.
+            KeyError: if the camera does not exist.
+            CaptureError: if the file cannot be read.
         """
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
@@ -61,8 +61,8 @@ class FileReader:
     """Reads one file per image, as in the Dynamic3DGaussians layout.
 
     Args:
-        images: for each of T frames, maps camera names to image files.
-        masks: for each of T frames, maps camera names to mask files; a camera may have no mask in a frame.
+        images: one mapping per frame, from camera name to image file.
+        masks: one mapping per frame, from camera name to mask file; a frame may lack masks of some cameras.
         sizes: maps each camera name to the required (width, height) of its files.
     """
 
@@ -99,9 +99,9 @@ def read_bytes(path: Path) -> bytes:
     """Reads the bytes of a file.
 
     Raises:
-        CaptureError: the file cannot be read.
+        CaptureError: if the file cannot be read.
     """
     try:
         return path.read_bytes()
     except OSError as fault:
-        raise CaptureError(f"{path}: cannot be read ({fault.strerror})") from fault
+        raise CaptureError(f"{path} cannot be read: {fault.strerror}") from fault

@@ -1,4 +1,4 @@
-"""Adapts the intrinsics of cameras whose images do not have the calibrated size. Needs only numpy."""
+"""Adapts the intrinsics of cameras whose images do not have the calibrated size. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.images import Size
 
 SizeMismatch = Literal["corner", "centre", "stretch"]
-"""How images were produced whose aspect ratio differs from the calibrated one.
+"""How images with a different aspect ratio than the calibrated one were produced.
 
 ``corner``: cropped (or padded) at the right and bottom. ``centre``: cropped evenly on opposite sides. ``stretch``:
 resized by different factors along x and y.
@@ -22,7 +22,8 @@ ROUNDING_PIXELS = 0.5
 MIN_RESIZE = 0.05
 """Minimum relative change of size that counts as resizing; a smaller change is treated as cropping."""
 CODEC_BLOCK = 16
-"""Video codecs pad both sides to a multiple of this. Some calibrations include the padding, e.g. 1088 for 1080."""
+"""Video codecs pad width and height to a multiple of this. Some calibrations include the padding, e.g. 1088 for
+1080."""
 
 
 def adapt_intrinsics(
@@ -43,20 +44,20 @@ def adapt_intrinsics(
         intrinsics: [3, 3] camera matrix in pixels, with the principal point relative to the upper left corner.
         calibrated: (width, height) for which the camera was calibrated.
         found: actual (width, height) of the images.
-        camera: name of the camera, for messages.
-        where: path of the image, for messages.
+        camera: name of the camera, used in messages.
+        where: path of the image, used in messages.
         size_mismatch: how images with a different aspect ratio were produced; if None, they are rejected.
 
     Returns:
         The adapted intrinsics, and a remark for the user, which is None if the sizes are equal.
 
     Raises:
-        CaptureError: the aspect ratios differ and `size_mismatch` is None.
+        CaptureError: if the aspect ratios differ and `size_mismatch` is None.
 
     >>> k = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
     >>> half, remark = adapt_intrinsics(k, (64, 48), (32, 24), camera="c", where="c.png")
     >>> half[0].tolist(), remark
-    ([50.0, 0.0, 16.0], "camera 'c': calibrated for 64x48, but images are 32x24: intrinsics scaled by 0.5")
+    ([50.0, 0.0, 16.0], "camera 'c': calibrated for 64x48, but images are 32x24; intrinsics scaled by 0.5")
     >>> adapt_intrinsics(k, (64, 48), (60, 48), camera="c", where="c.png", size_mismatch="centre")[0][0].tolist()
     [100.0, 0.0, 30.0]
     """
@@ -67,20 +68,20 @@ def adapt_intrinsics(
     k = intrinsics.copy()
     if _same_aspect_ratio(calibrated, found) and abs(ratio.mean() - 1) > MIN_RESIZE:
         k[:2] *= ratio[:, None]
-        return k, f"{said}: intrinsics scaled by {ratio.mean():.4g}"
+        return k, f"{said}; intrinsics scaled by {ratio.mean():.4g}"
     if size_mismatch == "stretch":
         k[:2] *= ratio[:, None]
-        return k, f"{said}: intrinsics stretched by {ratio[0]:.5g} along x and {ratio[1]:.5g} along y"
+        return k, f"{said}; intrinsics scaled by {ratio[0]:.5g} along x and {ratio[1]:.5g} along y"
     if size_mismatch == "centre":
         k[:2, 2] += (np.array(found) - calibrated) / 2
-        return k, f"{said}: treated as cropped evenly on opposite sides"
+        return k, f"{said}; treated as cropped evenly on opposite sides"
     if size_mismatch == "corner":
-        return k, f"{said}: treated as cropped at the right and bottom"
+        return k, f"{said}; treated as cropped at the right and bottom"
     padded = all(big == -(-small // CODEC_BLOCK) * CODEC_BLOCK for big, small in zip(calibrated, found, strict=True))
-    hint = " (codec padding to a multiple of 16, usually at the right and bottom: --size-mismatch corner)"
+    hint = " (codec padding to a multiple of 16, usually at the right and bottom; try --size-mismatch corner)"
     raise CaptureError(
-        f"{where}: is {found[0]}x{found[1]} pixels, but camera {camera!r} was calibrated for "
-        f"{calibrated[0]}x{calibrated[1]}{hint if padded else ''}; give images of that size, or specify how they "
+        f"{where} is {found[0]}x{found[1]} pixels, but camera {camera!r} was calibrated for "
+        f"{calibrated[0]}x{calibrated[1]}{hint if padded else ''}; use images of that size, or specify how they "
         "were produced: --size-mismatch corner (cropped at the right and bottom), centre (cropped evenly) or stretch"
     )
 

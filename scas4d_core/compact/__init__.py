@@ -1,4 +1,4 @@
-"""The compact 4D file format: key frames and differences between frames. Requires only numpy and zstandard."""
+"""The compact 4D file format: key frames and differences between frames. Requires only NumPy and zstandard."""
 
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.head import FileHeader

@@ -1,4 +1,4 @@
-"""Encodes Gaussians that have no reference state: those of the first frame, and those added later.
+"""Encodes Gaussians without a reference state, i.e. the first frame's Gaussians and newborn Gaussians.
 
 Later frames are coded relative to these Gaussians, so thin axes must keep their direction. Each axis is therefore
 quantized relative to its own length.
@@ -41,7 +41,7 @@ Float = NDArray[np.float64]
 OCTAVE = 8
 """Number of quantization steps per octave (factor of two) of axis length."""
 FINER = 4
-"""Divisor of the bounds on centres, axes and colours, because static Gaussians keep their initial errors."""
+"""Divisor that tightens the bounds on centres, axes and colours, because static Gaussians keep their initial errors."""
 COARSEST = 0.02
 """Maximum error of an axis relative to its own length."""
 SHORTEST = 1e-30
@@ -90,7 +90,7 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     """Decodes Gaussians and their clusters.
 
     Raises:
-        PlaneError: the bytes do not encode ``count`` Gaussians.
+        PlaneError: if the bytes do not encode ``count`` Gaussians.
     """
     steps, offset = unpack(body, count)
     labels, offset = unpack(body, count, offset)

@@ -24,13 +24,13 @@ class Bounds:
         opacity: error of the opacity, whose range is 0…1.
 
     Raises:
-        InputError: a bound is not between 1e-6 (rotation: 0.002) and 1.
+        InputError: if a bound is not between 1e-6 (rotation: 0.002) and 1.
 
     >>> Bounds(position=0.1).position
     0.1
     >>> Bounds(colour=0)
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: bound colour=0 is out of range; give a number from 1e-06 to 1
+    scas4d_core.errors.InputError: bound colour=0 is out of range; use a number from 1e-06 to 1
     """
 
     position: float = 0.04
@@ -44,7 +44,7 @@ class Bounds:
         for item in fields(self):
             value, least = getattr(self, item.name), MIN_ROTATION if item.name == "rotation" else LEAST
             if not least <= value <= 1:
-                raise InputError(f"bound {item.name}={value} is out of range", f"give a number from {least} to 1")
+                raise InputError(f"bound {item.name}={value} is out of range", f"use a number from {least} to 1")
 
     @property
     def rotation_step(self) -> float:
@@ -62,6 +62,6 @@ class Bounds:
 
 
 LEAST = 1e-6
-"""Smallest allowed bound; finer steps would exceed the precision of float32."""
+"""Smallest allowed bound; finer steps would exceed float32 precision."""
 MIN_ROTATION = 0.002
 """Smallest allowed rotation bound; with smaller steps, a half turn would exceed the integer range of a plane."""

@@ -1,7 +1,7 @@
 """Predicts a state from the previous one with one affine map per cluster of Gaussians.
 
 As in the cascade, a map transforms centres (x → x + A (x − c) + t) and axes (F → (I + A) F). Material rotations are
-multiplied by the rotation nearest to I + A. The remaining residual of each Gaussian is small. Requires only numpy.
+multiplied by the rotation nearest to I + A. The remaining residual of each Gaussian is small. Requires only NumPy.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ SMALLEST = 1e-9
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 """The identity quaternion."""
 RIDGE = 1e-3
-"""Ridge regularization of A, in units of the Gaussians' size; a flat or thin cluster leaves A underdetermined."""
+"""Ridge regularization of A, in units of the Gaussians' size; without it, A is underdetermined in flat or thin
+clusters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,7 @@ class Clusters:
         return cls(labels)
 
     def nearest(self, state: Columns, born: Columns) -> Ints:
-        """Returns labels [B] of newborn Gaussians: the nearest cluster for moving ones, else 0.
+        """Returns the labels [B] of newborn Gaussians: the nearest cluster for moving ones, otherwise 0.
 
         Args:
             state: existing Gaussians, to which ``labels`` apply.
@@ -218,7 +219,7 @@ def _k_means(points: Float, count: int) -> Ints:
 
 
 def _nearest(points: Float, centres: Float, piece: int = 512) -> Ints:
-    """Returns the index of the nearest centre of each point, [N]; processing in cache-sized blocks is 10× faster."""
+    """Returns the index of each point's nearest centre, [N]. Processing in cache-sized blocks is 10× faster."""
     squares = np.square(centres).sum(axis=1)
     nearest = [
         np.argmin(squares - 2 * points[begin : begin + piece] @ centres.T, axis=1)

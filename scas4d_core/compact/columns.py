@@ -1,4 +1,4 @@
-"""A state stored as one [components, N] array per attribute, a layout that numpy processes fast."""
+"""A state stored as one [components, N] array per attribute, a layout that NumPy processes quickly."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Columns:
         colours: [3, N] RGB colours.
         foreground: [N] learnt labels; Gaussians above 0.5 move.
         ids: [N] Gaussian ids.
-        opacities: [N] opacities; retired Gaussians keep theirs.
+        opacities: [N] opacities; retired Gaussians keep their opacity.
         retired: [N] bool, whether each Gaussian is retired.
         gloss: [3, M] gloss of the first M Gaussians, or None.
         environment: environment map for reflections, or None.

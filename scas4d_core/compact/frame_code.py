@@ -1,7 +1,7 @@
-"""Encodes a state relative to a reference state that the reader also has: cluster motion, and residuals per Gaussian.
+"""Encodes a state as cluster motion and per-Gaussian residuals, relative to a reference that the reader also has.
 
 The reference is a decoded state, so errors do not accumulate: each frame corrects the errors of the previous one.
-Requires only numpy.
+Requires only NumPy.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 MIN_VOLUME_RATIO = 0.1
-"""Minimum ratio of decoded to true volume; its inverse is the maximum. Other Gaussians are coded exactly.
+"""Minimum ratio of decoded to true volume; its inverse is the maximum. Gaussians outside this range are coded exactly.
 
 This affects thin Gaussians whose axis error is as large as the axis: they would lose their volume or be inverted.
 """
@@ -151,10 +151,10 @@ class FrameDelta:
             reference, clusters: reference state, and clusters of its Gaussians.
 
         Raises:
-            PlaneError: the bytes are not a valid state of these Gaussians.
+            PlaneError: if the bytes are not a valid state of these Gaussians.
         """
         if len(body) < _STEPS.size:
-            raise PlaneError(f"{len(body)} bytes are too few for a state")
+            raise PlaneError(f"truncated state of {len(body)} bytes")
         steps = _STEPS.unpack_from(body)
         if not (np.abs(steps) < LARGEST_STEP).all():
             raise PlaneError(f"quantization steps {steps} are out of range")
@@ -181,7 +181,7 @@ class FrameDelta:
             state: reference Gaussians, or a subset of them.
             clusters: clusters of these Gaussians.
             bounds: error bounds.
-            places: maps each reference row to its column in ``state``; None if ``state`` contains all rows.
+            places: maps each reference row to its column in ``state``, or None if ``state`` contains all rows.
         """
         partial = DecodedState.of(bounds, _predict(state, clusters, self.motion, self.steps))
         for name in SHAPE:
@@ -206,7 +206,7 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
         body: encoded bytes.
 
     Raises:
-        PlaneError: the bytes are not a valid state of these Gaussians.
+        PlaneError: if the bytes are not a valid state of these Gaussians.
     """
     return apply_deltas(reference, clusters, bounds, [FrameDelta.read(body, reference, clusters)])
 
@@ -267,7 +267,7 @@ def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _codes_all_rows(reference: Columns, clusters: Clusters) -> bool:
-    """Returns whether all rows are coded; if all move or there is gloss, looking for static rows would waste time."""
+    """Returns whether to code all rows. If all move or there is gloss, searching for static rows would waste time."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 
@@ -277,7 +277,7 @@ def _changing(
     """Finds the Gaussians whose shape or position must be coded because they move or exceed the bounds.
 
     Returns:
-        Their rows [E], or None for all rows; and the largest error of each attribute over the other Gaussians.
+        The rows of these Gaussians [E] (None for all rows), and the largest error of each attribute over all others.
     """
     if _codes_all_rows(reference, clusters):
         return None, {}
@@ -296,7 +296,7 @@ def _predict(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], 
 
 
 def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[float, float]:
-    """Returns the quantization steps of A and t; each moves a Gaussian by a fraction of its own position step."""
+    """Returns the quantization steps of A and t. One step moves a Gaussian by a fraction of its own position step."""
     moving = clusters.labels > 0
     if not moving.any():
         return 1.0, 1.0
@@ -337,7 +337,7 @@ def apply_exact(
 
     Args:
         state: state to change.
-        rows, values: rows [E], and their centres and axes [12, E]; None for no rows.
+        rows, values: rows [E], and their centres and axes [12, E], or None for no rows.
         retired, environment: new values; None keeps the current ones.
     """
     if rows is not None and values is not None and len(rows):

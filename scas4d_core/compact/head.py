@@ -14,7 +14,7 @@ from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.records import FileError, FormatError
 
 VERSION = 1
-"""Version of the format (docs/format.md); files of other versions are rejected."""
+"""Format version (docs/format.md); files with other versions are rejected."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class FileHeader:
             name: name of the file, for messages.
 
         Raises:
-            FileError: the text is not a valid header.
-            FormatError: the file has an unsupported format version.
+            FileError: if the text is not a valid header.
+            FormatError: if the file has an unsupported format version.
         """
         try:
             record = json.loads(text)
@@ -76,17 +76,17 @@ class FileHeader:
             if record["format"] != "scas4d" or not isinstance(version, int):
                 raise ValueError(f"format {record['format']!r}, version {version!r}")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise FileError(f"{name}: not a compact 4D file: invalid header ({error})") from None
+            raise FileError(f"{name} is not a compact 4D file: invalid header ({error})") from None
         if version != VERSION:
             raise FormatError(
-                f"{name}: a compact 4D file of version {version}; this scas4d reads version {VERSION}: "
-                "use the scas4d that wrote it"
+                f"{name} has compact 4D format version {version}, but this version of scas4d reads version {VERSION}; "
+                "use the version that wrote the file"
             )
         try:
             origin = np.array(record["world"]["origin"], np.float64).reshape(3)
             metres = float(record["world"]["metres_per_unit"])
             if not (np.isfinite(origin).all() and np.isfinite(metres) and metres > 0):
-                raise ValueError(f"world {record['world']}")
+                raise ValueError(f"invalid world {record['world']}")
             red, green, blue = (float(value) for value in record["background"])
             cameras, rate = record["cameras"], record["frames_per_second"]
             return cls(

@@ -36,7 +36,7 @@ def footer(offset: int) -> bytes:
 
 
 def read_index(file: BinaryIO, name: str) -> tuple[list[Record], dict[str, Any]] | None:
-    """Returns the records of a file and the JSON values about it, or None if the index is missing or damaged."""
+    """Returns a file's records and the JSON values about the file, or None if the index is missing or damaged."""
     size = file.seek(0, 2)
     if size < _FOOTER.size + HEAD_SIZE:
         return None

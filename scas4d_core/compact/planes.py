@@ -42,7 +42,7 @@ def pack(values: NDArray[Any]) -> bytes:
     """
     numbers = np.asarray(values)
     if len(numbers) and (int(numbers.max()) >= MOST or int(numbers.min()) <= -MOST):
-        raise OverflowError(f"values of a plane must be below {MOST} in absolute value")
+        raise OverflowError(f"plane values must be below {MOST} in absolute value")
     small = numbers.astype(np.int32)
     folded = np.empty(len(small), np.uint32)
     folded[:] = ((small << 1) ^ (small >> 31)).view(np.uint32)
@@ -67,7 +67,7 @@ def unpack(data: bytes | memoryview, count: int, offset: int = 0) -> tuple[Ints,
     """Decodes the plane at ``offset`` to integers [count]; also returns the offset of its end.
 
     Raises:
-        PlaneError: the bytes are not a plane with this number of values.
+        PlaneError: if the bytes are not a plane with this number of values.
     """
     unsigned, end = _unpacked(data, count, offset, 4)
     return (unsigned >> 1).view(np.int32) ^ -(unsigned & 1).view(np.int32), end
@@ -76,14 +76,14 @@ def unpack(data: bytes | memoryview, count: int, offset: int = 0) -> tuple[Ints,
 def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> tuple[Unsigned, int]:
     """Decodes unsigned values; ``wider`` limits how many more planes may be nested."""
     if len(data) < offset + _HEAD.size:
-        raise PlaneError(f"the data ends at byte {len(data)}, within a plane")
+        raise PlaneError(f"unexpected end of data at byte {len(data)}, inside a plane")
     bits, escapes, size = _HEAD.unpack_from(data, offset)
     offset += _HEAD.size
     if bits == 0:
         return np.zeros(count, np.uint32), offset
     end = offset + size
     if bits not in (*NARROW, WIDE) or escapes > count or len(data) < end or wider == 0:
-        raise PlaneError(f"invalid plane of {bits} bits, {escapes} escapes and {size} bytes at byte {offset}")
+        raise PlaneError(f"invalid plane at byte {offset} ({bits} bits, {escapes} escapes, {size} bytes)")
     if bits == WIDE:
         low = np.frombuffer(decompress(data[offset:end], count), np.uint8)
         high, end = _unpacked(data, count, end, wider - 1)
@@ -109,21 +109,22 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
     """Decompresses a zstandard frame that contains exactly ``size`` bytes.
 
     Raises:
-        PlaneError: the frame contains a different number of bytes, or is damaged. At most ``size`` bytes are allocated.
+        PlaneError: if the frame contains a different number of bytes, or is damaged. At most ``size`` bytes are
+            allocated.
     """
     try:
         if zstandard.frame_content_size(data) != size:
-            raise PlaneError(f"{zstandard.frame_content_size(data)} bytes instead of {size}")
+            raise PlaneError(f"expected {size} bytes after decompression, got {zstandard.frame_content_size(data)}")
         content: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     except zstandard.ZstdError as error:
         raise PlaneError(f"not a zstandard frame ({error})") from None
     if len(content) != size:
-        raise PlaneError(f"{len(content)} bytes instead of {size}")
+        raise PlaneError(f"expected {size} bytes after decompression, got {len(content)}")
     return content
 
 
 def _bits(unsigned: Unsigned) -> int:
-    """Returns the packing with the smallest estimated size, from the entropy of the values and the cost of escapes."""
+    """Returns the packing with the smallest size, estimated from the entropy of the values and the cost of escapes."""
     count = len(unsigned)
     below = np.bincount(np.minimum(unsigned, 256), minlength=257)
     costs = []

@@ -1,4 +1,4 @@
-"""Reads a compact file, even while it is being written or if it was truncated. Requires only numpy and zstandard."""
+"""Reads compact files, even truncated files and files that are being written. Requires only NumPy and zstandard."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ class CompactReader:
 
     Attributes:
         head: header with the world transform, bounds, background and cameras.
-        damage: description of the damage after which no frames are listed, or None.
-        about: values about the whole file from its index, such as the largest error of each attribute (``errors``);
-            empty without an index.
+        damage: description of the first damage in the file, or None; frames after the damage are not listed.
+        about: JSON values about the whole file, from its index, such as the largest error of each attribute
+            (``errors``); empty if there is no index.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        FileError: the file is not a compact file.
-        DamagedFileError: its header is damaged.
+        FileNotFoundError: if the file does not exist.
+        FileError: if the file is not a compact file.
+        DamagedFileError: if the file header is damaged.
 
     >>> CompactReader("README.md")
     Traceback (most recent call last):
-    scas4d_core.compact.records.FileError: README.md: not a compact 4D file: it does not begin with b's4dR'
+    scas4d_core.compact.records.FileError: README.md is not a compact 4D file: it does not start with b's4dR'
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -82,7 +82,7 @@ class CompactReader:
         self._last: tuple[int, Columns] | None = None
         try:
             if (begin := self._file.read(len(MAGIC))) != MAGIC[: len(begin)] or not begin:
-                raise FileError(f"{self.path.name}: not a compact 4D file: it does not begin with {MAGIC!r}")
+                raise FileError(f"{self.path.name} is not a compact 4D file: it does not start with {MAGIC!r}")
             parts = read_index(self._file, self.path.name)
             if parts is not None:
                 records, self.about = parts
@@ -96,7 +96,7 @@ class CompactReader:
                 self.refresh()
             if not self._records or self._records[0].kind is not RecordKind.HEAD:
                 raise FileError(
-                    f"{self.path.name}: the header is missing{self._why()}; it was truncated or not yet written"
+                    f"{self.path.name}: the header is missing{self._why()}; the file is truncated or not yet written"
                 )
             self.head = FileHeader.read(read_body(self._file, self._records[0], self.path.name), self.path.name)
         except BaseException:
@@ -116,7 +116,7 @@ class CompactReader:
         self._file.close()
 
     def refresh(self) -> list[int]:
-        """Reads the records appended since the last call; returns the new frames."""
+        """Reads the records appended since the last call, and returns the indices of the new frames."""
         if self._whole or self.damage is not None:
             return []
         known = len(self._frames)
@@ -152,13 +152,15 @@ class CompactReader:
         """Returns the state of a frame in the internal world of ``head.world``. Its arrays must not be modified.
 
         Raises:
-            FileError: the file has no such frame.
-            DamagedFileError: bytes needed for the frame are damaged.
+            FileError: if the file has no such frame.
+            DamagedFileError: if bytes needed for the frame are damaged.
         """
         place = bisect_right(self._frames, index) - 1
         if place < 0 or self._frames[place] != index:
             held = f"{self._frames[0]} to {self._frames[-1]}" if self._frames else "none"
-            raise FileError(f"{self.path.name}: frame {index} is not in the file{self._why()}; it has frames {held}")
+            raise FileError(
+                f"{self.path.name}: frame {index} is not in the file{self._why()}; available frames: {held}"
+            )
         begin = place
         while (
             self._states[begin].kind is RecordKind.DELTA and begin > 0 and not (self._last and self._last[0] == begin)
@@ -180,16 +182,16 @@ class CompactReader:
             file: output file.
 
         Returns:
-            The copied frames, up to the first damaged one. They include this file's first frame and the key frame
-            before ``first``, on which the others depend.
+            Indices of the copied frames, up to the first damaged one. They include this file's first frame and the key
+            frame before ``first``, on which the others depend.
 
         Raises:
-            FileError: no frame is in the range.
-            DamagedFileError: the first frame, or a record that it depends on, is damaged.
+            FileError: if no frame is in the range.
+            DamagedFileError: if the first frame, or a record that it depends on, is damaged.
         """
         wanted = [place for place, index in enumerate(self._frames) if first <= index <= last]
         if not wanted:
-            raise FileError(f"{self.path.name}: no frame from {first} to {last} is in the file{self._why()}")
+            raise FileError(f"{self.path.name} contains no frames from {first} to {last}{self._why()}")
         begin = next(place for place in range(wanted[0], -1, -1) if self._states[place].kind is not RecordKind.DELTA)
         states = {self._states[place] for place in (0, *range(begin, wanted[-1] + 1))}
         end, copied = self._frames[wanted[-1]], list[int]()
@@ -210,14 +212,14 @@ class CompactReader:
         return copied
 
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
-        """Returns the part label of each Gaussian [N], −1 for none, last stored up to a frame; None if not stored."""
+        """Returns the part labels [N] (−1 for none) most recently stored up to a frame, or None if there are none."""
         records = [record for record in self._parts if index is None or record.frame <= index]
         if not records:
             return None
         body = read_body(self._file, records[-1], self.path.name)
         count = int.from_bytes(body[:4], "little")
         if count > self.count:
-            raise self._damaged(records[-1], PlaneError(f"parts of {count} Gaussians, but only {self.count} exist"))
+            raise self._damaged(records[-1], PlaneError(f"labels for {count} Gaussians, but only {self.count} exist"))
         try:
             return unpack(body, count, 4)[0].astype(np.int64) - 1
         except PlaneError as error:
@@ -250,10 +252,10 @@ class CompactReader:
         return min(one.offset - HEAD_SIZE for one in self._records if one.frame >= index)
 
     def note(self, index: int) -> dict[str, Any]:
-        """Returns the note on a frame as a dict of JSON values, empty if there is none.
+        """Returns a frame's note as a dict of JSON values, or an empty dict if there is no note.
 
         Raises:
-            DamagedFileError: the note is damaged.
+            DamagedFileError: if the note is damaged.
         """
         record = self._notes.get(index)
         if record is None:
@@ -272,9 +274,9 @@ class CompactReader:
                 self._frames.append(record.frame)
         elif record.kind in STATES:
             if not self._frames or record.frame <= self._frames[-1]:
-                before = f"frame {self._frames[-1]}" if self._frames else "no frame"
+                before = f"after frame {self._frames[-1]}" if self._frames else "before any birth record"
                 place = record.offset - HEAD_SIZE
-                raise DamagedFileError(f"{self.path.name}: frame {record.frame} follows {before} at byte {place}")
+                raise DamagedFileError(f"{self.path.name}: unexpected frame {record.frame} {before}, at byte {place}")
             self._states.append(record)
             self._frames.append(record.frame)
         elif record.kind is RecordKind.PARTS:
@@ -288,7 +290,7 @@ class CompactReader:
         return -1 if state.kind is RecordKind.BORN else sum(birth.frame <= state.frame for birth in self._births)
 
     def _decoded(self, places: list[int], before: Columns | None) -> Columns:
-        """Decodes consecutive states of the same Gaussians; returns the last. Only the first may be a key frame.
+        """Decodes consecutive states of the same Gaussians and returns the last. Only the first may be a key frame.
 
         Args:
             places: indices of the states, in file order.
@@ -315,7 +317,7 @@ class CompactReader:
         if record.kind is RecordKind.DELTA:
             expected = checksum_bytes(self._states[place - 1])
             if body[: len(expected)] != expected:
-                raise self._damaged(record, PlaneError("it was coded against a different previous state"))
+                raise self._damaged(record, PlaneError("it is relative to a different previous state"))
             body = body[len(expected) :]
         try:
             return FrameDelta.read(body, reference, clusters)
@@ -351,7 +353,7 @@ class CompactReader:
         """Returns the Gaussian count at the start of a body, after a plausibility check against the body size."""
         count = int.from_bytes(body[:4], "little")
         if len(body) < 4 or count > MAX_PER_BYTE * len(body) + 1024:
-            raise self._damaged(record, PlaneError(f"{count} Gaussians in {len(body)} bytes"))
+            raise self._damaged(record, PlaneError(f"invalid count: {count} Gaussians in {len(body)} bytes"))
         return count
 
     def _damaged(self, record: Record, error: Exception) -> DamagedFileError:

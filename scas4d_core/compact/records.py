@@ -1,6 +1,6 @@
 """Records of a compact file: a checksummed header, which suffices to list the records, and a body.
 
-A file can be read while it is being written: an incomplete record at its end is ignored. Damage before that is reported
+A file can be read while it is being written: an incomplete record at its end is ignored. Any other damage is reported
 with its offset.
 """
 
@@ -29,12 +29,12 @@ LONGEST = 1 << 24
 
 
 class RecordKind(IntEnum):
-    """Kinds of records, which differ in the content of the body."""
+    """Kinds of records, which determine the content of the body."""
 
     HEAD = 1
     """JSON: version, world, bounds."""
     BORN = 2
-    """Gaussians coded without a reference: those of the first frame, or newborn ones."""
+    """Gaussians coded without a reference, either the first frame's Gaussians or newborn ones."""
     KEY = 3
     """A key state, coded relative to the birth records of its Gaussians."""
     DELTA = 4
@@ -116,7 +116,7 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
         name: name of the file, for messages.
 
     Raises:
-        DamagedFileError: there is no valid record where one should begin.
+        DamagedFileError: if there is no valid record where one should begin.
     """
     file.seek(0, 2)
     size = file.tell()
@@ -133,7 +133,7 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
 
 
 def _is_zero(file: BinaryIO) -> bool:
-    """Returns whether the rest of the file is zero."""
+    """Returns whether the rest of the file contains only zeros."""
     while piece := file.read(1 << 20):
         if any(piece):
             return False
@@ -144,8 +144,8 @@ def checked_records(path: Path) -> Iterator[int]:
     """Verifies all complete records of a file, and yields the body size of each.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        DamagedFileError: a record is damaged.
+        FileNotFoundError: if the file does not exist.
+        DamagedFileError: if a record is damaged.
     """
     with path.open("rb") as file:
         for record in scan(file, 0, path.name):
@@ -157,15 +157,17 @@ def parse_head(data: bytes, offset: int, name: str) -> Record:
     """Parses the header of the record at an offset.
 
     Raises:
-        DamagedFileError: the bytes are not a record header.
-        FileError: the record has an unknown kind.
+        DamagedFileError: if the bytes are not a record header.
+        FileError: if the record has an unknown kind.
     """
     head = data[: _HEAD.size]
     if len(data) < HEAD_SIZE or head[:4] != MAGIC or _CHECKSUM.unpack_from(data, _HEAD.size)[0] != zlib.crc32(head):
-        raise DamagedFileError(f"{name}: no record begins at byte {offset}; the file is damaged there")
+        raise DamagedFileError(f"{name}: no valid record at byte {offset}; the file is damaged")
     _, kind, frame, time, size, checksum = _HEAD.unpack(head)
     if kind not in RecordKind.__members__.values():
-        raise FileError(f"{name}: unknown record kind {kind} at byte {offset}; a later version of scas4d wrote it")
+        raise FileError(
+            f"{name}: unknown record kind {kind} at byte {offset}; a later version of scas4d wrote the file"
+        )
     return Record(RecordKind(kind), frame, time, offset + HEAD_SIZE, size, checksum)
 
 
@@ -173,7 +175,7 @@ def read_body(file: BinaryIO, record: Record, name: str) -> bytes:
     """Reads the body of a record.
 
     Raises:
-        DamagedFileError: the checksum does not match, or the file ends within the body.
+        DamagedFileError: if the checksum does not match, or the file ends within the body.
     """
     file.seek(record.offset)
     body = file.read(record.size)
@@ -192,14 +194,14 @@ def note_bytes(note: Mapping[str, Any]) -> bytes:
         note: JSON values of the note.
 
     Raises:
-        ValueError: the note is not valid JSON, or is longer than 16 MB.
+        ValueError: if the note is not valid JSON, or is longer than 16 MB.
 
     >>> read_note(note_bytes({"psnr": 36.5}))
     {'psnr': 36.5}
     """
     text = json.dumps(dict(note), allow_nan=False).encode()
     if len(text) > LONGEST:
-        raise ValueError(f"a note of {len(text)} bytes is too long; the maximum is {LONGEST}")
+        raise ValueError(f"the note has {len(text)} bytes, but the maximum is {LONGEST}")
     return len(text).to_bytes(COUNT_BYTES, "little") + compress(text)
 
 
@@ -207,11 +209,11 @@ def read_note(body: bytes) -> dict[str, Any]:
     """Parses the body of a note.
 
     Raises:
-        PlaneError: the body is not a note.
+        PlaneError: if the body is not a note.
     """
     size = int.from_bytes(body[:COUNT_BYTES], "little")
     if len(body) <= COUNT_BYTES or size > LONGEST:
-        raise PlaneError(f"invalid note of {size} bytes in a body of {len(body)}")
+        raise PlaneError(f"invalid note of {size} bytes in a body of {len(body)} bytes")
     try:
         note = json.loads(decompress(body[COUNT_BYTES:], size))
     except (ValueError, RecursionError) as error:

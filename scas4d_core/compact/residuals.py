@@ -1,4 +1,4 @@
-"""Decodes a state attribute by attribute, from residuals quantized to the error bounds. Requires only numpy."""
+"""Decodes a state attribute by attribute, from residuals quantized to the error bounds. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from scas4d_core.gaussians import rotation_rows
 Array = NDArray[np.float32]
 
 SCALE_STEP = 0.08
-"""Quantization step of a log size. Decoded sizes, which scale other steps, are within 4 % of the true ones."""
+"""Quantization step of logarithmic sizes. Decoded sizes, which scale other steps, are within 4 % of the true sizes."""
 MARGIN = 0.95
 """Safety factor on steps that are relative to a size, to cover the size's own quantization error."""
 LARGEST = 1 << 30
@@ -122,7 +122,7 @@ class DecodedState:
 def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
     """Rounds residuals [P, N] to int32 and marks rows [N] with values that are not finite or too large.
 
-    Such values become 0.
+    Such values are set to 0.
     """
     outside = ~(np.abs(found) < LARGEST)
     return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)

@@ -1,4 +1,4 @@
-"""Sections of a coded state: residuals, masks and exact arrays. Decoding never allocates more than the rows need."""
+"""Sections of a coded state: residuals, masks and exact arrays. Decoding allocates only as much as the rows need."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: i
 
     Args:
         planes: [P, N] residuals.
-        rows: [N] row index of each residual; None if there is one for every row.
+        rows: [N] row index of each residual, or None if every row has a residual.
         total: total number of rows, if ``rows`` is given.
 
     >>> planes = np.array([[0, 0, 5, 0], [0, 0, 1, 0]])
@@ -70,7 +70,7 @@ def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tup
     """Decodes a section to its coded rows [R], their residuals [components, R], and the offset of its end.
 
     Raises:
-        PlaneError: the bytes are not a valid section.
+        PlaneError: if the bytes are not a valid section.
     """
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
@@ -116,7 +116,7 @@ def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
         return None, offset
     dimensions = body[offset] if offset < len(body) else 0
     if not 0 < dimensions <= 4 or len(body) < offset + 1 + 4 * dimensions:
-        raise PlaneError(f"invalid array of {dimensions} dimensions at byte {offset}")
+        raise PlaneError(f"invalid array with {dimensions} dimensions at byte {offset}")
     shape = struct.unpack_from(f"<{dimensions}I", body, offset + 1)
     size = 4
     for length in shape:
@@ -141,10 +141,10 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
     if kind == NONE:
         return np.zeros(0, np.intp), np.zeros((width, 0), np.float32), offset
     if len(body) < offset + 4:
-        raise PlaneError(f"the data ends at byte {len(body)}, within a count")
+        raise PlaneError(f"unexpected end of data at byte {len(body)}, inside a count")
     (count,) = struct.unpack_from("<I", body, offset)
     if not 0 < count <= most:
-        raise PlaneError(f"invalid number of exactly coded rows: {count} of {most}")
+        raise PlaneError(f"invalid number of exactly coded rows: {count} (at most {most})")
     data, offset = _read_sized(body, offset + 4, 4 * count * (1 + width))
     rows = np.frombuffer(data, "<u4", count).astype(np.intp)
     if int(rows.max()) >= most:
@@ -156,10 +156,10 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
 def _read_kind(body: bytes, offset: int) -> tuple[int, int]:
     """Returns the first byte of a section, and the offset after it."""
     if offset >= len(body):
-        raise PlaneError(f"the data ends at byte {len(body)}, before a section")
+        raise PlaneError(f"unexpected end of data at byte {len(body)}, before a section")
     kind = body[offset]
     if kind not in (NONE, ALL, SOME):
-        raise PlaneError(f"invalid section of kind {kind} at byte {offset}")
+        raise PlaneError(f"invalid section kind {kind} at byte {offset}")
     return kind, offset + 1
 
 
@@ -170,8 +170,10 @@ def _sized(data: bytes) -> bytes:
 def _read_sized(body: bytes, offset: int, size: int) -> tuple[bytes, int]:
     """Decompresses a block of ``size`` bytes; also returns the offset of the block's end."""
     if len(body) < offset + 4:
-        raise PlaneError(f"the data ends at byte {len(body)}, within a size")
+        raise PlaneError(f"unexpected end of data at byte {len(body)}, inside a size")
     (length,) = struct.unpack_from("<I", body, offset)
     if len(body) < offset + 4 + length:
-        raise PlaneError(f"{length} bytes at byte {offset + 4} extend beyond the end of the data, at {len(body)}")
+        raise PlaneError(
+            f"a block of {length} bytes at byte {offset + 4} extends beyond the end of the data ({len(body)} bytes)"
+        )
     return decompress(body[offset + 4 : offset + 4 + length], size), offset + 4 + length

@@ -45,14 +45,14 @@ class CompactWriter:
         path: path of the file, which must not exist.
         head: header of the file.
         key_every: interval between key frames.
-        clustered: whether to cluster the Gaussians. Clustering dominates the time for a single-frame file, but makes
-            further frames smaller.
+        clustered: whether to cluster the Gaussians. Clustering dominates the time needed to write a single-frame file,
+            but makes further frames smaller.
 
     Attributes:
         errors: largest error of each attribute so far, in the units of ``Bounds``.
 
     Raises:
-        FileExistsError: the file exists.
+        FileExistsError: if the file exists.
 
     >>> from tempfile import TemporaryDirectory
     >>> from scas4d_core.cameras import WorldFrame
@@ -72,7 +72,7 @@ class CompactWriter:
         self, path: Path | str, head: FileHeader, key_every: int = KEY_EVERY, *, clustered: bool = True
     ) -> None:
         if key_every < 1:
-            raise FileError(f"key_every is {key_every}; give 1 or more")
+            raise FileError(f"key_every must be at least 1; got {key_every}")
         text = head.text()  # serialized first, so an invalid header creates no file
         self.path = Path(path)
         self.head = head
@@ -86,7 +86,7 @@ class CompactWriter:
         self._last: Columns | None = None
         self._since_key = 0
         self._opacities: NDArray[np.float32] | None = None
-        """Exact opacities of all Gaussians so far; None if unknown."""
+        """Exact opacities of all Gaussians so far, or None if unknown."""
         self._record = Record(RecordKind.HEAD, -1, 0.0, 0, 0, 0)
         """The record of the last state."""
         self._append(record_bytes(RecordKind.HEAD, text))
@@ -98,14 +98,14 @@ class CompactWriter:
         ``errors`` covers the existing frames that have a note, and all frames added from now on.
 
         Raises:
-            FileNotFoundError: the file does not exist.
-            FileError: the file is complete, has no state, or is damaged.
+            FileNotFoundError: if the file does not exist.
+            FileError: if the file is complete, has no state, or is damaged.
         """
         with CompactReader(path) as reader:
             if reader.is_closed:
-                raise FileError(f"{reader.path.name}: the file is already complete; start another file")
+                raise FileError(f"{reader.path.name} is already complete; start a new file")
             if reader.damage is not None or not reader.frames:
-                raise FileError(f"{reader.path.name}: it cannot be resumed ({reader.damage or 'it has no state'})")
+                raise FileError(f"{reader.path.name} cannot be resumed: {reader.damage or 'it contains no state'}")
             last = reader.encoder_state()
             known = [reader.note(index).get(ERRORS, {}) for index in reader.frames]
         writer = cls.__new__(cls)
@@ -143,8 +143,8 @@ class CompactWriter:
             note: JSON values about the frame, which are written before its state together with its ``errors``.
 
         Raises:
-            FileError: the frame cannot follow the previous ones.
-            ValueError: the note cannot be serialized as JSON.
+            FileError: if the frame cannot follow the previous frames.
+            ValueError: if the note cannot be serialized as JSON.
         """
         self._check(index, state)
         note_bytes(note or {})
@@ -185,14 +185,14 @@ class CompactWriter:
             labels: [N] part labels, −1 for none.
 
         Raises:
-            FileError: the index is not that of the last frame, or the number of labels is wrong.
+            FileError: if the index is not that of the last frame, or the number of labels is wrong.
         """
         values = np.asarray(labels, np.int64)
         known = 0 if self._born is None else len(self._born)
         if index != self._record.frame or values.shape != (known,):
             raise FileError(
-                f"{self.path.name}: parts {values.shape} of frame {index} do not match frame {self._record.frame} with "
-                f"{known} Gaussians"
+                f"{self.path.name}: part labels of shape {values.shape} for frame {index} do not match the last frame, "
+                f"{self._record.frame}, which has {known} Gaussians"
             )
         self._append(record_bytes(RecordKind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
 
@@ -202,15 +202,17 @@ class CompactWriter:
         if index <= last:
             raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in ascending order")
         if not len(state):
-            raise FileError(f"{name}: frame {index} has no Gaussians; start with a frame that has some")
+            raise FileError(f"{name}: frame {index} has no Gaussians; start with a frame that contains Gaussians")
         if (born := self._born) is not None:
             known = len(born)
             if len(state) < known or not np.array_equal(state.ids[:known], born.ids):
-                raise FileError(f"{name}: frame {index} has different Gaussians from frame {last}; do not remove any")
+                raise FileError(f"{name}: frame {index} lacks Gaussians of frame {last}; do not remove or reorder any")
             if self._opacities is not None and not np.array_equal(state.own_opacities[:known], self._opacities):
-                raise FileError(f"{name}: frame {index} changes opacities of frame {last}; they are fixed at birth")
+                raise FileError(f"{name}: frame {index} changes opacities from frame {last}; they are fixed at birth")
             if _glossy(state.gloss) != (0 if born.gloss is None else born.gloss.shape[1]):
-                raise FileError(f"{name}: frame {index} has gloss for {_glossy(state.gloss)} Gaussians, unlike before")
+                raise FileError(
+                    f"{name}: frame {index} has gloss for {_glossy(state.gloss)} Gaussians, unlike the first frame"
+                )
         for field in ("means", "factors", "rotations", "colours", "own_opacities", "gloss"):
             if (array := getattr(state, field)) is None or np.isfinite(array).all():
                 continue

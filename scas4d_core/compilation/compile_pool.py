@@ -30,7 +30,7 @@ NICE = 10
 GC_THRESHOLDS = (200_000, 20, 1000)
 """Thresholds of Python's garbage collector, tuned for a compiler with millions of long-lived objects.
 
-The default thresholds would take a tenth of the time; disabling collection would raise memory use by half.
+With the default thresholds, collection takes a tenth of the time; disabling it increases memory use by half.
 """
 POLL_S = 0.05
 PARENT_EVERY_S = 0.5
@@ -38,14 +38,14 @@ TRIES = 2
 """Maximum number of pools started for the same kernels, because the first one may have been killed."""
 
 OnProgress = Callable[[int, int], None]
-"""Called with the number of compiled kernels and the total number to wait for."""
+"""Callback that receives the number of compiled kernels and the total number to wait for."""
 
 _pool: list[subprocess.Popen[bytes]] = []
 """Pool processes started by this process."""
 
 
 def processes() -> int:
-    """Returns how many processes may compile at the same time: one per core, at most `MAX_PROCESSES`."""
+    """Returns the number of processes that may compile concurrently: one per core, at most `MAX_PROCESSES`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MAX_PROCESSES)
 

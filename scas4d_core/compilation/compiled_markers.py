@@ -43,7 +43,7 @@ class CompiledMarkers:
         folder: folder for this version, checkout and processor; created if it does not exist.
 
     Raises:
-        OSError: the folder cannot be created.
+        OSError: if the folder cannot be created.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -37,7 +37,7 @@ def compile_kernel(kernel: Kernel) -> None:
     """Compiles a kernel into the cache, or loads it if it is already cached.
 
     Raises:
-        Exception: the function does not exist, or Numba cannot compile it for these types.
+        Exception: if the function does not exist, or Numba cannot compile it for these types.
     """
     function = getattr(import_module(f"scas4d_core.{kernel.module}"), kernel.name)
     function.compile(types_of(kernel.arguments))

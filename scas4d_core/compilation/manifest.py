@@ -1,8 +1,8 @@
 """Kernels that scenes call, with their argument types, grouped by the stage that needs them.
 
 Numba compiles a kernel on its first call, for the argument types of that call. This list declares the types in advance
-so that several processes can share the work; a test compares it with the calls of a scene. A kernel missing from the
-list still works, but the first process to call it must compile it.
+so that several processes can share the work; a test compares it with the kernels that a scene calls. A kernel missing
+from the list still works, but the first process to call it must compile it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from enum import StrEnum
 
 
 class KernelGroup(StrEnum):
-    """Groups of kernels, by the stage that needs them."""
+    """Groups of kernels, one for each stage that needs them."""
 
     FIRST_FRAME = "first frame"
     """Needed for frame 0 and to render any view."""
@@ -31,12 +31,12 @@ class Kernel:
     """A kernel with specific argument types.
 
     Attributes:
-        group: group that the kernel belongs to.
+        group: group to which the kernel belongs.
         module: module of the function, relative to ``scas4d_core``.
         name: name of the function.
         arguments: one word per argument. The first letter is the type: f, d for float32, float64; i, s for int64,
-            int32; u, w, y for uint32, uint64, uint8; b for bool. A number after it is the number of array axes. i*2 is
-            a tuple of two int64, and none is None.
+            int32; u, w, y for uint32, uint64, uint8; b for bool. A number after the letter is the number of array axes.
+            i*2 is a tuple of two int64, and none is None.
     """
 
     group: KernelGroup

@@ -39,11 +39,11 @@ class Effect:
         name: key in ``effect_names.EFFECTS``.
         group: group of related effects.
         description: one sentence for users.
-        disambiguation: how the effect is separated from others that could explain the same pixels.
+        disambiguation: how the effect is distinguished from other effects that could explain the same pixels.
         cost: additional cost of an update with the effect.
-        auto: whether the effect needs evidence to be on; otherwise it is on unless it is refused.
-        on_above, off_below: values of ``Evidence.share`` at or above which the effect is switched on, and below which
-            it is switched off.
+        auto: whether the effect requires evidence to be switched on; otherwise it is on unless it is refused.
+        on_above: the effect is switched on if ``Evidence.share`` is at least this value.
+        off_below: the effect is switched off if ``Evidence.share`` is below this value.
         without_masks: whether the effect can be on in a scene whose first frame has no masks.
         committed_arrays: names of the effect's arrays in ``Attempt.carried`` that are committed with each frame; they
             should be small. Only these arrays and those of ``first_frame_arrays`` survive the loss of a checkpoint.
@@ -61,27 +61,27 @@ class Effect:
     committed_arrays: tuple[str, ...] = ()
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns the fault and the remedy if the effect cannot be on with these settings; None if it can."""
+        """Returns the problem and its remedy if the effect cannot be on with these settings, or None if it can."""
         return None
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns arrays of frame 0 that the evidence or the part needs, or None; not called if pinned off."""
+        """Returns arrays of frame 0 that the effect needs later, or None. Not called if the effect is pinned off."""
         return None
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns the fault and the remedy if the effect cannot be off with these settings; None if it can."""
+        """Returns the problem and its remedy if the effect cannot be off with these settings, or None if it can."""
         return None
 
     def on_at_first(self, seen: FrameObservation) -> bool:
-        """Returns true if the effect is switched on by the first frame; requires ``first_frame_arrays``."""
+        """Returns whether the first frame switches the effect on; requires ``first_frame_arrays``."""
         return False
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the evidence from a frame; None if the frame gives none, in which case the switch is unchanged."""
+        """Returns the evidence from a frame, or None if there is none; the switch then stays unchanged."""
         return None
 
     def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
-        """Returns arrays for later frames, in addition to those of the effect's part; None keeps the existing arrays.
+        """Returns arrays for later frames, besides those of the effect's part, or None to keep the existing arrays.
 
         Called after each learnt frame, before the evidence is computed. It is also called while the effect is off,
         unless it is pinned off.
@@ -109,11 +109,11 @@ class Effect:
 
 
 Refusal = tuple[str, str]
-"""The fault and its remedy."""
+"""Description of a problem, and its remedy."""
 
 
 def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
-    """Returns the fault and the remedy if a rate or weight of the update is 0.
+    """Returns the problem and its remedy if a learning rate or weight of the update is 0, otherwise None.
 
     Args:
         settings: settings of the scene.
@@ -121,7 +121,7 @@ def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
     """
     if attrgetter(key)(settings.update) > 0:
         return None
-    return f"update.{key} is 0", f"set a {'weight' if key.startswith('weights.') else 'rate'} above 0"
+    return f"update.{key} is 0", f"use a {'weight' if key.startswith('weights.') else 'rate'} above 0"
 
 
 @cache

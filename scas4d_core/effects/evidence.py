@@ -19,7 +19,7 @@ class Evidence:
     """Evidence for an effect, from the frames so far.
 
     Attributes:
-        share: share that the effect explains or would explain, 0…1; compared with the thresholds of the effect.
+        share: share (0…1) that the effect explains or would explain; compared with the effect's thresholds.
         text: human-readable explanation, such as "camera c2 is off by 0.8 pixels".
     """
 
@@ -32,7 +32,7 @@ class FitTime:
     """Time limit and time spent for fitting the Gaussians added in a frame, outside the update.
 
     Attributes:
-        end: ``perf_counter`` value at which fits must end; no limit if None.
+        end: ``perf_counter`` value at which fits must end, or None if there is no limit.
         spent: time spent on fits, in seconds.
         postponed: descriptions of fits for which there was no time; the next frame detects them again.
     """

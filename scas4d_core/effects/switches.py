@@ -1,4 +1,4 @@
-"""On/off switches of a scene's effects: pinned by the settings, or decided from evidence with hysteresis.
+"""On/off switches of a scene's effects, which are pinned by the settings or decided from evidence, with hysteresis.
 
 A switch changes between two frames. It is committed with the frame whose evidence changed it. A resumed scene continues
 with the switches of its checkpoint, so that a replay makes the same decisions.
@@ -32,7 +32,7 @@ class Switch:
         on: whether the effect takes part in updates.
         since: index of the frame after which the switch last changed.
         pinned: whether the settings pin the switch.
-        share, text: latest evidence, see ``Evidence``.
+        share, text: latest evidence; see ``Evidence``.
         idle: number of consecutive frames with evidence below the switch-off threshold.
     """
 
@@ -50,10 +50,15 @@ NO_EVIDENCE: Mapping[str, Evidence] = MappingProxyType({})
 
 
 def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
-    """Yields the name, mode, fault and remedy of each effect whose pin contradicts the settings."""
+    """Yields the name, mode, problem and remedy of each effect whose pin contradicts the settings."""
     for name, mode in settings.effects.items():
         if mode == "on" and (refusal := effect(name).refusal(settings)) is not None:
-            yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
+            yield (
+                name,
+                mode,
+                f"effects.{name} cannot be 'on': {refusal[0]}",
+                f"{refusal[1]}, or set the effect to 'auto'",
+            )
         if mode == "off" and (refusal := effect(name).requirement(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
 
@@ -61,7 +66,7 @@ def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, st
 def first_switches(
     settings: Settings, index: int, found: Mapping[str, Evidence] = NO_EVIDENCE, masked: bool = True
 ) -> dict[str, Switch]:
-    """Returns the switches before any update: pinned, on by default, or on because of evidence in frame 0.
+    """Returns the switches before any update: pinned, on by default, or switched on by evidence in frame 0.
 
     Args:
         settings: settings of the scene.
@@ -201,7 +206,7 @@ def register_effects(builder: PlanBuilder, effects: Sequence[str] | None = None)
 
     Args:
         builder: builder of the update plan.
-        effects: names of the active effects; by default, those that are on without evidence.
+        effects: names of the active effects; defaults to the effects that are on without evidence.
     """
     if effects is None:
         effects = names_on(first_switches(Settings(scene=builder.scene, update=builder.update), 0))

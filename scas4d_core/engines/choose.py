@@ -17,15 +17,15 @@ from scas4d_core.engines.renderer import Renderer
 Device = Literal["cpu", "gpu"]
 
 WARP_DEVICE = "SCAS4D_WARP_DEVICE"
-"""Environment variable with the Warp device that device "gpu" stands for; "cpu" runs the same kernels without a GPU,
-slowly, for tests."""
+"""Environment variable that selects the Warp device for device "gpu". For tests, "cpu" runs the same kernels (slowly)
+without a GPU."""
 
 
 class DeviceError(ValueError):
-    """A scene requires a GPU that cannot be used.
+    """Raised if a scene requires a GPU, but none can be used.
 
     Args:
-        reason: why it cannot be used.
+        reason: reason why no GPU can be used.
 
     >>> print(DeviceError("NVIDIA Warp is not installed"))
     device 'gpu' cannot be used: NVIDIA Warp is not installed; see docs/gpu.md, or choose device 'cpu' or 'auto'
@@ -36,7 +36,7 @@ class DeviceError(ValueError):
 
 
 def gpu_fault() -> str | None:
-    """Returns why device "gpu" cannot be used, or None if it can."""
+    """Returns the reason why device "gpu" cannot be used, or None if it can be used."""
     if importlib.util.find_spec("warp") is None:
         return "NVIDIA Warp is not installed (extra gpu)"
     return None if WARP_DEVICE in os.environ else _hardware_fault()
@@ -44,7 +44,7 @@ def gpu_fault() -> str | None:
 
 @cache
 def _hardware_fault() -> str | None:
-    """Returns why no GPU can be used, or None; determined once. NVIDIA Warp is only imported if there is a driver."""
+    """Returns the (cached) reason why no GPU can be used, or None; only imports NVIDIA Warp if there is a driver."""
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -52,18 +52,18 @@ def _hardware_fault() -> str | None:
     import warp
 
     if warp.get_cuda_device_count() == 0:
-        return "no NVIDIA GPU can be used, or the driver is older than the CUDA version of NVIDIA Warp requires"
+        return "no usable NVIDIA GPU was found, or the driver is too old for the CUDA version of NVIDIA Warp"
     return None
 
 
 def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
-    """Returns the device for a setting; "auto" is the GPU if one can be used, otherwise the CPU.
+    """Returns the device for a setting. "auto" selects the GPU if one can be used, otherwise the CPU.
 
     Args:
         device: value of the setting ``device``.
 
     Raises:
-        DeviceError: the setting requires a GPU, but none can be used.
+        DeviceError: if the setting requires a GPU, but none can be used.
 
     >>> resolve_device("cpu")
     'cpu'
@@ -76,7 +76,7 @@ def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
 
 
 def warp_device() -> str:
-    """Returns the Warp device of device "gpu"."""
+    """Returns the name of the Warp device that device "gpu" uses."""
     return os.environ.get(WARP_DEVICE, "cuda:0")
 
 
@@ -99,7 +99,7 @@ def renderer_of(device: Device, background: tuple[float, float, float], limits: 
     """Returns a new full-image renderer for a device.
 
     Args:
-        device: device; see ``resolve_device``.
+        device: device to use; see ``resolve_device``.
         background: background colour, RGB in 0…1.
         limits: rasterizer constants.
     """
@@ -129,4 +129,4 @@ def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
 
     if isinstance(renderer, WarpRenderer):
         return WarpFitEngine(renderer, mask_weight)
-    raise TypeError(f"{type(renderer).__name__} has no engine for fits")
+    raise TypeError(f"no fit engine for a {type(renderer).__name__}")

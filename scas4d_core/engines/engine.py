@@ -36,9 +36,9 @@ from scas4d_core.structure.hierarchy import Hierarchy
 Array = NDArray[np.float32]
 
 GAINS_MISSING = "begin was called without gains; enable UpdatePlan.camera_gains to estimate them"
-"""Message of ``UpdateEngine.gains`` if gains are not estimated."""
+"""Error message of ``UpdateEngine.gains`` if gains are not estimated."""
 REPORT = "report"
-"""Name of the stage in which an update compiles its report, including timings, colour shifts, I/O and publishing."""
+"""Name of the stage in which an update compiles its report. It includes timings, colour shifts, I/O and publishing."""
 KEPT_PICTURES = 8
 """Number of most recent views whose renderings are kept in the log, where effects can evaluate them."""
 KEPT_ROWS = 128

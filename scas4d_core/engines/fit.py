@@ -134,7 +134,7 @@ class FitEngine(Protocol):
 
         Args:
             views: training views; ``iterate`` refers to them by index.
-            fixed: Gaussians of each view that are rendered with the fitted ones but not updated. If empty, there are
+            fixed: Gaussians of each view that are rendered with the fitted ones but not updated; empty if there are
                 none.
         """
 

@@ -41,7 +41,7 @@ class ColourPlan:
 class UpdatePlan:
     """Loss terms, free parameters and options of a scene's updates.
 
-    If no effect requests a term, its weight stays 0 or its value None, and it is not computed.
+    A term that no effect requests has weight 0 (or value None) and is not computed.
 
     Attributes:
         cameras: names of the rig's cameras, in rig order.
@@ -64,8 +64,8 @@ class UpdatePlan:
         gloss: whether gloss and environment are learned (``effects.appearance.direction``).
         camera_gains: whether camera gains are estimated (``effects.appearance.camera_gain``).
         full_images: whether any pixel may change. If false, only pixels covered by moving Gaussians can change.
-        disables_skip: whether to update even frames that Θ_{t−1} already reproduces well, because an effect learns
-            from them.
+        disables_skip: whether frames that Θ_{t−1} already reproduces well must still be updated, because an effect
+            learns from them.
         learns_labels: whether moving Gaussians are detected from motion if no masks are given.
     """
 

@@ -56,12 +56,14 @@ class TrainingView:
         camera: camera in kernel format.
         target: [C, H, W] float32 image, RGB in 0…1, followed by the mask if the frame has one. C is 3 or 4.
         exposure: [C, 2] gain and offset of each channel; 1 and 0 for the mask.
+        levels: [C, H, W] uint8 image in 0…255 and mask in 0…1, if ``target`` was converted from them.
     """
 
     name: str
     camera: CameraArrays
     target: Array
     exposure: Array
+    levels: NDArray[np.uint8] | None = None
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:

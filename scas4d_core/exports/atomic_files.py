@@ -19,7 +19,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     The temporary name keeps the suffix, because some libraries infer the format from it.
 
     Raises:
-        InputError: the folder or the file cannot be written, or the disk is full.
+        InputError: if the folder or the file cannot be written, or the disk is full.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -43,11 +43,11 @@ def check_writable(path: Path | str) -> None:
     """Creates and removes a file next to ``path``, so that a long export to an unwritable folder fails early.
 
     Raises:
-        InputError: the folder is not writable.
+        InputError: if the folder is not writable.
 
     >>> check_writable("no_such_folder/a.glb")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: out 'no_such_folder/a.glb' cannot be written (...); give a path in a ...
+    scas4d_core.errors.InputError: out 'no_such_folder/a.glb' cannot be written (...); use a path in an ...
     """
     target = Path(path)
     with translate_write_errors(target):
@@ -68,7 +68,7 @@ def translate_write_errors(path: Path | str) -> Iterator[None]:
     except OSError as error:
         raise InputError(
             f"out {str(path)!r} cannot be written ({message_of(error)})",
-            "give a path in a folder that exists and is writable, on a disk with free space",
+            "use a path in an existing, writable folder on a disk with free space",
         ) from error
 
 
@@ -80,16 +80,16 @@ def import_optional(name: str, export: str) -> Any:
         export: name of the export format, for the error message.
 
     Raises:
-        InputError: the package is not installed; the message includes the command that installs it.
+        InputError: if the package is not installed; the message includes the command that installs it.
 
     >>> import_optional("no_such_package", "usd")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: format 'usd' needs the package no_such_package, which is not installed; in ...
+    scas4d_core.errors.InputError: format 'usd' requires the package no_such_package, which is not installed; ...
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"format {export!r} needs the package {name}, which is not installed",
-            "in the project folder, run pip install -e '.[exports]'",
+            f"format {export!r} requires the package {name}, which is not installed",
+            "run pip install -e '.[exports]' in the project folder",
         ) from error

@@ -1,4 +1,4 @@
-"""The Gaussians of one frame in a form for export: decomposed covariances in the user's world, harmonics and ids.
+"""The Gaussians of one frame, prepared for export: decomposed covariances in the user's world, harmonics and ids.
 
 OpenCV axes are x right, y down, z forward; those of glTF, SPZ and USD are x right, y up, z towards the viewer. A half
 turn about x converts one to the other. It is a rotation, so nothing is mirrored, and it is its own inverse.
@@ -87,7 +87,7 @@ def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) 
         retired: whether to keep retired Gaussians, with opacity 0, instead of omitting them.
 
     Raises:
-        InputError: Gaussians are not finite or have no volume; the message gives their rows and ids.
+        InputError: if some Gaussians have non-finite values or no volume; the message lists their rows and ids.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1).retire([0])
     >>> found = cloud_of(state, WorldFrame(np.zeros(3), metres_per_unit=0.5))

@@ -25,12 +25,12 @@ class CompactSequence:
         path: path of the file; an existing file is replaced.
         world: transform from the user's world to the internal world.
         rig: rig in the user's world, or None.
-        labels: [N] part label of each Gaussian, negative for none; None to store no parts.
+        labels: [N] part label of each Gaussian (negative for none), or None to store no parts.
         frames_per_second: nominal frame rate, or None.
         background: background colour, RGB in 0…1.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: if the file cannot be written.
 
     >>> import numpy as np
     >>> from tempfile import TemporaryDirectory
@@ -71,7 +71,7 @@ class CompactSequence:
         """Adds a frame, given its index, its time in seconds, and its state in the internal world.
 
         Raises:
-            InputError: the frame cannot follow the previous ones, or has non-finite values.
+            InputError: if the frame cannot follow the previous frames, or has non-finite values.
         """
         with translate_write_errors(self.path):
             try:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from scas4d_core.errors import InputError
 from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 
-USER_AXES = "user's, y down"
+USER_AXES = "user's world, y down"
 Y_UP = "y up"
 WITH_PARTS = ("usd", "s4d")
 """Formats that store parts if the scene has any."""
@@ -69,7 +69,7 @@ _FORMATS = (
         suffixes=(".ply",),
         numbered=True,
         axes=USER_AXES,
-        unit="the user's",
+        unit="user's unit",
         colour="sRGB, harmonics to degree 3, float32",
         scale="log, float32",
         opacity="logit, float32",
@@ -82,7 +82,7 @@ _FORMATS = (
         suffixes=(".splat",),
         numbered=True,
         axes=USER_AXES,
-        unit="the user's",
+        unit="user's unit",
         colour="sRGB, degree 0, 8 bits, clipped to 0…1",
         scale="linear, float32",
         opacity="linear, 8 bits",
@@ -110,8 +110,8 @@ _FORMATS = (
         suffixes=(".glb",),
         numbered=False,
         axes=Y_UP,
-        unit="metre; residuals in the user's",
-        colour="as glb, of the first frame",
+        unit="metre; residuals in the user's unit",
+        colour="as glb, from the first frame",
         scale="linear, float32",
         opacity="linear, float32",
         shape="as glb, in the part's local frame, which is animated",
@@ -124,7 +124,7 @@ _FORMATS = (
         suffixes=USD_SUFFIXES,
         numbered=False,
         axes=Y_UP,
-        unit="the user's (`metersPerUnit`)",
+        unit="user's unit (`metersPerUnit`)",
         colour="sRGB, harmonics to degree 3, float32; tracks linear",
         scale="linear, float32",
         opacity="linear, float32; 0 while absent",
@@ -138,7 +138,7 @@ _FORMATS = (
         suffixes=(".csv",),
         numbered=False,
         axes=USER_AXES,
-        unit="the user's",
+        unit="user's unit",
         colour="–",
         scale="–",
         opacity="–",
@@ -151,7 +151,7 @@ _FORMATS = (
         suffixes=(".csv",),
         numbered=False,
         axes=USER_AXES,
-        unit="the user's",
+        unit="user's unit",
         colour="–",
         scale="–",
         opacity="–",
@@ -175,7 +175,7 @@ _FORMATS = (
     ),
 )
 FORMATS: Mapping[str, Format] = MappingProxyType({each.name: each for each in _FORMATS})
-"""All formats by name."""
+"""Maps each format name to its format."""
 
 COLUMNS = ("name", "suffixes", "axes", "unit", "colour", "scale", "opacity", "shape", "ids", "lost")
 """Columns of the table in the documentation."""
@@ -185,24 +185,24 @@ def format_of(name: str) -> Format:
     """Returns the format with the given name.
 
     Raises:
-        InputError: there is no such format.
+        InputError: if there is no such format.
 
     >>> format_of("glb").scale
     'linear, float32'
     >>> format_of("obj")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: format 'obj' is not known; give one of ply, splat, spz, spz4, glb, glb-parts, ...
+    scas4d_core.errors.InputError: unknown format 'obj'; choose from ply, splat, spz, spz4, glb, glb-parts, usd, ...
     """
     if name not in FORMATS:
-        raise InputError(f"format {name!r} is not known", f"give one of {', '.join(FORMATS)}")
+        raise InputError(f"unknown format {name!r}", f"choose from {', '.join(FORMATS)}")
     return FORMATS[name]
 
 
 def check_suffix(path: Path, format: Format) -> None:
-    """Checks that the path of a single output file has a suffix of the format.
+    """Checks that the path of a single output file has a valid suffix for the format.
 
     Raises:
-        InputError: the suffix does not belong to the format.
+        InputError: if the suffix does not belong to the format.
 
     >>> check_suffix(Path("a.txt"), FORMATS["tracks"])
     Traceback (most recent call last):
@@ -226,7 +226,7 @@ def table() -> str:
     for each in FORMATS.values():
         cells = {column: str(getattr(each, column)) for column in COLUMNS}
         cells["suffixes"] = " ".join(f"`{suffix}`" for suffix in each.suffixes)
-        cells["sequence"] = "a file per frame" if each.numbered else "one file"
+        cells["sequence"] = "one file per frame" if each.numbered else "one file"
         names.setdefault(tuple(cells[head] for head in heads if head != "name"), []).append(f"`{each.name}`")
     lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
     lines += [f"| {' | '.join([', '.join(same), *cells])} |" for cells, same in names.items()]

@@ -51,7 +51,7 @@ class Binary:
     def add(
         self, array: NDArray[Any], *, vertices: bool = False, bounds: bool = False, normalized: bool = False
     ) -> int:
-        """Adds an array as an accessor with its own buffer view; returns the accessor's index.
+        """Adds an array as an accessor with its own buffer view, and returns the accessor's index.
 
         Args:
             array: [N, …] array with N ≥ 1 and a dtype in ``COMPONENTS``. For vertex attributes, the row size must be a
@@ -88,7 +88,7 @@ class Binary:
                 ``extras`` of the asset.
 
         Raises:
-            InputError: the file would exceed 4 GiB, or cannot be written.
+            InputError: if the file would exceed 4 GiB, or cannot be written.
 
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
@@ -108,7 +108,9 @@ class Binary:
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + (8 + self.length if self._arrays else 0)
         if total > LONGEST:
-            raise InputError(f"out {str(path)!r} would have {total:,} bytes, but .glb allows 4 GiB", "export as ply")
+            raise InputError(
+                f"out {str(path)!r} would have {total:,} bytes, but a .glb file can have at most 4 GiB", "export as ply"
+            )
         with atomic_path(path) as beside, beside.open("wb") as file:
             file.write(struct.pack("<4sII", b"glTF", 2, total))
             file.write(struct.pack("<I4s", len(text), b"JSON") + text)

@@ -4,9 +4,9 @@ Scale is linear and nonnegative, opacity linear in 0…1, rotation a unit quater
 have the signs and the order of 3DGS. Drafts of the extension used the logarithm of the scale.
 
 In glTF, y points up and z towards the viewer, and lengths are in metres. Positions, rotations and harmonics are rotated
-by 180° about x and converted to metres *in the data*, and the node's transform is the identity. The extension says that
-a reader SHOULD rotate harmonics with the node, so some readers will not. The half turn only changes signs, so it is
-lossless. ``asset.extras`` stores ``metres_per_unit`` for the inverse conversion.
+by 180° about x and converted to metres *in the data*, and the node's transform is the identity. The extension specifies
+that a reader SHOULD rotate harmonics with the node, so some readers will not. The half turn only changes signs, so it
+is lossless. ``asset.extras`` stores ``metres_per_unit`` for the inverse conversion.
 
 Readers without the extension show points with the colours ``COLOR_0`` (linear light, 16 bits). ``_ID`` contains the ids
 as float32, which is exact below 2²⁴; it is omitted if an id is larger.
@@ -42,7 +42,8 @@ def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
         world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: Gaussians are not finite or have no volume, the file would exceed 4 GiB, or it cannot be written.
+        InputError: if some Gaussians have non-finite values or no volume, the file would exceed 4 GiB, or it cannot be
+            written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

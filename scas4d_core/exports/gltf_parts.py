@@ -1,9 +1,10 @@
-"""Writes an articulated asset: one ``.glb`` with a node per part, which contains its splats and its rigid motion.
+"""Writes an articulated asset: one ``.glb`` with a node per part that contains the part's splats and rigid motion.
 
-Each node contains the Gaussians of the first frame in the part's local frame. A linear animation gives its translation
-and rotation, with times in seconds since the first frame. Gaussians without a part do not move and are in the node
-``standing``. Axes, units and attributes are the same as in ``gltf``. Deformation within a part, Gaussians born later,
-and changes of colour and size are lost. Highlights rotate with the part instead of staying fixed in the world.
+Each node contains the Gaussians of the first frame in the part's local frame. A linear animation contains the part's
+translation and rotation, with times in seconds since the first frame. Gaussians without a part do not move and are
+stored in the node ``standing``. Axes, units and attributes are the same as in ``gltf``. Deformation within a part,
+Gaussians born later, and changes of colour and size are lost. Highlights rotate with the part instead of staying fixed
+in the world.
 
 The ``extras`` of a node report the residual of the rigid motion. ``residual_rms`` is the weighted RMS distance between
 the rigid prediction and the means over all frames after the first. ``residual_worst`` is the distance in the worst
@@ -54,7 +55,7 @@ class _Keyframes:
 
 
 class PartAsset:
-    """Writes a sequence as an articulated asset. Keeps the first frame in memory, and 64 bytes per part and frame.
+    """Writes a sequence as an articulated asset. Memory use is the first frame plus 64 bytes per part and frame.
 
     Args:
         path: path of the file.
@@ -62,7 +63,7 @@ class PartAsset:
         labels: [N] part label of each Gaussian, negative for none.
 
     Raises:
-        InputError: the folder is not writable.
+        InputError: if the folder is not writable.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
@@ -91,11 +92,11 @@ class PartAsset:
 
         Args:
             index: frame index.
-            time: time in seconds, later than all previous ones.
+            time: time in seconds, later than all previous times.
             gaussians: state in the internal world.
 
         Raises:
-            InputError: the time does not increase, or no Gaussian of the first frame belongs to a part.
+            InputError: if the time does not increase, or no Gaussian of the first frame belongs to a part.
         """
         if self._motion is None:
             self._motion = PartMotion(self._labels, gaussians, self._world)
@@ -103,8 +104,8 @@ class PartAsset:
             self._keys = {part: _Keyframes() for part in self._motion.parts}
         elif not time > self._latest:
             raise InputError(
-                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the previous frame",
-                "give frames in chronological order",
+                f"time {time:g} s of frame {index} is not later than that of the previous frame, {self._latest:g} s",
+                "add frames in chronological order",
             )
         self._latest = time
         for pose in self._motion.poses(gaussians):
@@ -114,10 +115,10 @@ class PartAsset:
         """Writes the file atomically.
 
         Raises:
-            InputError: no frame was added, or the file cannot be written.
+            InputError: if no frame was added, or the file cannot be written.
         """
         if self._motion is None or self._first is None:
-            raise InputError("there is no frame to export", "give at least one frame")
+            raise InputError("there are no frames to export", "add at least one frame")
         cloud = cloud_of(self._first, self._world, retired=True).scaled(self._world.metres_per_unit).half_turned()
         binary = Binary()
         nodes: list[dict[str, Any]] = []

@@ -67,7 +67,7 @@ class PartMotion:
         extent: extent of the moving Gaussians in the first frame, in the user's units; the reference for percentages.
 
     Raises:
-        InputError: the labels have an invalid shape or type, or no Gaussian of the first frame belongs to a part.
+        InputError: if the labels have an invalid shape or type, or no Gaussian of the first frame belongs to a part.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
     >>> motion = PartMotion(np.zeros(3, int), state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
@@ -85,7 +85,7 @@ class PartMotion:
         self.extent = moving_extent(first) / world.metres_per_unit
         self.parts = sorted({int(part) for part in self._labels[first.present] if part >= 0})
         if not self.parts:
-            raise InputError("parts: no Gaussian of the first frame belongs to a part", "give the parts of this scene")
+            raise InputError("parts: no Gaussian of the first frame belongs to a part", "use the parts of this scene")
         self.origins = {part: self._centre(self._start, self.rows(part)) for part in self.parts}
         self._first_turns = first.rotations
 
@@ -107,7 +107,7 @@ class PartMotion:
         return part_poses
 
     def _mean_material_rotation(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
-        """Returns the weighted mean [3, 3] of the material rotations since the first frame; not exactly a rotation."""
+        """Returns the weighted mean [3, 3] of material rotations since the first frame, only nearly a rotation."""
         now = quaternions_to_matrices(gaussians.rotations[rows].astype(np.float64))
         then = quaternions_to_matrices(self._first_turns[rows].astype(np.float64))
         turn: Float = np.einsum("n,nik,njk->ij", weights, now, then)
@@ -125,7 +125,7 @@ def majority_motion(
     """Fits the rigid motion of the majority of points; arguments and results are the same as in ``rigid_motion``.
 
     Cauchy weights, scaled by the median distance, suppress outliers (Holland and Welsch 1977). Outliers occur because a
-    part segmented by motion includes Gaussians of its neighbours, and interior ones that no image constrains. The
+    part segmented by motion includes Gaussians of its neighbours, and interior Gaussians that no image constrains. The
     returned RMS distance is over all points.
 
     >>> before = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [2, 2, 2]])
@@ -163,12 +163,12 @@ def rigid_motion(
     """Finds R and t that minimize the weighted sum of |R·before + t − after|² (Kabsch 1976).
 
     Collinear or coincident points leave R ambiguous; the solution nearest to ``near`` is returned. Coplanar points
-    determine R, because reflections are excluded: its determinant is +1.
+    determine R, because reflections are excluded (det R = +1).
 
     Args:
         before, after: [M, 3] corresponding points, M ≥ 1.
-        weights: [M] nonnegative weights; None for equal weights.
-        near: [3, 3] prior rotation, exact or approximate; None for the identity.
+        weights: [M] nonnegative weights, or None for equal weights.
+        near: [3, 3] exact or approximate prior rotation, or None for the identity.
 
     Returns:
         R [3, 3], t [3], and the weighted RMS residual.
@@ -215,7 +215,8 @@ def part_labels(labels: NDArray[Any], count: int) -> NDArray[np.int64]:
     given = np.asarray(labels)
     if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
         raise InputError(
-            f"parts: labels have shape {given.shape} and type {given.dtype}", "give integers [N], one per Gaussian"
+            f"parts: labels have shape {given.shape} and type {given.dtype}",
+            "use an integer array of shape [N], one label per Gaussian",
         )
     result = np.full(count, -1, np.int64)
     result[: len(given)] = given[:count]

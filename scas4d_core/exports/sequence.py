@@ -28,7 +28,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import write_ply
 
 Progress = Callable[[int, int], None]
-"""Called after each frame with its index and the number of frames done."""
+"""Callback that receives the index of a completed frame and the number of completed frames."""
 
 FRAME_WRITERS: dict[str, Callable[[Path, Gaussians, WorldFrame], None]] = {
     "ply": write_ply,
@@ -68,9 +68,9 @@ def export_sequence(
 ) -> list[Path]:
     """Writes frames in the given format, with at most one state in memory.
 
-    Numbered files are named ``frame_000012.ply`` for frame 12. Each is written atomically and replaces an existing one.
-    A ``.zip`` or a single file appears only when it is complete. After an error, complete numbered files remain in a
-    folder; other outputs are removed.
+    Numbered files are named ``frame_000012.ply`` for frame 12. Each file is written atomically and replaces any
+    existing file. A ``.zip`` or a single file appears only when it is complete. After an error, complete numbered files
+    remain in a folder; other outputs are removed.
 
     Args:
         states: index, time in seconds, and state in the internal world of each frame, in increasing order.
@@ -81,7 +81,7 @@ def export_sequence(
         world: transform from the user's world to the internal world.
         rig: rig in the user's world; used by USD and ``s4d``.
         parts: [N] part label of each Gaussian, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
-        ids: ids of the Gaussians to write for ``tracks``; None for all moving ones.
+        ids: ids of the Gaussians to write for ``tracks``, or None for all moving Gaussians.
         frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None, the latter is derived
             from the first two frames.
         background: background colour, RGB in 0…1; stored only by ``s4d``.
@@ -91,7 +91,7 @@ def export_sequence(
         The paths of the numbered files, or of the single file.
 
     Raises:
-        InputError: the format is unknown, there is no frame, parts or a package are missing, the output cannot be
+        InputError: if the format is unknown, there is no frame, parts or a package are missing, the output cannot be
             written, or Gaussians cannot be exported. Exceptions from ``states`` propagate unchanged.
 
     >>> from tempfile import TemporaryDirectory
@@ -106,15 +106,15 @@ def export_sequence(
     wanted = format_of(format)
     target = Path(out)
     if wanted.needs_parts and parts is None:
-        raise InputError(f"parts is None, but format {format!r} requires parts", "give one label per Gaussian")
+        raise InputError(f"format {format!r} requires parts, but parts is None", "pass one label per Gaussian")
     if frames_per_second is not None and not 0 < frames_per_second < float("inf"):
-        raise InputError(f"frames_per_second is {frames_per_second!r}", "give a positive number, or None")
+        raise InputError(f"invalid frames_per_second {frames_per_second!r}", "use a positive number or None")
     if not wanted.numbered:
         check_suffix(target, wanted)
     coming = iter(states)
     waiting = list(islice(coming, 1))
     if not waiting:
-        raise InputError("states has no frames", "give a range that contains at least one committed frame")
+        raise InputError("states has no frames", "use a range that contains at least one committed frame")
     writer = _writer(wanted, target, world, rig, parts, ids, frames_per_second, background)
     done = 0
     paths: list[Path] = []
@@ -134,7 +134,7 @@ def export_sequence(
 
 
 def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Path]:
-    """Returns the folder's numbered files of this format for other frames, such as those left by an earlier export.
+    """Returns the folder's numbered files of this format for other frames, such as files left by an earlier export.
 
     >>> other_frames(Path("no_such_folder"), format_of("ply"), [0])
     []

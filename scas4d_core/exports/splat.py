@@ -35,7 +35,7 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
         world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: Gaussians are not finite or have no volume, or the file cannot be written.
+        InputError: if some Gaussians have non-finite values or no volume, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -62,20 +62,22 @@ def read_splat(path: Path | str) -> Splats:
     """Reads a ``.splat`` file in row order; rotations are normalized.
 
     Raises:
-        InputError: the file does not exist, or its size is not a multiple of 32 bytes.
+        InputError: if the file does not exist, or its size is not a multiple of 32 bytes.
 
     >>> read_splat("README.md")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md: not a .splat file (... bytes is not a multiple of 32); ...
+    scas4d_core.errors.InputError: README.md is not a .splat file (... bytes is not a multiple of 32); ...
     """
     try:
         content = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: not a .splat file ({error.strerror})", "give the path of a readable file") from error
+        raise InputError(
+            f"{path} is not a .splat file ({error.strerror})", "use the path of a readable file"
+        ) from error
     if len(content) % ROW.itemsize:
         raise InputError(
-            f"{path}: not a .splat file ({len(content)} bytes is not a multiple of {ROW.itemsize})",
-            "give a complete, uncompressed file",
+            f"{path} is not a .splat file ({len(content)} bytes is not a multiple of {ROW.itemsize})",
+            "use a complete, uncompressed file",
         )
     rows = np.frombuffer(content, ROW)
     turns = rows["rotation"].astype(np.float64) - 128

@@ -1,8 +1,8 @@
 """Writes and reads SPZ (Niantic, github.com/nianticlabs/spz), versions 3 (gzip) and 4 (zstd), with the package gsply.
 
 As SPZ's README states, axes are RUB: x right, y up, z backward, that is, the user's world rotated by 180° about x.
-gsply does not convert axes, so this module does. Lengths are in metres, which the format's ranges are designed for.
-Quantization, from gsply 0.4.6 and Niantic's ``load-spz.cc``:
+gsply does not convert axes, so this module does. Lengths are in metres, for which the format's value ranges are
+designed. Quantization, from gsply 0.4.6 and Niantic's ``load-spz.cc``:
 
 - positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m, with the largest number of fractional bits f for which the frame fits;
 - scales: the logarithm in one byte, 16 steps per factor of e: ±3.2 %, clipped below 45 µm or above 379 m;
@@ -42,15 +42,15 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
         version: SPZ version, 3 or 4.
 
     Raises:
-        InputError: the version is not supported; gsply (or zstandard for version 4) is missing; Gaussians are not
-            finite or have no volume; a position exceeds 4,194 km; or the file cannot be written.
+        InputError: if the version is not supported; gsply (or zstandard for version 4) is missing; some Gaussians have
+            non-finite values or no volume; a position exceeds 4,194 km; or the file cannot be written.
 
     >>> write_spz("a.spz", Gaussians.of_points([[0, 0, 2]], radius=0.1), WorldFrame(np.zeros(3)), version=2)
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: SPZ version 2 is not supported; give 3 or 4
+    scas4d_core.errors.InputError: SPZ version 2 is not supported; use 3 or 4
     """
     if version not in VERSIONS:
-        raise InputError(f"SPZ version {version} is not supported", "give 3 or 4")
+        raise InputError(f"SPZ version {version} is not supported", "use 3 or 4")
     gsply = import_optional("gsply", "spz")
     if version == 4:
         import_optional("zstandard", "spz4")
@@ -76,7 +76,7 @@ def fractional_bits(cloud: Cloud) -> int:
     """Returns the largest number of fractional bits f for which all positions fit into 24 bits; a step is 2⁻ᶠ units.
 
     Raises:
-        InputError: a position is too far from the origin.
+        InputError: if a position is too far from the origin.
 
     >>> fractional_bits(cloud_of(Gaussians.of_points([[0, 0, 5]], radius=0.1), WorldFrame(np.zeros(3))))
     20
@@ -86,7 +86,7 @@ def fractional_bits(cloud: Cloud) -> int:
         if round(farthest * 2**bits) < 2**POSITION_BITS:
             return bits
     raise InputError(
-        f"a Gaussian is {farthest:.3g} m from the origin of the user's world, but the limit of SPZ is {2**22:,} m",
+        f"a Gaussian is {farthest:.3g} m from the origin of the user's world, but SPZ allows at most {2**22:,} m",
         "move the origin of the calibration near the scene, or export as ply or glb",
     )
 
@@ -99,17 +99,19 @@ def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
         metres_per_unit: metres per unit of the result.
 
     Raises:
-        InputError: gsply is missing, or cannot read the file.
+        InputError: if gsply is missing, or cannot read the file.
 
     >>> read_spz("README.md")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md: not an SPZ file (...); ...
+    scas4d_core.errors.InputError: README.md is not an SPZ file (...); ...
     """
     gsply = import_optional("gsply", "spz")
     try:
         data = gsply.read_spz(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not an SPZ file ({error})", "give a complete .spz file of version 1 to 4") from error
+        raise InputError(
+            f"{path} is not an SPZ file ({error})", "use a complete .spz file of version 1 to 4"
+        ) from error
     means, logs, quaternions, logits, base = (
         np.asarray(column, np.float64)
         for column in (data.means, data.scales, data.quats, data.opacities.reshape(-1), data.sh0)

@@ -1,7 +1,7 @@
 """Writes tracks and part poses as CSV for spreadsheets and scripts, in the user's world, axes and units.
 
-Times are in seconds. Rows are ordered by frame; a Gaussian or part that is absent in a frame has no row for it.
-Coordinates have 12 significant digits, because the origin of a world may be far away.
+Times are in seconds. Rows are ordered by frame; a Gaussian or part that is absent from a frame has no row for that
+frame. Coordinates have 12 significant digits, because the origin of a world may be far away.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ class _Table:
 
 
 class TrackTable(_Table):
-    """Writes the means of Gaussians frame by frame; the column ``confidence`` is empty because it is unknown.
+    """Writes the means of Gaussians frame by frame; the column ``confidence`` is empty, because confidence is unknown.
 
     Args:
         path: path of the file.
         world: transform from the user's world to the internal world.
-        ids: ids of the Gaussians to write; None for those moving in each frame.
+        ids: ids of the Gaussians to write, or None for the Gaussians that move in each frame.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: if the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -103,7 +103,7 @@ class PoseTable(_Table):
         labels: [N] part label of each Gaussian, negative for none.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: if the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2], [0, 0, 4]], radius=0.1)
@@ -125,7 +125,7 @@ class PoseTable(_Table):
         """Adds a frame, given its index, its time in seconds, and its state in the internal world.
 
         Raises:
-            InputError: no Gaussian of the first frame belongs to a part.
+            InputError: if no Gaussian of the first frame belongs to a part.
         """
         if self._motion is None:
             self._motion = PartMotion(self._labels, gaussians, self._world)
@@ -136,7 +136,7 @@ class PoseTable(_Table):
 
 
 def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
-    """Writes queried tracks with their confidence; points absent in a frame have no row.
+    """Writes queried tracks with their confidence; points absent from a frame have no row for that frame.
 
     The column ``id`` contains the Gaussian with the largest weight for each point, so two points may share an id.
 
@@ -146,7 +146,7 @@ def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
         times: [T] times in seconds.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: if the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> tracks = Tracks(np.array([[[0.0, 1, 2]]]), np.array([[0.5]]), np.array([3]), np.array([7]))

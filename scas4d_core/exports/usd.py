@@ -2,7 +2,7 @@
 
 ``/World/Gaussians`` contains one fixed set of Gaussians for all frames; opacity is 0 before birth and during
 retirement. As the schema requires, scales and opacities are linear, and harmonics are grouped by Gaussian. Colours are
-sRGB image values; the schema cannot express that, so the ``colorSpace`` of the harmonics does.
+sRGB image values, which the schema cannot express; the ``colorSpace`` of the harmonics specifies it.
 ``primvars:scas4d:id`` and ``primvars:scas4d:part`` store the ids and part labels. ``/World/Parts/part_k`` are Xforms
 with the rigid motion of each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` shows
 the centres of up to ``MAX_TRACKS`` moving Gaussians as UsdGeomPoints with purpose guide. ``/World/Cameras`` contains
@@ -51,7 +51,7 @@ REACH = 3.0
 COLOUR_SPACE = "srgb_rec709_scene"
 """USD's name for the primaries and transfer function of sRGB."""
 DEFAULT_RATE = 24.0
-"""Time codes per second if the rate is unknown, as for a single frame; USD's own default."""
+"""Time codes per second if the rate is unknown, as for a single frame; this is USD's default."""
 
 
 class UsdSequence:
@@ -62,11 +62,11 @@ class UsdSequence:
             ``.usdz``.
         world: transform from the user's world to the internal world.
         rig: rig in the user's world, or None.
-        labels: [N] part label of each Gaussian, negative for none; None to store no parts.
-        frames_per_second: time codes per second; None to derive them from the first two frames.
+        labels: [N] part label of each Gaussian (negative for none), or None to store no parts.
+        frames_per_second: time codes per second, or None to derive them from the first two frames.
 
     Raises:
-        InputError: usd-core is missing or too old, the suffix is not a USD suffix, or the folder is not writable.
+        InputError: if usd-core is missing or too old, the suffix is not a USD suffix, or the folder is not writable.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -96,7 +96,9 @@ class UsdSequence:
             import_optional(f"pxr.{name}", "usd") for name in ("Sdf", "Tf", "Vt", "Gf")
         )
         if not hasattr(volume, "ParticleField3DGaussianSplat"):
-            raise InputError("usd-core has no ParticleField3DGaussianSplat", "pip install 'usd-core>=26.3'")
+            raise InputError(
+                "usd-core does not support ParticleField3DGaussianSplat", "run pip install 'usd-core>=26.3'"
+            )
         self._world, self._labels, self._rate = world, labels, frames_per_second
         self._rig = rig
         self._splat = volume.ParticleField3DGaussianSplat
@@ -123,16 +125,18 @@ class UsdSequence:
 
         Args:
             index: frame index.
-            time: time in seconds, later than all previous ones.
-            gaussians: state in the internal world. Each row must always be the same Gaussian; new ones are appended.
+            time: time in seconds, later than all previous times.
+            gaussians: state in the internal world. Each row must always refer to the same Gaussian; new Gaussians are
+                appended.
 
         Raises:
-            InputError: the time does not increase, Gaussians are not finite or have no volume, or the disk is full.
+            InputError: if the time does not increase, some Gaussians have non-finite values or no volume, or the disk
+                is full.
         """
         if self._first_index is not None and not time > self._latest:
             raise InputError(
-                f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the previous frame",
-                "give frames in chronological order",
+                f"time {time:g} s of frame {index} is not later than that of the previous frame, {self._latest:g} s",
+                "add frames in chronological order",
             )
         cloud = cloud_of(gaussians, self._world, retired=True).half_turned()
         if self._first_index is None:
@@ -165,11 +169,11 @@ class UsdSequence:
         """Completes the stage and renames the file to its final name.
 
         Raises:
-            InputError: no frame was added, or the file cannot be written.
+            InputError: if no frame was added, or the file cannot be written.
         """
         try:
             if self._first_index is None:
-                raise InputError("there is no frame to export", "give at least one frame")
+                raise InputError("there are no frames to export", "add at least one frame")
             with translate_usd_errors(self.path):
                 self._complete()
                 with atomic_path(self.path) as beside:
@@ -287,11 +291,11 @@ class UsdSequence:
         else:
             done = self._layer.Export(str(beside))  # exporting drops replaced samples
         if not done:
-            raise InputError(f"out {str(self.path)!r} cannot be written by USD", "give a writable path")
+            raise InputError(f"out {str(self.path)!r} cannot be written by USD", "use a writable path")
 
 
 def _extent(means: NDArray[Any], reach: NDArray[Any]) -> NDArray[Any]:
-    """Returns the corners [2, 3] of the bounding box of points [N, 3] with radii [N]; zeros if there are no points."""
+    """Returns the bounding box corners [2, 3] of points [N, 3] with radii [N], or zeros if there are no points."""
     if not len(means):
         return np.zeros((2, 3))
     return np.stack([np.min(means - reach[:, None], axis=0), np.max(means + reach[:, None], axis=0)])

@@ -26,13 +26,13 @@ NEAREST, FARTHEST = 0.01, 1000.0
 class AnimatedValues:
     """Writes time samples of an attribute with one value per Gaussian, but only when values change.
 
-    USD interpolates between samples, so before a change the previous frame's value is written too. Gaussians born later
-    make samples longer, so shorter samples are padded before the file is completed (``lengthen``).
+    USD interpolates between samples, so the previous frame's value is also written before a change. Gaussians born
+    later make samples longer, so shorter samples are padded before the file is completed (``lengthen``).
 
     Args:
         attribute: USD attribute.
-        typed: converts a numpy array to a USD array.
-        unborn: value of a Gaussian before its birth; None to use its value at birth.
+        typed: function that converts a NumPy array to a USD array.
+        unborn: value of a Gaussian before its birth, or None to use its value at birth.
     """
 
     def __init__(self, attribute: Any, typed: Callable[[Array], Any], unborn: float | None = None) -> None:
@@ -137,5 +137,5 @@ def translate_usd_errors(path: Path) -> Iterator[None]:
             yield
     except failure as error:
         raise InputError(
-            f"out {str(path)!r} cannot be written (USD: {message_of(error)})", "give a writable path"
+            f"out {str(path)!r} cannot be written (USD: {message_of(error)})", "use a writable path"
         ) from error

@@ -34,8 +34,8 @@ Colour = tuple[float, float, float]
 def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
     """Returns the settings with the background 'auto' replaced by a colour from the images.
 
-    This is the colour of a plain backdrop if there is one, or else the mean colour. A background colour that is not in
-    the images, such as black in a bright room, causes dark seams, and black holes in regions that no camera sees.
+    This is the colour of a plain backdrop if there is one, otherwise the mean colour. A background colour that is not
+    in the images, such as black in a bright room, causes dark seams, and black holes in regions that no camera sees.
 
     Args:
         settings: settings of the scene.
@@ -67,7 +67,7 @@ def _set_background(settings: Settings, background: Sequence[float]) -> Settings
 
 
 def with_recorded_background(settings: Settings, history: History) -> Settings:
-    """Returns the settings with the background that a scene recorded; unchanged if its first frame cannot be read."""
+    """Returns the settings with a scene's recorded background, or unchanged if its first frame cannot be read."""
     if settings.scene.background != "auto":
         return settings
     with suppress(HistoryError):
@@ -104,8 +104,8 @@ class FirstFrame:
         """Reads the data from the first frame of a history.
 
         Raises:
-            HistoryError: the frame cannot be read.
-            KeyError: the report of the frame is incomplete.
+            HistoryError: if the frame cannot be read.
+            KeyError: if the report of the frame is incomplete.
         """
         first = history.indices[0]
         report = history.report(first)
@@ -127,17 +127,17 @@ def fit_static_scene(
     """Fits Θ_0 to the views of frame 0, starting from a point cloud.
 
     Args:
-        factory: creates the views of the scene.
+        factory: factory that creates the views of the scene.
         views: views of frame 0; their exposures are learnt in place.
         positions: [P, 3] point positions in metres, in the internal world.
         colours: [P, 3] point colours in 0…1.
         foreground: [P] foreground label of each point in 0…1, or None.
         scene: settings of the scene.
         settings: settings of frame 0.
-        progress: called after each iteration.
+        progress: function called after each iteration.
 
     Raises:
-        ValueError: the point cloud is empty.
+        ValueError: if the point cloud is empty.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot", image_scale=0.25)
@@ -168,11 +168,11 @@ def fit_first_frame(
 
     Args:
         frame: images and masks of frame 0, at the image size of the factory's rig.
-        points: initial point cloud in the user's world; None to compute one.
-        factory: creates the views of the scene.
+        points: initial point cloud in the user's world, or None to compute one.
+        factory: factory that creates the views of the scene.
         settings: settings of the scene.
         world: transform from the user's world to the internal world.
-        on_progress: called with the progress of each stage.
+        on_progress: function called with the progress of each stage.
     """
     if points is None:
         load_stereo()
@@ -199,12 +199,12 @@ def fit_first_frame(
         lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )
     if result.ran_short_of_time and len(result.losses) <= (1 - REPORTED_SHORTFALL) * static.iterations:
-        limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, all phases equally shorter")
+        limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations (all phases shortened equally)")
     return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
 
 
 def _remaining_time(limit: TimeLimit) -> dict[str, float]:
-    """Returns the maximum remaining seconds of frame 0 for a progress report; empty without a limit."""
+    """Returns the maximum remaining seconds of frame 0 for a progress report, or an empty dict without a limit."""
     return {"seconds_at_most": max(0.0, limit.seconds_left())} if limit.bounded else {}
 
 

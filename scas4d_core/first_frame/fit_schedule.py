@@ -29,10 +29,10 @@ TIME_TOLERANCE = 1.03
 MIN_PLAN_CHANGE = 0.02
 """Relative change of the number of iterations above which a new plan is recorded."""
 REPORTED_SHORTFALL = 0.05
-"""Fraction of missing iterations above which the report mentions them; the effect of fewer is below that of the seed.
-The sample at half size (two seeds) has 35.33 dB. With 5, 10 and 20 % fewer iterations it has 35.20, 35.29 and 35.24 dB,
-and with half of them 35.03 dB. *cloth* at half size (one seed) has 28.91 dB; with 5 and 20 % fewer iterations, it has
-28.91 and 28.88 dB."""
+"""Fraction of missing iterations above which the report mentions them; smaller fractions have less effect than the
+seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10 and 20 % fewer iterations, it reaches 35.20,
+35.29 and 35.24 dB, and with half of the iterations 35.03 dB. *cloth* at half size (one seed) reaches 28.91 dB; with 5
+and 20 % fewer iterations, it reaches 28.91 and 28.88 dB."""
 MIN_COUNT_RATIO = 1.3
 """Minimum ratio between Gaussian counts for separating the cost per Gaussian from the cost of the pixels."""
 
@@ -45,7 +45,7 @@ class FitProgress:
         done: number of completed iterations.
         planned: total number of iterations in the current plan.
         loss: loss of the last iteration.
-        seconds: predicted remaining time in seconds; None if unknown.
+        seconds: predicted remaining time in seconds, or None if unknown.
     """
 
     done: int
@@ -60,7 +60,7 @@ class FitSchedule:
     Args:
         iterations: number of iterations of the full schedule.
         limit: time limit of frame 0.
-        expected: returns the expected number of Gaussians at a point of the schedule.
+        expected: function that returns the expected number of Gaussians at a point of the schedule.
 
     Attributes:
         done: number of completed iterations.

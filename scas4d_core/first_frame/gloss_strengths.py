@@ -57,7 +57,7 @@ def estimate_strengths(
         environment: environment that is reflected.
         state: Gaussians of the surface.
         views: training views, whose images are used.
-        renderer: renderer of the state.
+        renderer: renderer for the state.
     """
     from scas4d_core.kernels.appearance.direction import DARK, FALL, OVER, shade
 

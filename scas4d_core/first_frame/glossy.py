@@ -50,7 +50,7 @@ NORMALS_EVERY = 0.1
 LEARN_NORMALS_FROM = 0.6
 """Fraction of the iterations after which normals are learnt; until then, the normals of the first surface are used."""
 SMOOTH_EVERY = 10
-"""Number of iterations between averaging the gloss over neighbours."""
+"""Interval, in iterations, at which the gloss is averaged over neighbours."""
 
 
 def fit_with_gloss_trial(
@@ -59,9 +59,9 @@ def fit_with_gloss_trial(
     """Fits Θ_0, with view-dependent colours if they are needed.
 
     Args:
-        make: creates a new trainer.
+        make: function that creates a new trainer.
         mode: whether to use view-dependent colours; "auto" runs a trial to decide.
-        progress: called after each iteration.
+        progress: function called after each iteration.
     """
     trainer = make()
     if mode == "off":
@@ -94,12 +94,12 @@ class GlossTrial:
 
     Args:
         trainer: trainer of the fit.
-        mode: "auto" decides by evidence; "on" always decides for view-dependent colours.
+        mode: "auto" to decide by evidence, or "on" to always use view-dependent colours.
 
     Attributes:
         on: whether to use view-dependent colours; false before the trial.
         out_of_time: whether the trial was skipped for lack of time.
-        evidence: fraction of the residual that view-dependent colours explain beyond constant colours; None without
+        evidence: fraction of the residual that view-dependent colours explain beyond constant colours, or None without
             a trial.
     """
 
@@ -119,7 +119,9 @@ class GlossTrial:
         gloss, means = estimate_gloss(self._trainer, None)
         without, seen = self._remaining_error(None), self._remaining_error(GlossShading.fresh(gloss, means))
         share = max(0.0, 1 - seen / max(without, 1e-12))
-        self.evidence = Evidence(share, f"explains {100 * share:.0f} % of the residual of frame 0")
+        self.evidence = Evidence(
+            share, f"view-dependent colour explains {100 * share:.0f} % of the residual of frame 0"
+        )
         self.on = self._mode == "on" or share >= effect("direction").on_above
         return self.on
 

@@ -32,7 +32,7 @@ from scas4d_core.posed_pictures import (
 )
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with the name of a stage, and its completed and total number of steps."""
+"""Callback that receives the name of a stage, and its completed and total numbers of steps."""
 
 MAX_POINTS = 60_000
 """Maximum number of points; if there are more, the spacing is increased."""
@@ -56,8 +56,8 @@ class InitialCloud(InitialPoints):
             front of a plain backdrop), "pairs" (two cameras agree), "plane" (a floor or table on which images agree),
             "surroundings" (images placed far behind the scene), "volume" (unconfirmed points in the volume that the
             cameras share).
-        coverage: fraction of image cells that contain a point on which cameras agree, median over the cameras.
-        stage: region that the surroundings enclose; None without surroundings.
+        coverage: fraction of image cells that contain a point on which cameras agree, as the median over cameras.
+        stage: region that the surroundings enclose, or None without surroundings.
     """
 
     method: str = "agreement"
@@ -92,7 +92,7 @@ def initial_points(
         rig: calibrated cameras, in the user's world.
         images: maps each camera name to its image, [H, W, 3] uint8; cameras without an image are ignored.
         masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground; may be empty.
-        progress: called with (stage, done, total).
+        progress: function called with (stage, done, total).
         max_points: maximum number of points.
         stereo: whether to use dense stereo in textured regions.
         stereo_iterations: rounds of propagation and refinement.
@@ -103,8 +103,8 @@ def initial_points(
         Points in the user's units; ``foreground`` is None if there are no masks.
 
     Raises:
-        InitialPointsError: there are fewer than two images, an image does not have its camera's size, or no two cameras
-            look at the same place.
+        InitialPointsError: if there are fewer than two images, an image does not have its camera's size, or no two
+            cameras look at the same place.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot", image_scale=0.5)
@@ -154,7 +154,7 @@ def _add_points(
     views: Sequence[PosedPicture],
     spacing: float,
 ) -> InitialCloud | None:
-    """Merges the points that a method finds into the previous points; returns those unchanged if it finds none."""
+    """Merges the points that a method finds into the previous points, which stay unchanged if it finds none."""
     try:
         return merge_points(found, search(), method, views, spacing)
     except InitialPointsError:
@@ -177,7 +177,7 @@ def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSe
 def merge_points(
     found: InitialCloud | None, cloud: InitialPoints, method: str, views: Sequence[PosedPicture], spacing: float
 ) -> InitialCloud:
-    """Adds to the previous points those of ``cloud`` that are more than ``spacing`` (in world units) away from them."""
+    """Adds all points of ``cloud`` that are more than ``spacing`` (in world units) away from the previous points."""
     if found is None:
         both = InitialCloud(cloud.positions, cloud.colours, cloud.foreground, method)
     else:
@@ -194,7 +194,7 @@ def merge_points(
 
 
 def image_coverage(views: Sequence[PosedPicture], cloud: InitialPoints) -> float:
-    """Returns the fraction of image (or mask) cells that contain a point, median over the views.
+    """Returns the fraction of image (or mask) cells that contain a point, as the median over the views.
 
     Args:
         views: views of the cameras.

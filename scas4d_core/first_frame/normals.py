@@ -42,7 +42,7 @@ def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: R
     Args:
         state: Gaussians of the surface.
         views: training views, from whose cameras depth is rendered.
-        renderer: renderer of the state.
+        renderer: renderer for the state.
     """
     means, count = state.means, len(state)
     haze = state.replace(opacities=np.minimum(state.opacities**SKIN, OPAQUE).astype(np.float32))

@@ -20,9 +20,9 @@ class FirstCloud:
     """Origin of the initial point cloud.
 
     Attributes:
-        method: "given" for a cloud from the user, else the methods as in ``initial_points.InitialCloud``.
+        method: "given" for a cloud from the user, otherwise the methods; see ``initial_points.InitialCloud``.
         points: number of points.
-        coverage: fraction of the images covered by points on which cameras agree; None for a given cloud.
+        coverage: fraction of the images covered by points on which cameras agree, or None for a given cloud.
     """
 
     method: str
@@ -40,8 +40,8 @@ class StaticResult:
         losses: training loss of each iteration.
         psnr: PSNR of the view rendered in each iteration, in dB.
         cameras: fit of each camera's image in its last iteration, keyed by camera name.
-        evidence: evidence for each effect, keyed by effect name; None without a trial.
-        cloud: origin of the initial points; None if unknown.
+        evidence: evidence for each effect, keyed by effect name, or None without a trial.
+        cloud: origin of the initial points, or None if unknown.
         planned: (iteration, total iterations) at each change of plan.
         ran_short_of_time: whether any iteration advanced the schedule by more than one.
         shortened: descriptions of the steps that had too little time.

@@ -52,7 +52,7 @@ PRUNE_OPACITY = 0.01
 MIN_VIEWS = 2
 """Number of training cameras that must see a Gaussian; otherwise it is removed."""
 SEEN_PIXELS = 0.05
-"""Blending weight, in pixels, above which a camera counts as seeing a Gaussian."""
+"""Blending weight, in pixels, above which a camera is considered to see a Gaussian."""
 RATE_POSITION, RATE_POSITION_END = 1.6e-4, 1.6e-6
 """Adam learning rates of means at the start and end, per metre of scene radius, with exponential decay (3DGS)."""
 RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION, RATE_EXPOSURE = 2.5e-3, 5e-2, 5e-3, 2e-3, 1e-3
@@ -63,7 +63,7 @@ WEIGHT_MASK = 3.0
 SPLIT_SHRINK = 1.6
 """Factor by which the two halves are smaller than the Gaussian that is split (3DGS)."""
 STOP_ROUNDS = 5
-"""Number of passes over all views that the stopping rule compares with as many passes before; fewer are too noisy."""
+"""Number of passes over all views that the stopping rule compares with as many preceding ones; fewer are too noisy."""
 
 
 class StaticTrainer:
@@ -110,8 +110,8 @@ class StaticTrainer:
         """Runs all iterations, or fewer due to the stopping rule or the time limit, and returns their losses.
 
         Args:
-            progress: called after each iteration.
-            should_stop: called after each iteration; the fit ends if it returns true.
+            progress: function called after each iteration.
+            should_stop: function called after each iteration; the fit ends if it returns true.
         """
         schedule = self.schedule
 
@@ -126,7 +126,7 @@ class StaticTrainer:
         return self.fit.losses
 
     def _after(self, now: FitStep, last: FitLoss) -> None:
-        """Records the camera's fit; runs density control, removal and the exposure check when they are due."""
+        """Records the camera's fit, and runs density control, removal and the exposure check when they are due."""
         settings, schedule, until = self.settings, self.schedule, self._until
         if last.colour_shift is not None:
             self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)
@@ -152,7 +152,7 @@ class StaticTrainer:
         return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
     def _has_converged(self) -> bool:
-        """Returns true if passes over all views no longer reduce the loss; one final pass follows."""
+        """Returns whether passes over all views no longer reduce the loss; one final pass follows."""
         losses, window = self.fit.losses, STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
             return False
@@ -262,11 +262,11 @@ def first_trainer(
     """Creates the trainer of ``fit_static_scene``, which takes the same arguments and raises the same errors.
 
     Args:
-        stage: region in the internal world outside of which a Gaussian needs only a single camera that sees it; None
+        stage: region in the internal world outside of which a Gaussian only needs to be seen by one camera, or None
             without surroundings.
     """
     if len(positions) == 0:
-        raise ValueError("the initial cloud has no points; give points, masks, or more overlapping cameras")
+        raise ValueError("the initial point cloud is empty; provide points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
     most = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, most, rng)

@@ -1,4 +1,4 @@
-"""The time limit of frame 0: keeps track of the remaining time and of the steps that had too little of it."""
+"""The time limit of frame 0, which keeps track of the remaining time and of steps that had too little time."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class TimeLimit:
     """Limits the duration of frame 0 by choosing cheaper alternatives based on the measured pace.
 
     Args:
-        seconds: time limit of frame 0 in seconds, counted from now; None for no limit.
-        clock: returns the current time in seconds.
+        seconds: time limit of frame 0 in seconds, counted from now, or None for no limit.
+        clock: function that returns the current time in seconds.
 
     Attributes:
         shortened: descriptions of the steps that had too little time.
@@ -46,7 +46,7 @@ class TimeLimit:
 
     @property
     def bounded(self) -> bool:
-        """True if there is a limit."""
+        """Whether there is a limit."""
         return self.seconds is not None
 
     def seconds_left(self, share: float = 1.0) -> float:

@@ -65,5 +65,5 @@ class Exposures:
                 view.exposure[:] = (1, 0)
 
     def by_camera(self) -> dict[str, Array]:
-        """Returns the [3, 2] exposure of each camera, keyed by name; empty if exposures are not learnt."""
+        """Returns the [3, 2] exposure of each camera, keyed by name, or an empty dict if exposures are not learnt."""
         return {view.name: view.exposure[:3].copy() for view in self._views} if self.on else {}

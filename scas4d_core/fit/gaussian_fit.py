@@ -39,11 +39,11 @@ class FitStep:
     ended: float
 
     def reaches(self, moment: float) -> bool:
-        """Returns true if this iteration reaches a given point of the schedule."""
+        """Returns whether this iteration reaches a given point of the schedule."""
         return self.begun < moment <= self.ended
 
     def passes(self, every: float) -> bool:
-        """Returns true if this iteration passes a multiple of ``every``."""
+        """Returns whether this iteration passes a multiple of ``every``."""
         return self.ended // every > self.begun // every
 
 
@@ -64,9 +64,9 @@ class GaussianFit:
         engine: fit engine, which no other fit may use.
         views: views to fit.
         parameters: [N, 15] parameter table with the columns of ``engines.fit``; changed in place.
-        fixed: for each view, fixed Gaussians that are rendered together with the fitted ones; empty for none.
-        gloss: gloss of view-dependent colours, which is also learnt; colours are constant if None.
-        exposures: exposures of the views, which are also learnt; exposures are fixed if None.
+        fixed: fixed Gaussians of each view, which are rendered with the fitted ones; empty if there are none.
+        gloss: gloss of view-dependent colours, which is also learnt, or None for constant colours.
+        exposures: exposures of the views, which are also learnt, or None for fixed exposures.
         betas: Adam decay rates.
         statistics: whether to collect ``table.statistics`` for density control.
 
@@ -140,9 +140,9 @@ class GaussianFit:
 
         Args:
             order: view index of each iteration.
-            scalars: returns the learning rates and options of an iteration.
-            begin: called before each iteration with its number in this run; the fit ends if it returns None.
-            end: called after each iteration with its loss; the fit ends if it returns true.
+            scalars: function that returns the learning rates and options of an iteration.
+            begin: function called before each iteration with its number in this run; the fit ends if it returns None.
+            end: function called after each iteration with its loss; the fit ends if it returns true.
         """
         for done, view in enumerate(order):
             now = begin(done)

@@ -198,7 +198,7 @@ def blend(
         groups: tuple of length C/4, which makes the number of channels known at compile time.
         starts: [tiles + 1] start of each tile's list in ``items``.
         items: [entries] Gaussian of each entry.
-        covers: [entries] uint64 block mask of each entry, see ``tiles.cover``. Blocks in which the Gaussian has no
+        covers: [entries] uint64 block mask of each entry; see ``tiles.cover``. Blocks in which the Gaussian has no
             effect are cleared.
         wanted: [tiles] uint64 mask of the blocks to render; all others are filled with the background.
         tile_order: int64 tiles to render, distributed to tasks in this order. All other tiles stay unchanged.

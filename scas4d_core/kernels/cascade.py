@@ -167,7 +167,7 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
         v: [13, 16] factors 0–8 and rotations 9–12, updated in place.
         present: mask, starting at flat index ``lane``: 0 for Gaussians that are not counted, otherwise 1.
         guard_counts: [3 or more] int64 counts, to which the number of Gaussians that triggered each guard in
-            ``COUNTED_GUARDS`` is added. If None, they are not counted.
+            ``COUNTED_GUARDS`` is added; None disables counting.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)

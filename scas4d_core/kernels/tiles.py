@@ -1,4 +1,4 @@
-"""Depth sorting and tile lists. Gaussians are sorted once globally, so tile lists filled in this order are sorted."""
+"""Depth sorting and tile lists. Gaussians are sorted once globally, and tile lists filled in this order are sorted."""
 
 from __future__ import annotations
 

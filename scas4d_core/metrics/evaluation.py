@@ -39,7 +39,7 @@ MOVING_SHARE = 0.01
 CHANGED = 0.1
 """Difference from frame 0 in any channel, with values in 0…1, above which a pixel is considered changed."""
 STILL_LEVELS = 6
-"""Maximum range of a still pixel's values in each channel, in levels of 255. Allows for noise in the true images."""
+"""Maximum range of a still pixel's values in each channel, in 8-bit levels. Allows for noise in the true images."""
 MIN_STILL = 500
 """Minimum number of still pixels over all test cameras for which flicker is reported."""
 
@@ -55,7 +55,7 @@ def measure_pictures(
         reconstruction: reconstruction in which the frame is already committed.
         capture: capture with masks, opened at the image scale to evaluate.
         index: frame index.
-        with_lpips: whether to compute LPIPS too, which requires torch.
+        with_lpips: whether to also compute LPIPS, which requires torch.
 
     Returns:
         The mean scores over all test cameras, and the scores of each camera, keyed by camera name.
@@ -157,7 +157,7 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
 
 
 def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Returns the flicker, in levels of 255, and the number of still pixels it is averaged over."""
+    """Returns the flicker, in 8-bit levels, and the number of still pixels over which it is averaged."""
     rig = capture.test_rig
     assert rig is not None
     deviations: list[NDArray[Any]] = []

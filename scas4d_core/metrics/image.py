@@ -60,7 +60,7 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
     squared = (first - second) ** 2
     if mask is not None:
         if mask.shape != first.shape[:2]:
-            raise ValueError(f"mask has shape {mask.shape}; expected {first.shape[:2]} like the images")
+            raise ValueError(f"mask must have shape {first.shape[:2]}, like the images; got {mask.shape}")
         squared = squared[np.asarray(mask) != 0]
     if squared.size == 0:
         return math.nan
@@ -120,7 +120,7 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
     try:
         evaluator = importlib.import_module("flip_evaluator")
     except ImportError:
-        return Score(None, "flip_evaluator is not installed: pip install flip-evaluator")
+        return Score(None, "flip_evaluator is not installed; run pip install flip-evaluator")
     _, error, _ = evaluator.evaluate(
         np.ascontiguousarray(second, dtype=np.float32),
         np.ascontiguousarray(first, dtype=np.float32),
@@ -159,10 +159,10 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
         importlib.import_module("torchvision")
         importlib.import_module("lpips")
     except ImportError as fault:
-        return Score(None, f"{fault.name} is not installed: pip install lpips")
+        return Score(None, f"{fault.name} is not installed; run pip install lpips")
     weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_BACKBONES[backbone]
     if not weights.is_file():
-        return Score(None, f"weights file {weights} not found; copy it there, because it is never downloaded")
+        return Score(None, f"weights file {weights} not found; copy it there (it is never downloaded)")
     network = _lpips_network(backbone)
     with torch.no_grad():
         tensors = [torch.from_numpy(p.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1 for p in (first, second)]
@@ -185,17 +185,19 @@ def _window_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _pair(image: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if image.shape != truth.shape:
-        raise ValueError(f"image has shape {image.shape}, truth {truth.shape}; render at the ground-truth size")
+        raise ValueError(
+            f"image has shape {image.shape}, but truth has shape {truth.shape}; render at the ground-truth size"
+        )
     return _unit(image, "image"), _unit(truth, "truth")
 
 
 def _unit(picture: NDArray[Any], name: str) -> NDArray[np.float64]:
     if picture.ndim != 3 or picture.shape[2] != 3:
-        raise ValueError(f"{name} has shape {picture.shape}; expected [H, W, 3]")
+        raise ValueError(f"{name} must have shape [H, W, 3]; got {picture.shape}")
     if picture.dtype == np.uint8:
         return picture / 255.0
     if picture.dtype.kind != "f":
-        raise ValueError(f"{name} has dtype {picture.dtype}; expected floats in 0…1, or uint8")
+        raise ValueError(f"{name} must be uint8, or floats in 0…1; got dtype {picture.dtype}")
     if not np.isfinite(picture).all():
         raise ValueError(f"{name} contains NaN or infinity")
     unit: NDArray[np.float64] = np.clip(picture.astype(np.float64), 0.0, 1.0)

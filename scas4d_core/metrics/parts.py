@@ -19,7 +19,7 @@ def adjusted_rand_index(
     part, with their value in ``labels``.
 
     Args:
-        labels: [...] integer labels, rendered.
+        labels: [...] rendered integer labels.
         truth: [...] integer ground-truth labels, of the same shape.
         foreground: [...] bool mask of the pixels to compare. If None, all pixels with a non-zero true label are used.
 
@@ -34,10 +34,12 @@ def adjusted_rand_index(
     1.0
     """
     if labels.shape != truth.shape:
-        raise ValueError(f"labels have shape {labels.shape}, truth {truth.shape}; render at the ground-truth size")
+        raise ValueError(
+            f"labels have shape {labels.shape}, but truth has shape {truth.shape}; render at the ground-truth size"
+        )
     counted = truth != 0 if foreground is None else np.asarray(foreground) != 0
     if counted.shape != truth.shape:
-        raise ValueError(f"foreground has shape {counted.shape}; expected {truth.shape} like the labels")
+        raise ValueError(f"foreground must have shape {truth.shape}, like the labels; got {counted.shape}")
     if not counted.any():
         raise ValueError("there are no foreground pixels to compare")
     return float(adjusted_rand_score(truth[counted].ravel(), labels[counted].ravel()))

@@ -109,7 +109,7 @@ def oracle_tracks(
            [0., 0.]])
     """
     if candidates.ndim != 3 or candidates.shape[0] != truth.shape[0] or candidates.shape[2] != 2:
-        raise ValueError(f"candidates have shape {candidates.shape}; expected [T={truth.shape[0]}, N, 2]")
+        raise ValueError(f"candidates must have shape [T={truth.shape[0]}, N, 2]; got {candidates.shape}")
     present = np.flatnonzero(np.isfinite(candidates[query]).all(axis=-1))
     if len(present) == 0:
         raise ValueError("no candidate is in front of the camera in the query frame")
@@ -149,14 +149,17 @@ def track_error_3d(
     TrackError(median=12.5, percentile_90=12.5, count=8)
     """
     if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3 or moving.shape != truth.shape[1:2]:
-        raise ValueError(f"tracks {tracks.shape}, truth {truth.shape} must be [T, P, 3], moving {moving.shape} [P]")
+        raise ValueError(
+            "tracks and truth must have shape [T, P, 3], and moving [P]; got "
+            f"{tracks.shape}, {truth.shape} and {moving.shape}"
+        )
     if not extent > 0:
-        raise ValueError(f"extent {extent!r} must be positive")
+        raise ValueError(f"extent must be positive; got {extent!r}")
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)
     frames = np.arange(len(truth)) != query
     pooled = distances[np.ix_(frames, moving)].ravel()
     if pooled.size == 0:
-        raise ValueError("no point moves, or there is no frame other than the query frame; nothing to evaluate")
+        raise ValueError("nothing to evaluate: no point moves, or there is no frame other than the query frame")
     pooled = np.where(np.isfinite(pooled), pooled, np.inf) * (100.0 / extent)
     # Use the inverted CDF, because interpolating between two infinities yields NaN.
     ninety = np.quantile(pooled, 0.9, method="inverted_cdf")
@@ -224,7 +227,7 @@ def error_by_confidence(
     [1.5, 3.5]
     """
     if confidence.shape != tracks.shape[:2]:
-        raise ValueError(f"confidence has shape {confidence.shape}; expected [T, P] = {tracks.shape[:2]}")
+        raise ValueError(f"confidence must have shape [T, P] = {tracks.shape[:2]}; got {confidence.shape}")
     track_error_3d(tracks, truth, moving, extent, query=query)  # validates the arguments
     chosen = np.ix_(np.arange(len(truth)) != query, moving)
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)[chosen].ravel()
@@ -250,7 +253,7 @@ def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], 
     0.5
     """
     if predicted.shape != truth.shape or truth.ndim != 2:
-        raise ValueError(f"predicted {predicted.shape} and truth {truth.shape} must both be [T, Q]")
+        raise ValueError(f"predicted and truth must both have shape [T, Q]; got {predicted.shape} and {truth.shape}")
     frames = np.arange(len(truth)) != query
     right = predicted[frames] == truth[frames]
     return float(right.mean()) if right.size else math.nan
@@ -258,9 +261,9 @@ def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], 
 
 def _percent_of_diagonal(tracks: NDArray[Any], truth: NDArray[Any], diagonal: float) -> NDArray[np.float64]:
     if tracks.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 2:
-        raise ValueError(f"tracks {tracks.shape} and truth {truth.shape} must both be [T, Q, 2]")
+        raise ValueError(f"tracks and truth must both have shape [T, Q, 2]; got {tracks.shape} and {truth.shape}")
     if not diagonal > 0:
-        raise ValueError(f"diagonal {diagonal!r} must be a positive number of pixels")
+        raise ValueError(f"diagonal must be a positive number of pixels; got {diagonal!r}")
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)
     percent: NDArray[np.float64] = np.where(np.isfinite(distances), distances, diagonal) * (100.0 / diagonal)
     return percent
@@ -268,7 +271,7 @@ def _percent_of_diagonal(tracks: NDArray[Any], truth: NDArray[Any], diagonal: fl
 
 def _without_query(counted: NDArray[np.bool_], shape: tuple[int, ...], query: int) -> NDArray[np.bool_]:
     if counted.shape != shape:
-        raise ValueError(f"counted has shape {counted.shape}; expected [T, Q] = {shape}")
+        raise ValueError(f"counted must have shape [T, Q] = {shape}; got {counted.shape}")
     counts = counted.astype(np.bool_)
     counts[query] = False
     return counts

@@ -53,13 +53,13 @@ class CommittedScene:
         Args:
             camera: camera in the user's world.
             index: index of a committed frame.
-            background: RGB in 0…1; None for the scene's background.
+            background: RGB in 0…1, or None for the scene's background.
             labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest
-                frame are valid for any frame: those of Gaussians added later are ignored.
+                frame are valid for any frame, because labels of Gaussians added later are ignored.
 
         Raises:
-            HistoryError: the frame was not committed.
-            ValueError: the labels have the wrong shape or are out of range.
+            HistoryError: if the frame was not committed.
+            ValueError: if the labels have the wrong shape or are out of range.
         """
         gaussians = self._state(index)
         if labels is not None and np.shape(labels) == (self.history.count,):
@@ -85,7 +85,7 @@ class CommittedScene:
         )
 
     def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-        """Returns the trajectories of Gaussians by id [Q]."""
+        """Returns the trajectories of the Gaussians with the given ids [Q]."""
         return tracks_of_history.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
@@ -94,10 +94,10 @@ class CommittedScene:
         return tracks.with_visibility(camera, self._depth, tolerance)
 
     def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
-        """Returns the part label of each Gaussian [N], largest part first, −1 for static ones; see ``parts.parts``.
+        """Returns the part label of each Gaussian [N] (largest part first, −1 if static); see ``parts.parts``.
 
         Args:
-            count: number of parts; None to choose it by silhouette score.
+            count: number of parts, or None to choose it by silhouette score.
             previous: [N] labels computed from fewer frames; parts that persist keep their labels.
         """
         return parts_of_history.parts(self.history, count, previous=previous)

@@ -22,7 +22,7 @@ FAR_M = 1e4
 def harmonics(gaussians: Gaussians) -> Float:
     """Returns the coefficients [N, 16, 3] of each Gaussian's RGB − 0.5 over viewing directions in world axes.
 
-    They are valid for this frame only, because highlights are fixed to the world while objects rotate. Degree 3 is too
+    They are only valid for this frame, because highlights are fixed to the world while objects rotate. Degree 3 is too
     coarse for the highlight of a lamp, which becomes wider and dimmer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[0.5, 0.5, 1.0])

@@ -38,15 +38,15 @@ LAMBDA_ROTATION = 1.0
 """λR, the weight of the entries of R over time; a rotation by angle a changes them by 2.8 sin(a/2). Rotation separates
 parts; position separates only those that rotate alike. A larger position weight would split long parts."""
 LAMBDA_INITIAL = 0.25
-"""λp0, the weight of p at the first frame, which the paper repeats at every frame."""
+"""λp0, the weight of p in the first frame, which the paper repeats in every frame."""
 MAX_FRAMES = 32
 """Maximum number of frames in the features, evenly spaced over the history; limits memory use."""
 SAMPLE = 20_000
 """Maximum number of Gaussians that are clustered; all are then labelled."""
 MAX_PARTS = 12
-"""Largest number of parts to try if none is given."""
+"""Maximum number of parts to try if no number is given."""
 STAY = 0.05
-"""Margin by which the inertia of the previous parts must exceed that of a fresh clustering to be replaced by it."""
+"""Margin by which the inertia of the previous parts must exceed that of a fresh clustering before they are replaced."""
 STAY_COUNT = 0.02
 """Bonus on the mean silhouette score for keeping the previous number of parts."""
 RESTARTS = 10
@@ -67,14 +67,14 @@ def parts(
 
     Args:
         history: history with at least one committed frame; with only one, positions alone separate parts.
-        count: number of parts; None for the number from 2 to ``MAX_PARTS`` with the largest mean silhouette score
+        count: number of parts, or None for the number from 2 to ``MAX_PARTS`` with the largest mean silhouette score
             (Rousseeuw 1987) on up to 1,000 Gaussians.
         previous: [N] labels from fewer frames with the same ``count`` (or None). Parts that persist then keep their
             labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
 
     Raises:
-        ValueError: no frame is committed, no Gaussian moves, count is below 1 or above the number of moving Gaussians,
-            or ``previous`` has a different number of Gaussians.
+        ValueError: if no frame is committed, no Gaussian moves, count is below 1 or above the number of moving
+            Gaussians, or ``previous`` has a different number of Gaussians.
 
     >>> from scas4d_core.storage.history import History
     >>> boxes = np.random.default_rng(0).random((40, 3))
@@ -98,11 +98,12 @@ def parts(
         )
     if count is not None and not 1 <= count <= rows.size:
         raise InputError(
-            f"count {count} must be between 1 and {rows.size}, the number of moving Gaussians", "change the count"
+            f"count {count} is not between 1 and {rows.size}, the number of moving Gaussians",
+            "use a count in this range",
         )
 
     if previous is not None and previous.shape != (len(newest),):
-        raise InputError(f"previous labels {previous.shape} must be [{len(newest)}], one per Gaussian")
+        raise InputError(f"previous labels must have shape [{len(newest)}], one per Gaussian; got {previous.shape}")
 
     rng = np.random.default_rng(SEED)
     chosen = rows if rows.size <= SAMPLE else np.sort(rng.choice(rows, SAMPLE, replace=False))
@@ -200,7 +201,7 @@ def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) 
 def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float) -> Features:
     """Returns the features of M Gaussians over T frames, [M, 12 T + 3] float32.
 
-    The paper repeats p(0) at every frame. Here it is included once, times √T, which gives the same distances. All
+    The paper repeats p(0) in every frame. Here it is included once, times √T, which gives the same distances. All
     features are divided by √T, so that distances do not grow with the number of frames.
 
     Args:

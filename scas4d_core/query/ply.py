@@ -33,7 +33,7 @@ OPACITY_MARGIN = 1e-6
 JACOBI_SWEEPS = 12
 """Number of one-sided Jacobi sweeps; convergence is quadratic, and a 3×3 matrix takes about five."""
 ORTHOGONAL = 1e-6
-"""Cosine below which two axes count as orthogonal, at the precision of float32 factors."""
+"""Cosine below which two axes are considered orthogonal, given the precision of float32 factors."""
 
 _FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -42,7 +42,7 @@ _FIELDS = (
 
 
 class PlyError(InputError):
-    """Raised if Gaussians cannot be exported or a file is invalid; the message gives the rows or path and the fault."""
+    """Raised if Gaussians cannot be exported or a file is invalid; the message names the rows or path."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
         world: transform from the user's world to the internal world.
 
     Raises:
-        PlyError: some Gaussians are not finite or have no volume; the message gives their rows and ids.
+        PlyError: if some Gaussians have non-finite values or no volume; the message lists their rows and ids.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -116,20 +116,20 @@ def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
 
     Args:
         source: path or open file.
-        name: name of the file for error messages; None to use the path.
+        name: name of the file for error messages, or None to use the path.
 
     Raises:
-        PlyError: the file is not a splat file, or a property is missing.
+        PlyError: if the file is not a splat file, or a property is missing.
 
     >>> read_ply("README.md")
     Traceback (most recent call last):
-    scas4d_core.query.ply.PlyError: README.md: not a 3D Gaussian Splatting .ply (...)
+    scas4d_core.query.ply.PlyError: README.md is not a 3D Gaussian Splatting .ply file (...)
     """
     try:
         vertex = PlyData.read(str(source) if isinstance(source, Path) else source)["vertex"]
         table = {name: np.asarray(vertex[name], dtype=np.float64) for name in _FIELDS if name[0] != "n"}
     except (OSError, KeyError, ValueError, PlyParseError) as error:
-        raise PlyError(f"{name or source}: not a 3D Gaussian Splatting .ply ({error})") from error
+        raise PlyError(f"{name or source} is not a 3D Gaussian Splatting .ply file ({error})") from error
 
     def columns(*names: str) -> Float:
         return np.stack([table[name] for name in names], axis=-1)
@@ -148,7 +148,7 @@ def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
     """Converts a state to centres, axes and scales in the user's world.
 
     Raises:
-        PlyError: some Gaussians are not finite or have no volume.
+        PlyError: if some Gaussians have non-finite values or no volume.
     """
     _refuse(gaussians)
     axes, scales = split_factors(gaussians.factors)

@@ -23,11 +23,11 @@ Float = NDArray[np.float64]
 TILE_PX = 16
 """Size in pixels of the square tiles in which rays share a search for Gaussians."""
 RAYS_AT_ONCE = 64
-"""Number of rays processed at once; limits working memory to a few megabytes."""
+"""Number of rays processed at once, to limit working memory to a few megabytes."""
 DEEPEST = 96
-"""Maximum number of Gaussians per ray, those that absorb the most; the others have no visible effect."""
+"""Maximum number of Gaussians per ray: those that absorb the most light. All others have no visible effect."""
 BISECTIONS = 26
-"""Number of bisection steps; reduces a bracket of 10 m to less than a micrometre."""
+"""Number of bisection steps, which reduce a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
 """Maximum depth difference between a Gaussian's absorption and its centre, in standard deviations. If a ray only grazes
 the rim of a flat Gaussian, the nearest point on the ray can be arbitrarily far away."""

@@ -1,8 +1,7 @@
 """Exports tracks in the npz format of TAPVid-3D, whose tools can then read them as predictions.
 
-Names and axes are those of the benchmark's evaluation (google-deepmind/tapnet,
-``tapvid3d/evaluation/evaluate_model.py``). Points are in metres, in the axes of one camera (OpenCV: x right, y down, z
-forward).
+Names and axes follow the benchmark's evaluation (google-deepmind/tapnet, ``tapvid3d/evaluation/evaluate_model.py``).
+Points are in metres, in the axes of one camera (OpenCV: x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ def tapvid3d(
         positions: [T, Q, 3] positions in the user's world and units, NaN if unknown.
         visibility: [T, Q] visibility in the camera.
         camera: camera in the user's world.
-        queried: index in T of the frame in which the points were queried; −1 if that frame is not included.
+        queried: index in T of the frame in which the points were queried, or −1 if that frame is not included.
         metres_per_unit: metres per user unit.
-        pixels: [Q, 2] queried pixels; None for the projections of the points in the queried frame.
+        pixels: [Q, 2] queried pixels, or None for the projections of the points in the queried frame.
 
     Returns:
         ``tracks_XYZ`` [T, Q, 3] float32: positions in camera axes, in metres. ``visibility`` [T, Q] bool.
@@ -41,7 +40,7 @@ def tapvid3d(
         the camera.
 
     Raises:
-        ValueError: the shapes do not match.
+        ValueError: if the shapes do not match.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> arrays = tapvid3d(np.array([[[0, 0, 2.0]]]), np.array([[True]]), camera, queried=0)
@@ -49,7 +48,9 @@ def tapvid3d(
     ((1, 1, 3), array([[32., 24.,  0.]], dtype=float32))
     """
     if positions.ndim != 3 or visibility.shape != positions.shape[:2]:
-        raise ValueError(f"positions {positions.shape} must be [T, Q, 3] and visibility {visibility.shape} [T, Q]")
+        raise ValueError(
+            f"positions must have shape [T, Q, 3], and visibility [T, Q]; got {positions.shape} and {visibility.shape}"
+        )
     turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     count = positions.shape[1]
     if pixels is None:

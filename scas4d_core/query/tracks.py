@@ -26,13 +26,13 @@ from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
 RenderDepth = Callable[[Camera, int], tuple[NDArray[Any], NDArray[Any]]]
-"""Renders a frame from a camera in the user's world; returns z depth [H, W] in user units and alpha [H, W]."""
+"""Function that renders a frame from a camera in the user's world: z depth [H, W] in user units, and alpha [H, W]."""
 
 ALPHA_OF_A_SURFACE = 0.5
 """Minimum alpha of a pixel that counts as showing a surface."""
 CARRIERS = 32
-"""Number of Gaussians that carry a point. Compared with only the nearest, the median 3D error decreases by 6 % (cloth)
-to 25 % (stage)."""
+"""Number of Gaussians that carry a point. Compared with using only the nearest Gaussian, the median 3D error decreases
+by 6 % (cloth) to 25 % (stage)."""
 SOFTENING = 0.01
 """Length added in quadrature to a Gaussian's axes when computing its distance to a point, as a fraction of the extent.
 Gaussians are thinner than the uncertainty of the surface, and more carriers average out more noise. Compared with
@@ -42,8 +42,8 @@ RAY_SOFTENING = 0.003
 AGREEMENT = 0.01
 """Mean deviation of the carriers from the track that halves the confidence, as a fraction of the extent."""
 DEPTH_TOLERANCE = 0.0075
-"""Distance behind the rendered surface up to which a point counts as visible, as a fraction of the extent. It is about
-the error of the rendered depth."""
+"""Distance behind the rendered surface up to which a point counts as visible, as a fraction of the extent. The value is
+approximately the error of the rendered depth."""
 PIXEL_REACH = 2.0
 """Distance in pixels within which a pixel query that misses a silhouette uses the nearest covered pixel's depth."""
 
@@ -75,7 +75,7 @@ class Tracks:
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
-        """Adds the visibility in another camera; for the arguments see ``find_visibility``."""
+        """Adds the visibility in another camera; see ``find_visibility`` for the arguments."""
         visible = find_visibility(self.positions, self.indices, camera, render_depth, tolerance)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
@@ -99,8 +99,8 @@ def tracks_of_points(
         count: number of Gaussians that carry a point.
 
     Raises:
-        ValueError: points are not [Q, 3] or not finite.
-        HistoryError: a frame was not committed.
+        ValueError: if the points do not have shape [Q, 3], or are not finite.
+        HistoryError: if a frame was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
@@ -115,11 +115,11 @@ def tracks_of_points(
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points have shape {points.shape}", "give [Q, 3]")
+        raise InputError(f"points have shape {points.shape}", "expected [Q, 3]")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
         raise InputError(
-            f"points {bad[:5].tolist()} contain NaN or infinity", "give finite coordinates in the user's units"
+            f"points {bad[:5].tolist()} contain NaN or infinity", "use finite coordinates in the user's units"
         )
     theta = history.gaussians(index)
     extent = moving_extent(theta)
@@ -165,7 +165,7 @@ def tracks_of_pixels(
         limits: rasterizer constants that ``render_depth`` uses.
 
     Raises:
-        ValueError: uv is not [Q, 2], not finite or outside the image.
+        ValueError: if the pixels do not have shape [Q, 2], are not finite, or are outside the image.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
@@ -180,12 +180,12 @@ def tracks_of_pixels(
     """
     uv = np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2:
-        raise InputError(f"uv has shape {uv.shape}", "give [Q, 2] pixels")
+        raise InputError(f"uv has shape {uv.shape}", "expected [Q, 2] pixels")
     outside = np.flatnonzero(~((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1))
     if outside.size:
         raise InputError(
             f"pixel {uv[outside[0]].tolist()} (query {outside[0]}) is outside the image of camera {camera.name!r}",
-            f"give 0 <= u < {camera.width}, 0 <= v < {camera.height}",
+            f"use 0 <= u < {camera.width}, 0 <= v < {camera.height}",
         )
     theta = history.gaussians(index)
     softening = RAY_SOFTENING * moving_extent(theta)
@@ -215,8 +215,8 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     """Returns the trajectories of the Gaussians with the given ids; confidence is 1, or 0 in frames without them.
 
     Raises:
-        ValueError: an id is unknown.
-        HistoryError: a frame was not committed.
+        ValueError: if an id is unknown.
+        HistoryError: if a frame was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()

@@ -50,7 +50,7 @@ class ViewRenderer:
 
     Args:
         world: transform from the user's world to the internal world of the states.
-        limits: limits of the rasterizer.
+        limits: rasterizer constants.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
@@ -81,11 +81,12 @@ class ViewRenderer:
             gaussians: state of N Gaussians in the internal world.
             camera: camera in the user's world.
             background: background colour, RGB in 0…1.
-            colours: [N, 3] float32 RGB to use instead of the state's colours; None for the colours seen by this camera.
+            colours: [N, 3] float32 RGB to use instead of the state's colours, or None for the colours seen by this
+                camera.
             labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``.
 
         Raises:
-            ValueError: the labels have the wrong shape or are out of range.
+            ValueError: if the labels have the wrong shape or are out of range.
         """
         inside = self.world.camera_to_inside(camera)
         arrays = CameraArrays.of(inside)
@@ -108,7 +109,8 @@ class ViewRenderer:
         """Returns [H, W] uint8: 1 + the label with the largest weight. Each pass renders ``CHANNELS`` labels."""
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MAX_LABEL)).all():
             raise ValueError(
-                f"labels {labels.shape} must be [{len(gaussians)}], one per Gaussian, each in -1...{MAX_LABEL}"
+                f"labels must have shape [{len(gaussians)}], one per Gaussian, with values in -1...{MAX_LABEL}; got "
+                f"shape {labels.shape}"
             )
         painted = np.zeros((camera.height, camera.width), np.uint8)
         most = np.full(painted.shape, -1.0, np.float32)

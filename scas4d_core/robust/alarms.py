@@ -1,9 +1,9 @@
 """Alarms point out conditions that need attention after a frame. They are raised only here; other modules show them.
 
 Alarms are derived from values that an update computes anyway. A camera is compared with its own past and with the other
-cameras of the frame. A change that all cameras see is not attributed to one. Because a single frame may be noise, small
-deviations must persist for two frames. The thresholds were chosen from measurements on the captures; docs/stability.md
-has the distributions.
+cameras of the frame. A change that all cameras see is not attributed to a single camera. Because a single frame may be
+noise, small deviations must persist for two frames. The thresholds were chosen from measurements on the captures;
+docs/stability.md shows the distributions.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
 """Maximum deviation of one colour channel from the other two, relative to the camera's past and the other cameras. The
-first value applies to two consecutive frames, the second to a single frame. Clean captures: 0.03."""
+first value applies to two consecutive frames, the second to a single frame. Clean captures reach 0.03."""
 GAIN = (0.15, 0.25)
-"""Maximum common deviation of all channels, as in ``TINT``. Clean captures: 0.09, for a sheet seen edge-on."""
+"""Maximum common deviation of all channels, as in ``TINT``. Clean captures reach 0.09, for a sheet seen edge-on."""
 SPREAD = 4.0
 """``TINT`` and ``GAIN`` are raised to this multiple of the deviation that half of the cameras do not exceed in a frame.
 If all cameras fit badly, as on small images, colours are unreliable."""
 SHARPNESS = (0.12, 0.2)
-"""Maximum deviation of the log sharpness, as in ``TINT``. Clean captures: 0.07; a blur of one pixel: 0.42."""
+"""Maximum deviation of the log sharpness, as in ``TINT``. Clean captures reach 0.07; a blur of one pixel causes
+0.42."""
 FOLLOWS = 0.2
 """Rate at which the usual colours and sharpness of a camera follow new values; suspended while they are suspect."""
 ROW = 2
@@ -36,7 +37,7 @@ ROW = 2
 DARKEST = 0.02
 """Lower bound of a mean channel value, 0…1, when computing relative differences."""
 FLAT = 0.5
-"""Minimum mean difference of neighbouring pixels, in levels of 255, for measuring sharpness."""
+"""Minimum mean difference of neighbouring pixels, in 8-bit levels, for measuring sharpness."""
 ROWS = 64
 """Approximate number of pixel rows used for measuring sharpness."""
 COLOURS = ("red", "green", "blue")
@@ -65,7 +66,7 @@ class CameraFigures:
 
     @classmethod
     def of(cls, past: Past, name: str) -> CameraFigures:
-        """Returns a camera's figures from a row created by ``row``; the defaults if there is none."""
+        """Returns a camera's figures from a row created by ``row``, or the defaults if there is no row."""
         row = past.camera_figures.get(name)
         if row is None:
             return cls()
@@ -96,7 +97,7 @@ def alarms_of(
         past, after: usual values before and after the frame.
         outcome: outcome of the frame.
         reason: reason for the outcome.
-        exposure: brightness ratio of the frame to the usual brightness.
+        exposure: ratio of the frame's brightness to the usual brightness.
         offsets: offset of each camera above (+) or below its usual fit, in dB.
         colours: ``colours_of`` for each rendered camera.
         sharp: ``sharpness_of`` for each image of the frame.
@@ -147,8 +148,8 @@ def _check_camera(
         name: name of the camera.
         before: previous figures of the camera.
         past: usual values of all cameras.
-        offset: offset of the camera from its usual fit, in dB; None if it was not rendered.
-        colours: colours of the camera relative to the other cameras; None if unknown.
+        offset: offset of the camera from its usual fit, in dB, or None if it was not rendered.
+        colours: colours of the camera relative to the other cameras, or None if unknown.
         sharp: sharpness of the image.
         sharper: change from the usual sharpness, relative to the other cameras.
         same: whether the image is unchanged while those of other cameras have changed.
@@ -161,7 +162,10 @@ def _check_camera(
     if offset is not None:
         now = replace(now, misfit=before.misfit + 1 if in_doubt(past, offset) else 0)
         if offset < LAST_DB + allowed(past) or now.misfit >= ROW:
-            text = f"its image fits {-offset:.1f} dB worse than usual relative to the others: moved, dirty or late?"
+            text = (
+                f"its image fits {-offset:.1f} dB worse than usual relative to the other cameras; check whether the "
+                "camera has moved, is dirty or lags"
+            )
             alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
     if colours is not None:
         usual = _known(before.colours, colours)
@@ -172,11 +176,15 @@ def _check_camera(
         now = replace(now, gain=before.gain + 1 if abs(gain) > gains[0] else 0)
         if tint > tints[1] or now.tint >= ROW:
             parts = ", ".join(f"{colour} {100 * part:+.0f} %" for colour, part in zip(COLOURS, change, strict=True))
-            text = f"its colours differ from its own past and the other cameras: {parts}; white balance?"
+            text = (
+                f"its colours differ from its earlier images and the other cameras ({parts}); check the white balance"
+            )
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
         elif abs(gain) > gains[1] or now.gain >= ROW:
             size = f"{100 * abs(gain):.0f} % {'brighter' if gain > 0 else 'darker'}"
-            text = f"its image is {size} than expected from its own past and the other cameras: exposure?"
+            text = (
+                f"its image is {size} than expected from its earlier images and the other cameras; check the exposure"
+            )
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
         if not now.tint and not now.gain:
             red, green, blue = (usual + FOLLOWS * change).tolist()
@@ -184,8 +192,11 @@ def _check_camera(
     if not np.isnan(sharper):
         now = replace(now, blur=before.blur + 1 if abs(sharper) > SHARPNESS[0] else 0)
         if abs(sharper) > SHARPNESS[1] or now.blur >= ROW:
-            how, why = ("sharper", "noise?") if sharper > 0 else ("less sharp", "out of focus?")
-            text = f"its image is {100 * abs(np.expm1(sharper)):.0f} % {how} than usual relative to the others: {why}"
+            how, why = ("sharper", "check for noise") if sharper > 0 else ("less sharp", "check the focus")
+            text = (
+                f"its image is {100 * abs(np.expm1(sharper)):.0f} % {how} than usual relative to the other cameras; "
+                f"{why}"
+            )
             alarms.append(Alarm(AlarmKind.CAMERA_SHARPNESS, name, text))
     if np.isnan(before.sharp):
         now = replace(now, sharp=sharp)
@@ -235,7 +246,7 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
     """Returns the [3] relative brightness difference between a camera's channels and their rendering.
 
     Args:
-        shift: [3] colour shift of the camera, see ``CameraFit.colour_shift``.
+        shift: [3] colour shift of the camera; see ``CameraFit.colour_shift``.
         mean: [3] mean colour of the camera's image, 0…1.
 
     >>> colours_of((0.05, 0.0, -0.02), (0.3, 0.2, 0.18)).round(3).tolist()
@@ -292,7 +303,7 @@ def _frame_alarms(
     if text is not None:
         return [Alarm(AlarmKind.FRAME_REJECTED if outcome.rejected else AlarmKind.FRAME_IN_PART, None, text)]
     if count and len(same) == count:
-        return [Alarm(AlarmKind.FRAME_REPEATED, None, f"all {count} cameras repeat bit-identical images")]
+        return [Alarm(AlarmKind.FRAME_REPEATED, None, f"all {count} cameras repeated bit-identical images")]
     if exposure != 1.0:
         return [Alarm(AlarmKind.LIGHT, None, f"the images are {exposure:.2g} times as bright as before")]
     return []

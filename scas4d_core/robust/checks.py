@@ -7,9 +7,9 @@ median over pixels, because in most pixels only the lighting has changed. A ligh
 from frame to frame like a dimming lamp, is treated differently (``solve_frame``): the scene's colours are scaled by the
 gain, and the images are unchanged.
 
-A frame may repeat the images of the previous frame: a camera runs at half the rate of its rig, or a waiting rig resends
-its last frame. Nothing is learnt from such a frame, and it does not count as a pause of the motion: the next frame
-starts from the motion before the repeated images.
+A frame may repeat the images of the previous frame, because a camera runs at half the rate of its rig or an idle rig
+resends its last frame. Nothing is learnt from such a frame, and it does not count as a pause of the motion: the next
+frame starts from the motion before the repeated images.
 
 A state that is not finite, bounded and plausible is never committed. Single faulty Gaussians keep their previous state.
 If there are more than a few of them, the whole attempt has failed.
@@ -35,12 +35,13 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 EXPOSURE = 1.05
-"""Brightness ratio, as the median over cameras, above which the exposure of a frame differs. Clean captures: 1.04."""
+"""Brightness ratio, as the median over cameras, above which a frame's exposure differs. Clean captures reach 1.04."""
 ALIKE = 1.03
 """Maximum ratio between consecutive brightness steps of a light that changes continuously. A lamp that crosses a room
 and dims to half its brightness in ten frames has 1.017; flickering lights have no similar steps."""
 ENOUGH = 8
-"""Minimum number of cameras for estimating exposure: a turning object changes the brightness of one image by a third.
+"""Minimum number of cameras for estimating exposure: a turning object can change the brightness of one image by a
+third.
 """
 UNUSABLE = 2.0
 """Brightness ratio above which the lighting is too different to learn from the frame."""
@@ -54,7 +55,7 @@ DARK = 0.05
 PIXELS = 100
 """Minimum number of usable pixels of a camera, on a grid of every other row and column."""
 SATURATED = 0.99
-"""Channel value, 0…1, at which a pixel is saturated and gives only a lower bound of the brightness."""
+"""Channel value, 0…1, at which a pixel is saturated and only provides a lower bound on the brightness."""
 
 EVERY = 4
 """Row and column stride of the pixels in a fingerprint; two images of a camera are never identical by chance."""
@@ -87,7 +88,9 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
         reasons; and the reason why nothing can be learnt from the frame, or None.
     """
     left_out = {
-        name: "it has not fitted the other cameras since it was excluded" for name in bright if past.is_left_out(name)
+        name: "it has been inconsistent with the other cameras since it was excluded"
+        for name in bright
+        if past.is_left_out(name)
     }
     usual = {name: past.brightness.get(name, nan) for name in bright}
     ratios = {name: value / usual[name] for name, value in bright.items() if usual[name] > DARKEST}
@@ -106,7 +109,7 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
 
 
 def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
-    """Returns the brightness relative to the previous frame, median over cameras; 1 if too few cameras are usable."""
+    """Returns the median ratio of the cameras' brightness to the previous frame, or 1 if too few cameras are usable."""
     ratios = [
         value / past.last_brightness[name]
         for name, value in bright.items()
@@ -116,7 +119,7 @@ def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
 
 
 def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
-    """Returns true if a lighting change continues at the same rate as in the previous frame, faster than noise.
+    """Returns whether a lighting change continues at the same rate as in the previous frame, faster than noise.
 
     In this case the scene's own lighting changes, and the colours follow at once. Flicker reverses, and a sudden jump
     has no previous step.
@@ -175,7 +178,7 @@ def compensate_exposure(
 
 
 def measure_light_gain(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
-    """Returns the brightness of a frame relative to renderings of Θ_{t−1}; None if no camera is usable."""
+    """Returns the brightness of a frame relative to renderings of Θ_{t−1}, or None if no camera is usable."""
     return _gain(views, [_shown(renderer, state, view) for view in views])
 
 
@@ -193,13 +196,13 @@ def _shown(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
 
 
 def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None:
-    """Returns the median ratio over usable cameras; None if there are none."""
+    """Returns the median ratio over usable cameras, or None if there are none."""
     ratios = [ratio for view, now in zip(views, shown, strict=True) for ratio in _ratio(view.target[:LABEL], now)]
     return float(np.median(ratios)) if ratios else None
 
 
 def _ratio(picture: Array, shown: Array) -> list[float]:
-    """Returns a list with the median brightness ratio over pixels and channels; empty if there are too few pixels."""
+    """Returns the median brightness ratio over pixels and channels as a list, empty if there are too few pixels."""
     here, there = picture[:, ::2, ::2], shown[:, ::2, ::2]
     says = (there > DARK) & (there < SATURATED) & (here > DARK / 2) & (here < SATURATED)
     return [float(np.median(here[says] / there[says]))] if says.sum() >= 3 * PIXELS else []
@@ -237,17 +240,17 @@ def axis_lengths(gaussians: Gaussians) -> Array:
 def check_plausible(
     before: Gaussians, result: UpdateResult, rows: NDArray[np.int64], radius: float, first: Array | None = None
 ) -> tuple[UpdateResult, str | None]:
-    """Restores the previous state of Gaussians that are not finite, bounded and plausible.
+    """Restores the previous state of Gaussians whose new state is not finite, bounded and plausible.
 
     Args:
         before: previous state Θ_{t−1}.
         result: result of an attempt.
         rows: [M] rows of the moving Gaussians.
         radius: radius of the rig, in metres.
-        first: [N, 3] ``axis_lengths`` of frame 0; None to limit axes only by ``LONGEST``.
+        first: [N, 3] ``axis_lengths`` of frame 0, or None to limit axes only by ``LONGEST``.
 
     Returns:
-        The result with a state that may be committed, and None. If the whole state is implausible, the result with the
+        The result with a state that may be committed, and None. If the whole state is implausible: the result with the
         state ``before``, and the reason.
     """
     after = result.gaussians
@@ -264,7 +267,7 @@ def check_plausible(
     bad[rows] |= ~fine
     count = int(bad.sum())
     if count > max(1, FEW * len(rows)):
-        fault = f"{count} of {len(rows)} Gaussians are not finite, or moved or grew too far"
+        fault = f"{count} of {len(rows)} Gaussians have non-finite values, or moved or grew too much"
         return replace(result, gaussians=before, frozen=count), fault
     bounded = 0
     if first is not None:

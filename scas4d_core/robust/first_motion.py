@@ -1,6 +1,6 @@
-"""Runs the first update of a scene in several view orders: it has no previous motion, and later updates depend on it.
+"""Runs a scene's first update in several view orders, as it has no previous motion and later updates depend on it.
 
-The local minimum in which it ends is a matter of chance. With a bad order it ends 1 to 5 dB below others, and later
+Which local minimum it reaches is a matter of chance. With a bad order, it ends 1 to 5 dB below other orders, and later
 updates do not recover. The orders also differ in their learning rates, because steps that are too large for one scene
 are too small for another. The errors in all training views decide which result is best; a few small images are not
 sufficient (docs/method.md).
@@ -20,9 +20,9 @@ from scas4d_core.update.result import UpdateResult
 FASTER = (1.0, 2.0, 2.0)
 """Factors on the layers' rates (``UpdateSettings.cold_start_rates``), one for each order that may be tried."""
 AGREE = 0.04
-"""Relative difference of errors below which two orders count as the same minimum, and no third order is tried."""
+"""Relative difference of errors below which two orders have reached the same minimum, and no third order is tried."""
 ANOTHER_ORDER = 1_000_003
-"""Added to the update's seed for each further order."""
+"""Increment of the update's seed for each additional order."""
 
 
 class OrderResult(NamedTuple):
@@ -30,7 +30,7 @@ class OrderResult(NamedTuple):
 
     Attributes:
         result: result of the update.
-        fault: fault of the resulting state, or None.
+        fault: problem with the resulting state, or None.
         fits: PSNR of that state for each camera that was not excluded, in dB.
     """
 
@@ -40,7 +40,7 @@ class OrderResult(NamedTuple):
 
 
 def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[OrderResult, int]:
-    """Runs an update in two or three view orders; returns the best result and the number of orders.
+    """Runs an update in two or three view orders, and returns the best result and the number of orders.
 
     An update that needs no iteration is not repeated.
 
@@ -60,7 +60,7 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
 
 
 def errors_of(ends: Sequence[OrderResult]) -> list[float]:
-    """Returns the RMS error, 0…1, of each result, averaged over cameras that no order excluded.
+    """Returns the RMS error (0…1) of each result, averaged over cameras that no order excluded.
 
     The error is infinite if a state is implausible, or no better than the previous state.
     """
@@ -76,7 +76,7 @@ def _error(end: OrderResult, names: Sequence[str]) -> float:
 
 
 def _agree(errors: Sequence[float]) -> bool:
-    """Returns true if at least two errors are finite and all are within ``AGREE`` of the smallest.
+    """Returns whether at least two errors are finite and all are within ``AGREE`` of the smallest.
 
     >>> _agree([1.0]), _agree([1.0, 1.03]), _agree([1.05, 1.0]), _agree([np.inf, np.inf])
     (False, True, False, False)

@@ -1,9 +1,9 @@
 """Outlying cameras and frames: each camera is compared with its own past and with the other cameras of the frame.
 
 The comparison uses values that an update computes anyway: the fit of each camera when it was first and last rendered,
-and the mean brightness of its image (``checks``). A camera that fits much worse than the others is excluded.
-A change that all cameras show is accepted if the frame can be fitted as a whole. The thresholds were chosen from
-measurements on the captures; docs/stability.md has the distributions.
+and the mean brightness of its image (``checks``). A camera that fits much worse than the others is excluded. A change
+that all cameras show is accepted if the frame can be fitted as a whole. The thresholds were chosen from measurements on
+the captures; docs/stability.md shows the distributions.
 """
 
 from __future__ import annotations
@@ -17,21 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 FIRST_DB = -9.0
-"""Offset from a camera's usual level, when first rendered, below which it is excluded at once. Clean captures: -6.1."""
+"""Offset from a camera's usual level, when first rendered, below which it is excluded at once. Clean captures reach
+-6.1."""
 LAST_DB = -5.0
-"""The same when last rendered; the camera is then excluded from the next frame on. Clean captures: -3.7; camera moved
-by one or two pixels: -6 to -15."""
+"""Same as ``FIRST_DB``, but when last rendered; the camera is then excluded from the next frame on. Clean captures
+reach -3.7, and cameras that moved by one or two pixels reach -6 to -15."""
 NEAR_DB = -4.0
 """Offset below which a camera is suspect. Its usual level is then not updated, so that a lasting fault remains visible;
-two consecutive frames raise an alarm. Clean captures: -3.7."""
+two consecutive frames raise an alarm. Clean captures reach -3.7."""
 FITS_DB = -4.0
 """Offset above which an excluded camera is accepted again; meanwhile, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""
 DROP_DB = 6.0
-"""Drop of the cameras' median below its usual value at which an update has not fitted its frame."""
+"""Drop of the cameras' median PSNR below its usual value at which an update has not fitted its frame."""
 DROPS_DB = (14.0, 9.0, 9.0)
-"""The same in the first updates, in which the usual value is known only from frame 0 or from a longer update."""
+"""Same as ``DROP_DB``, but for the first updates, when the usual value is only known from frame 0 or a longer
+update."""
 HALVED_DB = 3.0
 """Additional tolerance per halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 cost 3.2."""
 BEHIND_DB = 1.5
@@ -39,7 +41,7 @@ BEHIND_DB = 1.5
 RESTS_DB = 3.0
 """Drop up to which a scene without visible motion counts as static; noise that frame 0 fits costs 1 to 2 dB."""
 CATCH_UP = 3
-"""Maximum number of consecutive frames after a rejected or skipped one that count as lagging."""
+"""Maximum number of consecutive frames after a rejected or skipped frame that count as lagging."""
 MAX_OUT = 0.5
 """Maximum share of excluded cameras; if more do not fit, the frame itself has changed."""
 
@@ -69,19 +71,19 @@ class Past:
             unknown.
         brightness: usual mean of each camera's image, 0…1, at the exposure of frame 0; NaN if unknown.
         frames_left_out: number of consecutive frames for which each camera has been excluded; 0 if it is used.
-        level: usual PSNR at the end of an update, in dB, see ``level_of``; NaN if unknown.
+        level: usual PSNR at the end of an update, in dB (see ``level_of``), or NaN if unknown.
         updates: number of updates included in the usual values.
         rejected: number of consecutive rejected frames with usable images.
         fitted: time of the last learnt frame, in seconds.
-        lagging_frames: number of frames since a rejected or skipped one; 0 when the PSNR is back to normal.
+        lagging_frames: number of frames since a rejected or skipped frame; 0 once the PSNR is back to normal.
         iterations: number of iterations of the last update.
         error: usual error at the end of an update, for each probe view.
-        light: brightness ratio of the last frame, see ``checks.check_brightness``.
+        light: brightness ratio of the last frame; see ``checks.check_brightness``.
         light_frames: number of consecutive brighter, or darker, frames.
         last_brightness: mean of each camera's image in the last frame, in any lighting.
-        brightness_ratio: brightness of the last frame relative to the one before it.
-        camera_figures: figures of each camera for alarms, see ``alarms.CameraFigures``.
-        timing: figures of each camera for its timing, see ``timing.CameraTimingSums``.
+        brightness_ratio: brightness of the last frame relative to the previous frame.
+        camera_figures: figures of each camera for alarms; see ``alarms.CameraFigures``.
+        timing: figures of each camera for its timing; see ``timing.CameraTimingSums``.
     """
 
     camera_levels: Mapping[str, float] = field(default_factory=dict)
@@ -161,16 +163,16 @@ class Past:
         )  # fmt: skip
 
     def camera_level(self, name: str) -> float:
-        """Returns the usual level of a camera in dB; NaN if unknown."""
+        """Returns the usual level of a camera in dB, or NaN if unknown."""
         return self.camera_levels.get(name, nan)
 
     def is_left_out(self, name: str) -> bool:
-        """Returns true if a camera is excluded."""
+        """Returns whether a camera is excluded."""
         return self.frames_left_out.get(name, 0) > 0
 
 
 def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str, tuple[float, ...]]:
-    """Returns the figures of each camera from an array of names and one of rows."""
+    """Returns the figures of each camera from an array of names and an array of rows."""
     return {name: tuple(row) for name, row in zip(arrays[names].tolist(), arrays[rows].tolist(), strict=True)}
 
 
@@ -192,7 +194,7 @@ def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
-    """Returns the cameras that fit much worse than usual, with the reasons.
+    """Returns the reason for each camera that fits much worse than usual, keyed by camera name.
 
     Args:
         past: usual values of the cameras.
@@ -201,7 +203,7 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
     """
     limit += allowed(past)
     outlying = {
-        name: f"its image fits {-off:.1f} dB worse than usual relative to the others"
+        name: f"its image fits {-off:.1f} dB worse than usual relative to the other cameras"
         for name, off in offsets(past, psnr).items()
         if off < limit
     }
@@ -214,12 +216,12 @@ def allowed(past: Past) -> float:
 
 
 def in_doubt(past: Past, offset: float) -> bool:
-    """Returns true if a camera's offset, in dB, is so low that a second such frame raises an alarm."""
+    """Returns whether a camera's offset, in dB, is so low that a second such frame raises an alarm."""
     return offset < NEAR_DB + allowed(past)
 
 
 def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
-    """Returns why an update has not fitted its frame, or None.
+    """Returns the reason why an update has not fitted its frame, or None.
 
     Args:
         past: usual values before the update.
@@ -233,11 +235,11 @@ def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) ->
     drop = DROPS_DB[past.updates] if past.updates < len(DROPS_DB) else DROP_DB
     if level > past.level - drop - _shorter(past, iterations):
         return None
-    return f"the state fits the images at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
+    return f"the state fits the images with {level:.1f} dB PSNR, {past.level - level:.1f} dB less than usual"
 
 
 def lag_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
-    """Returns why an update after rejected or skipped frames should be continued, or None.
+    """Returns the reason why an update after rejected or skipped frames should be continued, or None.
 
     The arguments are the same as for ``misfit_reason``.
     """
@@ -253,7 +255,7 @@ def _shorter(past: Past, iterations: int) -> float:
 
 
 def level_of(past: Past, psnr: Mapping[str, float]) -> float:
-    """Returns the median PSNR in dB over cameras, each relative to its usual level; NaN without cameras."""
+    """Returns the median PSNR in dB over cameras, each relative to its usual level, or NaN without cameras."""
     places = {name: past.camera_level(name) for name in psnr}
     values = [value - (places[name] if isfinite(places[name]) else 0.0) for name, value in _capped(psnr).items()]
     return float(np.median(values)) if values else nan
@@ -276,7 +278,8 @@ def past_after_update(
 
     Args:
         past: usual values before the update.
-        psnr: PSNR of each camera in dB: of used cameras when last rendered, of excluded ones at the end of the update.
+        psnr: PSNR of each camera in dB: when last rendered for used cameras, at the end of the update for excluded
+            cameras.
         bright: brightness of each image of the frame.
         exposure: brightness ratio of the frame.
         iterations: number of iterations of the update; 0 means as in the previous update.
@@ -324,7 +327,7 @@ def past_after_update(
 
 
 def usual_errors(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
-    """Returns the usual error of each view: it falls at once and rises slowly.
+    """Returns the usual error of each view, which falls immediately but rises slowly.
 
     Otherwise, after the large error of a noisy frame, the next good frame would be skipped although objects moved.
     """
@@ -337,5 +340,5 @@ def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def unless_most(found: dict[str, Fault], count: int) -> dict[str, Fault]:
-    """Returns the faults of the cameras, or none if most of the ``count`` cameras have one."""
+    """Returns the problems of the cameras, or none if most of the ``count`` cameras have a problem."""
     return found if len(found) <= MAX_OUT * count else {}

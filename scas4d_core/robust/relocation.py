@@ -1,4 +1,4 @@
-"""Relocates an object after a jump: the update tracks motions up to about the object's size, but no larger ones.
+"""Relocates an object after a jump: the update only tracks motions up to about the object's size.
 
 Each image is compared with a rendering of the scene without moving Gaussians; pixels that differ show the object. The
 rays of all cameras through the object's centre are intersected, once for the images and once for renderings of the
@@ -24,13 +24,13 @@ DIFFERENT = 0.1
 SMALLEST_AREA = 0.25
 """Minimum ratio of the object's area in an image to its rendered area; the maximum is the inverse."""
 CAMERAS = 3
-"""Minimum number of such cameras."""
+"""Minimum number of cameras with a plausible object area."""
 AGREE = 0.25
 """Maximum RMS distance of the rays from their intersection, relative to the displacement; otherwise they disagree."""
 
 
 def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Renderer, rig: Rig) -> Float | None:
-    """Returns the [3] displacement of the moving Gaussians in metres; None if the cameras do not agree.
+    """Returns the [3] displacement of the moving Gaussians in metres, or None if the cameras do not agree.
 
     Args:
         gaussians: previous state Θ_{t−1}.

@@ -1,7 +1,7 @@
 """Solves one frame: a regular update, retries if it fails, and a search for objects that jumped.
 
-Every new attempt starts from the committed state. If no attempt gives a state that is plausible (``checks``) and fits
-the frame (``outliers``), the previous state is kept and the report gives the reason.
+Every new attempt starts from the committed state. If no attempt produces a state that is plausible (``checks``) and
+fits the frame (``outliers``), the previous state is kept and the report states the reason.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LADDER = (
     AttemptOptions("smaller steps", rates=0.3, cold=True),
     AttemptOptions("rigid layers only", rates=0.3, rigid=True, freeze_colours=True, cold=True),
 )
-"""Options of further attempts, in order, while the resulting state is not plausible."""
+"""Options of additional attempts, which are made in order until the resulting state is plausible."""
 
 SEARCH = AttemptOptions("longer search", cold=True, iteration_factor=5.0)
 """Options of a search from the position that silhouettes suggest or from the end of the update. If two of three frames
@@ -54,7 +54,7 @@ of robot are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB wi
 Solved = tuple[UpdateResult, Past]
 """The result of a frame, and the usual values after it."""
 Validated = tuple[UpdateResult, str | None]
-"""The result of an attempt, and the fault of its state, or None."""
+"""The result of an attempt, and the problem with its state, or None."""
 
 
 class FrameSolver:
@@ -62,7 +62,7 @@ class FrameSolver:
 
     Args:
         updater: update of the scene's frames.
-        factory: factory of the scene's training views.
+        factory: factory that creates the scene's training views.
         renderer: renderer with the background and limits of the settings.
         settings: update settings.
 
@@ -80,7 +80,7 @@ class FrameSolver:
         self.check_seconds = 0.0
 
     def run(self, given: UpdateInput) -> Solved:
-        """Solves a frame; if it is rejected, the state and the motion are those of the input."""
+        """Solves a frame. If the frame is rejected, the state and motion of the input are returned unchanged."""
         result, past = self._solve(given)
         with self._time_checks():
             return self._with_alarms(given, result, past)
@@ -148,7 +148,7 @@ class FrameSolver:
                 outcome = FrameOutcome.REJECTED_MISFIT
                 return self._rejected(given, outcome, result.trace, lost, attempts, why, exposure)
             else:
-                reason = f"{why}, for {settings.max_rejected_frames} frames: accepted as the new normal"
+                reason = f"{why}, for {settings.max_rejected_frames} frames; accepted as the new normal"
                 outcome = FrameOutcome.ACCEPTED
                 given = replace(given, past=replace(given.past, level=nan, updates=0))
         elif outcome is FrameOutcome.UPDATED and (why := self._lag_reason(given, result)) is not None:
@@ -158,7 +158,7 @@ class FrameSolver:
         return self._accepted(given, result)
 
     def _scene_is_static(self, given: UpdateInput) -> str | None:
-        """Returns why the images show that no update is needed, or None."""
+        """Returns the reason why the images require no update, or None."""
         if given.same and len(given.same) == len(given.brightness):
             return "repeated images"
         if not given.may_be_static or given.past.updates > 0:  # only a scene without any update can still be at frame 0
@@ -171,7 +171,7 @@ class FrameSolver:
         return "no motion detected" if level > given.past.level - outliers.RESTS_DB else None
 
     def _retry_with_light_gain(self, given: UpdateInput) -> Solved | None:
-        """Solves a frame in lastingly changed lighting by scaling the colours; None if no gain is measured.
+        """Solves a frame under permanently changed lighting by scaling the colours; None if no gain is measured.
 
         If the lighting is unchanged, a new object makes the images brighter, which is no reason to reject them.
         """
@@ -179,7 +179,7 @@ class FrameSolver:
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
         if gain is None or (same and given.unusable is None):
             return None
-        gain, light = (1.0, "unchanged lighting") if same else (gain, f"{gain:.2g} times the lighting")
+        gain, light = (1.0, "unchanged lighting") if same else (gain, f"lighting scaled by {gain:.2g}")
         state, past = with_light_gain(given.state, gain), outliers.past_in_light(given.past, gain)
         in_light = replace(given, state=state, past=past, exposure=1.0, light_moves=False, unusable=None)
         result, past = self._solve(in_light)
@@ -195,7 +195,7 @@ class FrameSolver:
             (result, fault, _), orders = best_order(
                 lambda seed, layer_rate_factor: self._run_one_order(given, seed, layer_rate_factor), given.seed
             )
-            name = f"{name}, the best of {orders} orders" if orders > 1 else name
+            name = f"{name}, best of {orders} view orders" if orders > 1 else name
         else:
             motion = None if template.cold else given.motion
             result = self._run(given, given.state, motion, self._options(given, template))
@@ -204,7 +204,7 @@ class FrameSolver:
         return result, fault
 
     def _is_first_motion(self, given: UpdateInput, template: AttemptOptions) -> bool:
-        """Returns true for the first motion of a scene, if its update may take longer and has no time limit.
+        """Returns whether this is the first motion of a scene, and its update may take longer and has no time limit.
 
         A scene that resumes without its carry-over does not count: it has no usual values for its cameras. Nor does a
         scene after rejected frames, for which a longer search has already been made.
@@ -285,7 +285,7 @@ class FrameSolver:
         return outliers.lag_reason(given.past, result.trace.met, len(result.trace.losses))
 
     def _budget_is_spent(self, given: UpdateInput, more: int = 0) -> bool:
-        """Returns true if the time budget has no room for another attempt after ``more`` iterations."""
+        """Returns whether the time budget has no room for another attempt after ``more`` iterations."""
         return given.end is not None and perf_counter() + (PROBE + more) * (given.iteration_seconds or 0.0) > given.end
 
     def _search(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult | None:
@@ -295,17 +295,17 @@ class FrameSolver:
         attempts fail.
         """
         if self._budget_is_spent(given, len(given.views)):
-            attempts.append("no search: the budget is spent")
+            attempts.append("no search: the time budget is used up")
             return None
         ended = _with_colours_of(tried.gaussians, given.state)
         starts = [("search from the end of the update", ended)]
         jump = find_jump(given.state, given.views, self._renderer, self._rig)
         if jump is not None:
             length = float(np.linalg.norm(jump))
-            starts.insert(0, (f"search {length:.2f} m away", shift_moving(given.state, jump)))
+            starts.insert(0, (f"search from a position {length:.2f} m away", shift_moving(given.state, jump)))
         for name, start in starts:
             if self._budget_is_spent(given):
-                attempts.append(f"no {name}: the budget is spent")
+                attempts.append(f"no {name}: the time budget is used up")
                 break
             options = self._options(given, replace(SEARCH, name=name))
             result = self._run(given, start, None, options)
@@ -319,7 +319,7 @@ class FrameSolver:
         return None
 
     def _continue_update(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
-        """Continues an update from its end with more iterations; returns the better of both results."""
+        """Continues an update from its end with more iterations, and returns the better of both results."""
         options = self._options(given, replace(SEARCH, name="continued from the end of the update"))
         result = self._run(given, _with_colours_of(tried.gaussians, given.state), None, options)
         result, fault = self._check_plausible(given, given.state, result)

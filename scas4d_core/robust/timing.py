@@ -1,6 +1,6 @@
 """Camera timing: without genlock, cameras capture images up to half a frame before or after the other cameras.
 
-After an update, a few cameras are measured, different ones in each frame. Moving Gaussians move from Θ_{t−1} to Θ_t
+After an update, a few cameras are measured (different cameras in each frame). Moving Gaussians move from Θ_{t−1} to Θ_t
 within a frame. Renderings extrapolated forward and backward by half of this motion predict images of other times. They
 explain the residual of the image relative to Θ_t, and the fraction of the motion that fits best is the capture time.
 Measurements of a camera are averaged with exponential forgetting. An offset that all cameras share is a tracking lag,
@@ -53,13 +53,13 @@ ENOUGH = 2.5
 CAMERAS = 4
 """Minimum number of cameras with known means for a median; with fewer, the one that is off cannot be identified."""
 APART = 0.02
-"""Difference between the means of synchronized cameras on captures, in frames, as far as measurable; added to each
-standard error in quadrature."""
+"""Measured difference between the means of synchronized cameras on captures, in frames; added to each standard error in
+quadrature."""
 MAX_ERROR = 0.1
 """Maximum standard error of a reported mean, in frames."""
 OFF, SURE = 0.15, 4.0
-"""Minimum offset of a camera that is out of step, in frames and in multiples of its standard error. Clean captures:
-0.05. See docs/calibration.md.
+"""Minimum offset of a camera that is out of step, in frames and in multiples of its standard error. Clean captures
+reach 0.05. See docs/calibration.md.
 """
 
 Array = NDArray[np.float32]
@@ -133,7 +133,7 @@ class CameraTimingSums:
 def record_timing(
     past: Past, before: Gaussians, result: UpdateResult, renderer: Renderer, way: float, frame: float, index: int
 ) -> Past:
-    """Returns the past with measurements of some cameras of a frame; unchanged if the frame cannot be used.
+    """Returns the past with measurements of some of a frame's cameras, or unchanged if the frame cannot be used.
 
     Frames that were rejected, retried, skipped or lit differently cannot be used. Nor can the first frames with
     motion. Excluded cameras are not measured.
@@ -198,7 +198,7 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
 
 
 def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> PictureTiming | None:
-    """Returns the capture time of an image; None if too little of it changes.
+    """Returns the capture time of an image, or None if too little of it changes.
 
     The residual is regressed on the motion, on the curvature of the motion (second difference of the three renderings),
     and on a global gain and offset.

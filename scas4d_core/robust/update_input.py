@@ -1,4 +1,4 @@
-"""The input of the update of one frame: the state, the images, and the values carried over from earlier frames."""
+"""Input of one frame's update: the state, the images, and the values carried over from earlier frames."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RESTING = 10
 
 @dataclass(frozen=True, eq=False)
 class UpdateInput:
-    """The input of the update of one frame.
+    """The input of one frame's update.
 
     Attributes:
         state: previous state Θ_{t−1}.
@@ -33,16 +33,16 @@ class UpdateInput:
         seed: seed of the update.
         past: usual values of the scene and its cameras.
         lengths: [N, 3] axis lengths in frame 0, in metres.
-        exposure: brightness ratio of the frame, see ``checks.check_brightness``.
-        light_moves: whether the lighting change continues from frame to frame, see ``checks.light_continues``.
+        exposure: brightness ratio of the frame; see ``checks.check_brightness``.
+        light_moves: whether the lighting change continues from frame to frame; see ``checks.light_continues``.
         may_be_static: whether the images have shown no motion yet, in scenes that learn labels from motion.
         same: cameras whose image equals that of the last accepted frame.
         sharp: ``alarms.sharpness`` of each camera.
-        left_out: reason for each camera excluded before the update.
+        left_out: maps each camera excluded before the update to the reason.
         unusable: reason why nothing can be learnt from the frame, or None.
         carried: arrays carried over by the effects, keyed by effect name.
-        end: ``perf_counter`` value by which the last iteration must end; no limit if None.
-        iteration_seconds: time per iteration in previous updates, in seconds; None if unknown.
+        end: ``perf_counter`` value by which the last iteration must end, or None for no limit.
+        iteration_seconds: time per iteration in previous updates, in seconds, or None if unknown.
     """
 
     state: Gaussians

@@ -1,7 +1,7 @@
 """Births, retirements and revivals of Gaussians: the event log, lifetimes, and roots of newborn Gaussians.
 
 The file of each frame contains the log of all frames up to it, so the log survives when retention deletes files. Each
-birth has its own file, which all later frames need. Needs only numpy.
+birth has its own file, which all later frames need. Requires only NumPy.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def rows_among(ids: Int, wanted: Int) -> Int:
 
 
 def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
-    """Returns the lifetimes of the wanted Gaussians according to a log.
+    """Returns the lifetimes of the wanted Gaussians as recorded in a log.
 
     Args:
         events: event log.
@@ -142,15 +142,15 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
 
 
 def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gaussians:
-    """Returns the roots of a state: Θ_0, plus newborn Gaussians at the positions that they would have had in it.
+    """Returns the roots of a state: Θ_0, plus newborn Gaussians at the positions that they would have had in frame 0.
 
     Clusters and neighbours are computed from the roots. A newborn Gaussian is moved back by the inverse rigid motion of
-    its parent; one without a parent keeps its position at birth.
+    its parent; a Gaussian without a parent keeps its position at birth.
 
     Args:
         roots: [N] roots before this frame.
         state: [N + B] state after this frame.
-        parents: [B] row of each newborn Gaussian's parent; None if no newborn Gaussian has a parent.
+        parents: [B] row of each newborn Gaussian's parent, or None if no newborn Gaussian has a parent.
     """
     count, born = len(roots), state.rows(np.arange(len(roots), len(state)))
     if len(born):

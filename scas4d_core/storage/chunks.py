@@ -1,4 +1,4 @@
-"""Chunks: compact files in the folder of a history, each with a series of older frames. Needs numpy and zstandard.
+"""Chunks: compact files in a history's folder, each with a series of older frames. Requires NumPy and zstandard.
 
 ``states_<index>.s4d`` starts with the frame of that index. A frame is in a chunk once the record of its state is
 complete; the note before it contains the frame's report. If a frame also has its own file, that file takes precedence.
@@ -45,7 +45,7 @@ class Chunk:
         times: time of each frame in seconds, keyed by frame index.
         stamps: stamp of each frame: its size in the file in bytes, and −1 minus the checksum of the state. The negative
             value distinguishes it from stamps of frame files.
-        damage: description of the damage after which no frames could be listed, or None.
+        damage: description of the first damage in the file, or None; frames after the damage could not be listed.
         foreign: whether the file has an unsupported format.
     """
 
@@ -144,8 +144,8 @@ class Chunks:
         """Reads arrays of a frame as if from its own file; ``report`` is read from its note.
 
         Raises:
-            FileNotFoundError: no chunk contains the frame.
-            FileError: the frame cannot be read.
+            FileNotFoundError: if no chunk contains the frame.
+            FileError: if the frame cannot be read.
         """
         try:
             return self._read(index, names, optional)
@@ -176,15 +176,15 @@ class Chunks:
             state = reader.state(index).arrays()
             arrays |= {name: state[name] for name in asked & state.keys()}
         if missing := set(names) - arrays.keys():
-            raise FileError(f"{chunk.path.name}: frame {index} has no {', '.join(sorted(missing))}")
+            raise FileError(f"{chunk.path.name}: frame {index} lacks {', '.join(sorted(missing))}")
         return arrays
 
     def reader(self, index: int) -> CompactReader:
         """Returns the open reader of the chunk that contains a frame; this object closes it.
 
         Raises:
-            FileNotFoundError: no chunk contains the frame.
-            FileError: the chunk cannot be opened.
+            FileNotFoundError: if no chunk contains the frame.
+            FileError: if the chunk cannot be opened.
         """
         if (chunk := self.of(index)) is None:
             raise FileNotFoundError(f"no chunk contains frame {index}")
@@ -205,7 +205,7 @@ class Chunks:
             known[1].close()
 
     def fault(self, index: int) -> str | None:
-        """Rereads a frame of a chunk from disk; returns the problem, or None if the frame is intact."""
+        """Rereads a frame of a chunk from disk, and returns the problem, or None if the frame is intact."""
         if (chunk := self.of(index)) is None:
             return f"frame {index} is missing"
         self._close(chunk.path)
@@ -271,13 +271,13 @@ def chunk_file(first: int) -> str:
 
 
 def chunk_of(name: str) -> int | None:
-    """Returns the index of the first frame of a chunk, given its file name; None for other files."""
+    """Returns the index of the first frame of a chunk, given its file name, or None for other files."""
     match = _CHUNK_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def _listed(path: Path, status: os.stat_result) -> Chunk:
-    """Lists the frames of a chunk; none if the chunk cannot be opened."""
+    """Lists the frames of a chunk, or no frames if the chunk cannot be opened."""
     size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:

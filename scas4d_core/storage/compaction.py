@@ -1,8 +1,8 @@
-"""Compaction: moves older states from their own files to chunks, frame by frame. Needs numpy and zstandard.
+"""Compaction: moves older states from their own files to chunks, frame by frame. Requires NumPy and zstandard.
 
-The first and the newest frames stay exact, because updates, replays and restarts need their bits. A frame is appended
-to a chunk with its report as a note, the chunk is synced, and then the frame's own file is deleted. Therefore every
-frame stays readable no matter when the process ends. A view of an older frame changes at most once.
+The first and newest frames are kept bit-exact, because updates, replays and restarts depend on them. A frame is
+appended to a chunk with its report as a note, the chunk is synced, and then the frame's own file is deleted. Every
+frame therefore remains readable, no matter when the process ends. A view of an older frame changes at most once.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Compaction:
     Args:
         history: history in a directory.
         head: function that returns the file header with the error bounds; called when a chunk is created or resumed.
-        exact: number of newest states that stay exact, at least ``NEWEST_KEPT``.
+        exact: number of newest states that are kept bit-exact, at least ``NEWEST_KEPT``.
 
     Attributes:
-        exact: number of newest states that stay exact.
+        exact: number of newest states that are kept bit-exact.
 
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
@@ -79,7 +79,7 @@ class Compaction:
         """Moves one state and returns its frame, or None if there is none to move.
 
         Raises:
-            OSError: the disk is full or failing; nothing is lost, and the next step retries.
+            OSError: if the disk is full or failing; nothing is lost, and the next step retries.
         """
         while self.due:
             index = self._queue[0]
@@ -90,7 +90,7 @@ class Compaction:
                 self._release_writer()
                 raise
             except NOT_ENCODED as error:  # a damaged or unencodable state keeps its file
-                log.warning("frame %d is not compacted: %s", index, error)
+                log.warning("frame %d was not compacted: %s", index, error)
                 self._release_writer()
             else:
                 self._passed = self._queue.popleft()

@@ -24,14 +24,14 @@ def other_format(what: str, written: int | None, read: int) -> OtherFormatError:
 
     Args:
         what: description of the files.
-        written: format of the files, or None if they do not state one.
+        written: format of the files, or None if they do not specify one.
         read: supported format.
 
-    >>> str(other_format("states, a folder,", 3, 1))[:54]
-    'states, a folder, has format 3; this version reads for'
+    >>> str(other_format("state folder a", 3, 1))[:54]
+    'state folder a has format 3, but this version of scas4'
     """
     known = "has no format number" if written is None else f"has format {written}"
     return OtherFormatError(
-        f"{what} {known}; this version reads format {read}: "
-        "use the version of scas4d that wrote it, or reconstruct the scene again from its images"
+        f"{what} {known}, but this version of scas4d reads format {read}; "
+        "use the version that wrote it, or reconstruct the scene again from its images"
     )

@@ -1,4 +1,4 @@
-"""The arrays in the file of a committed frame: state, effect arrays, event log, time and report. Needs only numpy."""
+"""Arrays in the file of a committed frame: state, effect arrays, event log, time, report. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EffectArrays = Mapping[str, Mapping[str, NDArray[Any]]]
 
 
 def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
-    """Packs effect arrays into one array of bytes; returns None if there are none.
+    """Packs effect arrays into one array of bytes, or returns None if there are none.
 
     >>> unpack_effects(pack_effects({"shadows": {"c.0": np.arange(3)}}))
     {'shadows': {'c.0': array([0, 1, 2])}}

@@ -1,9 +1,9 @@
-"""The folder of a history: file names, and functions to read, write and repair the files. Needs only numpy.
+"""A history's folder: file names, and functions to read, write and repair the files. Requires only NumPy.
 
 ``fixed.npz``, written once, contains the data that all frames share; ``frame_<index>.npz`` contains a committed frame.
 Every file is written under a temporary name, synced and renamed. A file with its final name is therefore complete, and
-the directory listing is the only index. ``fixed.npz`` and the first frame, which everything needs, have copies that are
-read if the original is damaged or missing.
+the directory listing is the only index. All frames depend on ``fixed.npz`` and the first frame, so these files have
+copies that are read if the original is damaged or missing.
 
 ``born_<index>.npz`` contains the Gaussians born in a frame. It also has a copy, because all later frames need it. It is
 written before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks
@@ -43,8 +43,8 @@ class FrameFiles:
 
     Attributes:
         chunks: compact files that contain older frames.
-        faults: names of files that could not be read, with the reason; cleared when reported. A frame in a chunk is
-            listed under the name that its own file would have.
+        faults: maps the name of each file that could not be read to the reason; cleared when reported. A frame in a
+            chunk is listed under the name that its own file would have.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -84,7 +84,7 @@ class FrameFiles:
         return dict(sorted(stamps.items()))
 
     def stamps_of(self, indices: Iterable[int]) -> dict[int, Stamp]:
-        """Returns the stamps of the given frames, as far as they exist, without listing the directory."""
+        """Returns the stamps of the given frames that exist, without listing the directory."""
         stamps: dict[int, Stamp] = {}
         absent: list[int] = []
         for index in sorted(indices):
@@ -131,24 +131,24 @@ class FrameFiles:
             stamp: stamp of the frame, if known, which avoids reading the file if the frame is in a chunk.
 
         Raises:
-            FileNotFoundError: the frame does not exist.
-            UnreadableFrameError: its file is damaged.
+            FileNotFoundError: if the frame does not exist.
+            UnreadableFrameError: if its file is damaged.
         """
         if stamp is not None and stamp[1] < 0 and (known := self.chunks.time(index)) is not None:
             return known
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Reads arrays of a frame from its file, or else from its chunk or, for the first frame, from the copy.
+        """Reads arrays of a frame from its file, otherwise from its chunk or, for the first frame, from the copy.
 
         Args:
             index: index of the frame.
             names: names of the arrays.
-            optional: names of further arrays to read if present.
+            optional: names of additional arrays to read if present.
 
         Raises:
-            FileNotFoundError: the frame does not exist.
-            UnreadableFrameError: its file is damaged.
+            FileNotFoundError: if the frame does not exist.
+            UnreadableFrameError: if its file is damaged.
         """
         try:
             return _read(self.path(index), names, optional)
@@ -173,16 +173,16 @@ class FrameFiles:
             raise UnreadableFrameError(str(error)) from error
 
     def fault(self, index: int) -> str | None:
-        """Verifies everything stored for a frame; returns the problem, or None if it is intact."""
+        """Verifies everything stored for a frame, and returns the problem, or None if the frame is intact."""
         if not self.path(index).exists() and index in self.chunks:
             return self.chunks.fault(index)
         return fault_of(self.path(index))
 
     def require_format(self) -> None:
-        """Checks the format of the folder, if a file that states it can be read.
+        """Checks the format of the folder, if a file that specifies it can be read.
 
         Raises:
-            OtherFormatError: the format is not ``FORMAT``.
+            OtherFormatError: if the format is not ``FORMAT``.
         """
         try:
             known = self._either(self.fixed, self.fixed_copy, (), (_FORMAT,))
@@ -190,13 +190,13 @@ class FrameFiles:
             return
         written = int(known[_FORMAT]) if _FORMAT in known else None
         if written != FORMAT:
-            raise other_format(f"{self.directory.name}, a folder of states,", written, FORMAT)
+            raise other_format(f"state folder {self.directory.name}", written, FORMAT)
 
     def read_fixed(self, names: Sequence[str]) -> Arrays:
         """Reads arrays that all frames share.
 
         Raises:
-            UnreadableFrameError: the file and its copy are damaged or missing.
+            UnreadableFrameError: if the file and its copy are damaged or missing.
         """
         return self._either(self.fixed, self.fixed_copy, names)
 
@@ -209,7 +209,7 @@ class FrameFiles:
         """Reads the arrays of Gaussians born in a frame: the named ones, or all if ``names`` is None.
 
         Raises:
-            UnreadableFrameError: the file and its copy are damaged or missing.
+            UnreadableFrameError: if the file and its copy are damaged or missing.
         """
         return self._either(self.directory / born_file(index), self.directory / born_file(index, copy=True), names)
 
@@ -237,8 +237,8 @@ class FrameFiles:
             born: arrays of the births, keyed by frame.
 
         Returns:
-            The problem of each rewritten file, keyed by file name. The first frame is left unchanged if its copy is
-            damaged too.
+            The problem found in each rewritten file, keyed by file name. The first frame is left unchanged if its copy
+            is also damaged.
         """
         mended: dict[str, str] = {}
         needed = dict.fromkeys((self.fixed, self.fixed_copy), with_format(fixed))
@@ -311,7 +311,7 @@ def frame_file(index: int) -> str:
 
 
 def frame_of(name: str) -> int | None:
-    """Returns the index of a frame, given the name of its file; None for other files."""
+    """Returns the index of a frame, given the name of its file, or None for other files."""
     match = _FRAME_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
@@ -322,7 +322,7 @@ def born_file(index: int, copy: bool = False) -> str:
 
 
 def born_of(name: str) -> int | None:
-    """Returns the index of a frame, given the name of its birth file or the copy; None for other files."""
+    """Returns the index of a frame, given the name of its birth file or the copy, or None for other files."""
     match = _BORN_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
@@ -333,13 +333,13 @@ def checkpoint_file(index: int) -> str:
 
 
 def checkpoint_of(name: str) -> int | None:
-    """Returns the index of a frame, given the name of its checkpoint file; None for other files."""
+    """Returns the index of a frame, given the name of its checkpoint file, or None for other files."""
     match = _CHECKPOINT_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def fault_of(file: Path) -> str | None:
-    """Verifies a whole file; returns the problem, or None if it is intact."""
+    """Verifies a whole file, and returns the problem, or None if the file is intact."""
     try:
         verify(file)
     except (FileNotFoundError, ValueError) as error:

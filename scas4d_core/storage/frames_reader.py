@@ -1,4 +1,4 @@
-"""Reads the committed frames of a scene with their times, reports and event logs. Needs only numpy."""
+"""Reads the committed frames of a scene with their times, reports and event logs. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class FramesReader:
     """Committed frames, in the memory of this process or in a directory to which another process writes.
 
     Attributes:
-        damaged: frames whose file cannot be read, with the reason; they are not in ``indices``.
+        damaged: maps each frame whose file cannot be read to the reason; these frames are not in ``indices``.
     """
 
     def __init__(self, directory: Path | None = None) -> None:
@@ -60,8 +60,8 @@ class FramesReader:
             only: indices of the frames to read; if None, every file in the directory is checked.
 
         Raises:
-            HistoryError: there is no history, or the file that all frames need is damaged.
-            OtherFormatError: the folder, or a compact file in it, has an unsupported format.
+            HistoryError: if there is no history, or the file that all frames need is damaged.
+            OtherFormatError: if the folder, or a compact file in it, has an unsupported format.
         """
         files = FrameFiles(Path(directory))
         if not files.exists:
@@ -116,7 +116,7 @@ class FramesReader:
         return added, gone
 
     def older_than_newest(self, newest: int, after: int) -> list[int]:
-        """Returns the frames after ``after``, in increasing order, except the first and the ``newest`` newest ones."""
+        """Returns the frames after ``after``, in increasing order, except the first frame and the ``newest`` newest."""
         first = next(iter(self._times), -1)
         frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
         return list(frames)[::-1]
@@ -138,7 +138,7 @@ class FramesReader:
                 kept.pop(index, None)
 
     def pop_faults(self) -> dict[str, str]:
-        """Returns the files found damaged or missing since the last call, with the reason."""
+        """Returns the problem of each file found damaged or missing since the last call, keyed by file name."""
         if self._files is None:
             return {}
         faults, self._files.faults = self._files.faults, {}
@@ -167,7 +167,7 @@ class FramesReader:
 
     @property
     def files(self) -> FrameFiles | None:
-        """Files on disk, to repair them (``scas4d_core.recompute``); None for a history in memory."""
+        """Files on disk, to repair them (``scas4d_core.recompute``), or None for a history in memory."""
         return self._files
 
     def time(self, index: int) -> float:
@@ -176,10 +176,10 @@ class FramesReader:
         return self._times[index]
 
     def report(self, index: int) -> dict[str, Any]:
-        """Returns the report committed with a frame; empty if there was none.
+        """Returns the report committed with a frame, or an empty dict if there was none.
 
         Raises:
-            HistoryError: the frame was not committed, or its file is damaged.
+            HistoryError: if the frame was not committed, or its file is damaged.
         """
         self._require(index)
         text = self._texts.get(index)
@@ -189,24 +189,24 @@ class FramesReader:
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise HistoryError(f"{frame_file(index)}: its report is not valid JSON ({error})") from error
+            raise HistoryError(f"{frame_file(index)}: the report is not valid JSON ({error})") from error
         if index in self._frames and index not in self._scratch_reports:
             self._texts[index] = text
         return report
 
     @property
     def first_report(self) -> dict[str, Any]:
-        """Report of the first frame; empty if there is none or it cannot be read."""
+        """Report of the first frame, or an empty dict if it does not exist or cannot be read."""
         with suppress(HistoryError):
             return self.report(next(iter(self._times))) if self._times else {}
         return {}
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Background colour, RGB in 0…1, as estimated in frame 0; black if its report has none.
+        """Background colour, RGB in 0…1, as estimated in frame 0, or black if its report contains none.
 
         Raises:
-            HistoryError: the file of frame 0 and its copy are damaged.
+            HistoryError: if the file of frame 0 and its copy are damaged.
         """
         if self._background is None and self._times:
             given = self.report(next(iter(self._times))).get("background")
@@ -217,7 +217,7 @@ class FramesReader:
         return self._background or (0.0, 0.0, 0.0)
 
     def effects(self, index: int) -> dict[str, Arrays]:
-        """Returns the effect arrays of a committed frame that a cold start needs; empty if they cannot be read."""
+        """Returns the effect arrays of a committed frame for a cold start, or an empty dict if they are unreadable."""
         return unpack_effects(self._left(index))
 
     def _left(self, index: int) -> NDArray[np.uint8] | None:
@@ -271,7 +271,9 @@ class FramesReader:
             except UnreadableFrameError as error:
                 raise DamagedFrameError(str(error)) from error
         if known is None or (known["ids"][0], known["ids"][-1]) != (first, last):
-            raise DamagedFrameError(f"Gaussians {first} to {last}, born in frame {index}, do not match those on disk")
+            raise DamagedFrameError(
+                f"Gaussians {first} to {last}, which were born in frame {index}, do not match those on disk"
+            )
         return known
 
     def _require(self, index: int) -> None:

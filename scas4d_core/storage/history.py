@@ -1,4 +1,4 @@
-"""Stores the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Needs only numpy.
+"""Stores the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Requires only NumPy.
 
 On disk (``frame_files``), a history has one file with opacities and ids, written once, and one file per committed
 frame with its state, time and report. Frames with newborn Gaussians have a second file. Renaming a frame's file to its
@@ -55,7 +55,7 @@ class History(HistoryReader):
             in proportion to its size.
 
     Raises:
-        HistoryError: ``directory`` already contains states.
+        HistoryError: if ``directory`` already contains states.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> history = History()  # in memory; History("states") uses a folder
@@ -78,7 +78,9 @@ class History(HistoryReader):
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
             if self._files.list_stamps():
-                raise HistoryError(f"{self._files.directory.name} already contains a history; open it by History.load")
+                raise HistoryError(
+                    f"{self._files.directory.name} already contains a history; open it with History.load"
+                )
 
     @classmethod
     def open(cls, directory: Path | str) -> History:
@@ -119,21 +121,21 @@ class History(HistoryReader):
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:
-        """Commits the state of one frame with its report. A history in a directory has both on disk on return.
+        """Commits the state of one frame with its report. With a directory, both are on disk on return.
 
         Args:
-            index: frame index, greater than all previous ones.
+            index: frame index, greater than all previous indices.
             time: time of the frame in seconds.
             gaussians: state with the same ids and opacities as the previous frame. Additional rows are newborn
                 Gaussians without ids; their ids are assigned here. The arrays are copied.
-            report: report of JSON values (finite numbers, strings, lists, mappings).
-            parents: [B] row of each newborn Gaussian's parent; None if no newborn Gaussian has a parent.
-            roots: roots of all Gaussians (``births.extend_roots``); if None, newborn Gaussians are their own roots.
+            report: report as JSON values (finite numbers, strings, lists, mappings).
+            parents: [B] row of each newborn Gaussian's parent, or None if no newborn Gaussian has a parent.
+            roots: roots of all Gaussians (``births.extend_roots``), or None if newborn Gaussians are their own roots.
             effects: arrays that a cold start needs, keyed by effect and array name.
 
         Raises:
-            HistoryError: the index is not greater than the last one, Gaussians are missing, ids or opacities differ, or
-                the report is not valid JSON.
+            HistoryError: if the index is not greater than the last index, Gaussians are missing, ids or opacities
+                differ, or the report is not valid JSON.
         """
         if index <= self._newest():
             raise HistoryError(f"frame {index} is not after frame {self._newest()}; append frames in ascending order")
@@ -142,7 +144,7 @@ class History(HistoryReader):
             text = json.dumps(dict(report or {}), allow_nan=False)
         except (TypeError, ValueError) as error:
             raise HistoryError(
-                f"frame {index}: the report is not valid JSON ({error}); give finite numbers, strings, lists, mappings"
+                f"frame {index}: the report is not valid JSON ({error}); use finite numbers, strings, lists, mappings"
             ) from error
         self.record_seconds = perf_counter() - began
         arrays, before = gaussians.arrays(), self._events()
@@ -154,10 +156,12 @@ class History(HistoryReader):
                     f"frame {index}: {name} differ from those of the first frame; they are fixed within one history"
                 )
         if not (arrays["ids"][count:] == UNBORN).all():
-            raise HistoryError(f"frame {index}: new Gaussians have ids; use {UNBORN}, because the commit assigns ids")
+            raise HistoryError(f"frame {index}: new Gaussians must have id {UNBORN}, because the commit assigns ids")
         for name in PER_FRAME:
             if len(arrays[name]) != rows:
-                raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {rows}, one per Gaussian")
+                raise HistoryError(
+                    f"frame {index}: {name} has {len(arrays[name])} rows; expected {rows}, one per Gaussian"
+                )
         frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         births: dict[int, Arrays] = {}
         ids = fixed["ids"]
@@ -251,18 +255,18 @@ class History(HistoryReader):
         them.
 
         Args:
-            last: number of states to keep in addition to the first; no limit if None.
-            size_bytes: maximum total size of the frame files in bytes; no limit if None.
+            last: number of states to keep in addition to the first, or None for no limit.
+            size_bytes: maximum total size of the frame files in bytes, or None for no limit.
 
         Returns:
             The indices of the deleted frames, in increasing order.
 
         Raises:
-            HistoryError: a limit is below 1.
+            HistoryError: if a limit is below 1.
         """
         for name, rule in (("last", last), ("size_bytes", size_bytes)):
             if rule is not None and rule < 1:
-                raise HistoryError(f"{name} is {rule}; keep at least 1, or give None to keep all")
+                raise HistoryError(f"{name} must be at least 1, or None to keep all frames; got {rule}")
         if last is None and size_bytes is None:
             return []
         with_it = None if self._files is None else self._files.chunk_of
@@ -279,7 +283,7 @@ class History(HistoryReader):
         If there is no disk space, states stay in memory. The file is deleted with this history.
 
         Args:
-            folder: folder for the scratch file; the system's temporary folder if None.
+            folder: folder for the scratch file, or None for the system's temporary folder.
             keep_newest: number of newest states that stay in memory.
         """
         self._scratch = self._scratch or ScratchFile(folder)
@@ -311,7 +315,7 @@ class History(HistoryReader):
         """Rewrites damaged files that every frame needs, and damaged copies of these files.
 
         Returns:
-            The problem of each rewritten file, keyed by file name.
+            The problem found in each rewritten file, keyed by file name.
         """
         if self._files is None or not self._times or not self._fixed:
             return {}
@@ -349,16 +353,18 @@ class History(HistoryReader):
             index: index of a frame before the newest one.
             time: time of the frame in seconds.
             arrays: arrays of ``PER_FRAME``, and of ``WHOLES`` if any.
-            report: report of JSON values, as for ``append``.
-            effects: arrays that a cold start needs, as for ``append``.
+            report: report as JSON values; see ``append``.
+            effects: arrays that a cold start needs; see ``append``.
 
         Raises:
-            HistoryError: the frame is not before the newest one, or the number of Gaussians differs.
+            HistoryError: if the frame is not before the newest one, or the number of Gaussians differs.
         """
         assert self._files is not None
         log = self.log_at(index)
         if index >= self._newest() or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
-            raise HistoryError(f"frame {index} cannot be replaced: it is the newest, or its number of rows differs")
+            raise HistoryError(
+                f"frame {index} cannot be replaced: it is the newest frame, or the number of rows differs"
+            )
         frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         text = json.dumps(dict(report), allow_nan=False).encode()
         self._forget(index)

@@ -1,4 +1,4 @@
-"""Reads the committed states of a scene, Θ_0 … Θ_t, and the lifetimes of Gaussians. Needs only numpy."""
+"""Reads the committed states of a scene, Θ_0 … Θ_t, and the lifetimes of Gaussians. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class HistoryReader(FramesReader):
     """Reads committed states from the memory of this process, or from a directory to which another process writes.
 
     Attributes:
-        damaged: frames whose file cannot be read, with the reason; they are not in ``indices``.
+        damaged: maps each frame whose file cannot be read to the reason; these frames are not in ``indices``.
     """
 
     @property
@@ -46,7 +46,7 @@ class HistoryReader(FramesReader):
         """Returns the state of a committed frame. The arrays belong to the history and must not be modified.
 
         Raises:
-            HistoryError: the frame was not committed, or its file is damaged.
+            HistoryError: if the frame was not committed, or its file is damaged.
         """
         self._require(index)
         frame = self._frames.get(index)
@@ -60,22 +60,22 @@ class HistoryReader(FramesReader):
             return Gaussians(**frame, **self._fixed)
         fixed = self._fixed_after(births_in(log))
         if len(frame["means"]) != len(fixed["ids"]):
-            raise DamagedFrameError(f"frame {index}: {len(frame['means'])} Gaussians, expected {len(fixed['ids'])}")
+            raise DamagedFrameError(f"frame {index}: expected {len(fixed['ids'])} Gaussians, got {len(frame['means'])}")
         return Gaussians(**frame, **fixed, retired=retired_after(log, fixed["ids"]))
 
     @property
     def first(self) -> Gaussians:
-        """State of the first frame; raises like ``gaussians``."""
+        """State of the first frame; raises the same errors as ``gaussians``."""
         return self.gaussians(self.indices[0])
 
     def roots(self, index: int | None = None) -> Gaussians:
-        """Returns the first frame with all later Gaussians, at their positions in it (``births.extend_roots``).
+        """Returns the first frame with all later Gaussians at their frame-0 positions (``births.extend_roots``).
 
         Args:
-            index: frame up to which births and retirements are included; None for the newest.
+            index: frame up to which births and retirements are included, or None for the newest.
 
         Raises:
-            HistoryError: the first frame or a birth cannot be read.
+            HistoryError: if the first frame or a birth cannot be read.
         """
         log = self._events() if index is None else self.log_at(index)
         if not len(log):
@@ -91,8 +91,8 @@ class HistoryReader(FramesReader):
     def complete_state(self, index: int, state: Gaussians) -> Gaussians:
         """Completes a recomputed state of a frame with the Gaussians that were born or revived in it.
 
-        Newborn Gaussians are read from their birth file. Revived ones are not stored separately, so they are taken from
-        the next readable frame.
+        Newborn Gaussians are read from their birth file. Revived Gaussians are not stored separately, so they are taken
+        from the next readable frame.
         """
         log = self.log_at(index)
         for birth in births_in(log):
@@ -154,7 +154,7 @@ class HistoryReader(FramesReader):
         """Returns whether the Gaussian in each row [count] is present in a committed frame: born and not retired.
 
         Raises:
-            HistoryError: the frame was not committed.
+            HistoryError: if the frame was not committed.
         """
         self._require(index)
         log, ids = self.log_at(index), self.ids
@@ -166,14 +166,14 @@ class HistoryReader(FramesReader):
         """Returns the row of each id [Q].
 
         Raises:
-            InputError: an id is unknown.
+            InputError: if an id is unknown.
         """
         wanted, rows = np.asarray(ids, np.int64).reshape(-1), self.rows_of(ids)
         unknown = wanted[rows < 0]
         if len(unknown):
             raise InputError(
-                f"ids {unknown[:5].tolist()} do not exist in this scene",
-                f"use ids of its {self.count} Gaussians, such as those in a response",
+                f"unknown Gaussian ids {unknown[:5].tolist()}",
+                f"use ids of the scene's {self.count} Gaussians, such as those in a response",
             )
         return rows
 
@@ -181,7 +181,7 @@ class HistoryReader(FramesReader):
         """Returns the lifetimes of the Gaussians with the given ids: frames of birth, retirement and revival.
 
         Raises:
-            InputError: an id is unknown.
+            InputError: if an id is unknown.
         """
         wanted = self.ids[self.known_rows(ids)].tolist()
         return lives_of(self._events(), wanted, next(iter(self._times), -1))
@@ -196,17 +196,17 @@ class HistoryReader(FramesReader):
 
         Args:
             name: name of the array, one of ``PER_FRAME``.
-            indices: indices of committed frames, in the order of the result; may repeat. All frames if None.
+            indices: indices of committed frames in the order of the result, which may repeat, or None for all frames.
             rows: rows of Gaussians, of any shape; the result is then [T, *rows.shape, ...].
 
         Raises:
-            HistoryError: ``name`` is not in ``PER_FRAME``, or a frame was not committed.
+            HistoryError: if ``name`` is not in ``PER_FRAME``, or a frame was not committed.
         """
         if name not in PER_FRAME:
             raise HistoryError(f"{name!r} is not stored per frame; use one of {', '.join(PER_FRAME)}")
         chosen = self.indices if indices is None else list(indices)
         if not chosen:
-            raise HistoryError("indices is empty; give at least one committed frame")
+            raise HistoryError("indices is empty; pass at least one committed frame")
         result: NDArray[Any] | None = None
         for row, index in enumerate(chosen):
             self._require(index)

@@ -1,4 +1,4 @@
-"""Writes npz files atomically with a checksum per array, and reads them with verification. Needs only numpy.
+"""Writes npz files atomically with a checksum per array, and reads them with verification. Requires only NumPy.
 
 The zip comment contains a 128-bit BLAKE2b digest of the dtype, shape and values of every array. The CRC-32 of the zip
 does not suffice: a flipped bit in an array header can make numpy read too few bytes, and then the CRC is never checked.
@@ -53,7 +53,7 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 @contextmanager
 def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
-    """Opens the temporary file ``beside``; on success, syncs it and renames it to ``path``, else deletes it."""
+    """Opens the temporary file ``beside``; on success, syncs it and renames it to ``path``, otherwise deletes it."""
     try:
         with beside.open("wb") as file:
             yield file
@@ -85,7 +85,9 @@ def _comment(checksums: Mapping[str, str]) -> bytes:
         comment = json.dumps({"blake2b": short}, separators=(",", ":")).encode()
         if len(comment) <= zipfile.ZIP_MAX_COMMENT:
             return comment
-    raise ValueError(f"{len(checksums)} arrays are too many for one file: their checksums do not fit in its comment")
+    raise ValueError(
+        f"too many arrays for one file: the checksums of {len(checksums)} arrays do not fit into the zip comment"
+    )
 
 
 def _digest(array: NDArray[Any]) -> str:
@@ -135,13 +137,13 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
 
     Args:
         path: path of the file.
-        names: names of the arrays; all if None.
-        optional: names of further arrays to read if present.
+        names: names of the arrays, or None for all.
+        optional: names of additional arrays to read if present.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or an array is missing; the message gives the file name, without its folder,
-            and the reason.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is damaged, or an array is missing; the message contains the file name, without its
+            folder, and the reason.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -150,7 +152,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
     ...     shortened = file.write_bytes(file.read_bytes()[:-40])
     ...     read_npz(file)
     Traceback (most recent call last):
-    ValueError: a.npz is damaged or not an npz file (...)
+    ValueError: a.npz is damaged or is not an npz file (...)
     """
     try:
         # Opened here because numpy does not close damaged files.
@@ -160,7 +162,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
             arrays = {name: np.asarray(file[member(name)]) for name in wanted}
             for name, array in arrays.items():
                 if not _checksum_matches(checksums[name], _digest(array)):
-                    raise ValueError(f"{name} fails its checksum")
+                    raise ValueError(f"checksum mismatch in {name}")
             return arrays
     except FileNotFoundError:
         raise
@@ -172,8 +174,8 @@ def iter_verified(path: Path) -> Iterator[int]:
     """Verifies a whole npz piece by piece and yields the size of each piece in bytes.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, see ``read_npz``.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is damaged; see ``read_npz``.
     """
     try:
         with path.open("rb") as opened, zipfile.ZipFile(opened) as archive:
@@ -183,7 +185,7 @@ def iter_verified(path: Path) -> Iterator[int]:
                     digest = yield from _streamed(file)
                 name = member.filename.removesuffix(".npy")
                 if not _checksum_matches(checksums[name], digest):
-                    raise ValueError(f"{name} fails its checksum")
+                    raise ValueError(f"checksum mismatch in {name}")
     except FileNotFoundError:
         raise
     except DAMAGE as error:
@@ -191,7 +193,7 @@ def iter_verified(path: Path) -> Iterator[int]:
 
 
 def verify(path: Path) -> None:
-    """Verifies a whole npz; raises like ``iter_verified``."""
+    """Verifies a whole npz; raises the same errors as ``iter_verified``."""
     for _ in iter_verified(path):
         pass
 
@@ -213,10 +215,10 @@ def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
 
 
 def _damage(path: Path, error: BaseException) -> ValueError:
-    return ValueError(f"{path.name} is damaged or not an npz file ({type(error).__name__}: {message_of(error)})")
+    return ValueError(f"{path.name} is damaged or is not an npz file ({type(error).__name__}: {message_of(error)})")
 
 
 def clear_parts(folder: Path) -> None:
-    """Removes temporary files of interrupted ``write_npz`` calls; only the process that writes to it may call this."""
+    """Removes temporary files of interrupted ``write_npz`` calls. Only the process that writes to it may call this."""
     for part in folder.glob(".*.npz.*.part"):
         part.unlink(missing_ok=True)

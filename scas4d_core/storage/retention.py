@@ -1,11 +1,11 @@
-"""Selection of the states that retention deletes: the oldest ones; the states of a chunk are deleted together."""
+"""Selects the states that retention deletes, oldest first; the states of a chunk are deleted together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
 GoWith = Callable[[int], list[int]]
-"""Returns a frame and all frames that must be deleted together with it; some may already have been deleted."""
+"""Function that returns a frame and all frames to delete together with it; some may already have been deleted."""
 
 
 def surplus(
@@ -22,10 +22,10 @@ def surplus(
         indices: indices of all states, in increasing order.
         size_of: function that returns the size of a state in bytes.
         newest: number of newest states that are always kept.
-        last: number of states to keep in addition to the first; all if None. A chunk is deleted once it contains none
-            of them.
-        size_bytes: maximum total size in bytes, enforced by deleting whole chunks; no limit if None.
-        go_with: function that returns the states to delete together; if None, each state is deleted separately.
+        last: number of states to keep in addition to the first, or None to keep all. A chunk is deleted once it
+            contains none of these states.
+        size_bytes: maximum total size in bytes, enforced by deleting whole chunks, or None for no limit.
+        go_with: function that returns the states to delete together, or None to delete each state separately.
 
     >>> ten = lambda index: 10
     >>> surplus(range(8), ten, 2, None, 61)

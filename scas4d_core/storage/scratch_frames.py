@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 ROUNDED = 512
 """Block sizes are multiples of this number of bytes."""
 IN_MEMORY = 16
-"""Number of newest states that a history without a directory keeps in memory; older ones go to a scratch file."""
+"""Number of newest states that a history without a directory keeps in memory; older states go to a scratch file."""
 
 
 class ScratchFile:
     """Unnamed temporary file that is removed even if the process crashes. It is neither synced nor checksummed.
 
     Args:
-        within: folder in which the file is created on first use; the system's temporary folder if None.
+        within: folder in which the file is created on first use, or None for the system's temporary folder.
     """
 
     def __init__(self, within: Path | None) -> None:
@@ -36,7 +36,7 @@ class ScratchFile:
         self._one_at_a_time = Lock()
 
     def store(self, frame: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
-        """Moves the arrays of a frame to the file; returns them unchanged once the disk is full."""
+        """Moves the arrays of a frame to the file, or returns them unchanged if the disk is full."""
         if isinstance(frame, ScratchFrame) or self._full:
             return frame
         try:
@@ -49,7 +49,7 @@ class ScratchFile:
         """Adds an array to the file and returns its offset.
 
         Raises:
-            OSError: the file cannot be written, for example because the disk is full.
+            OSError: if the file cannot be written, for example because the disk is full.
         """
         with self._one_at_a_time:
             if self._file is None:
@@ -77,7 +77,7 @@ class ScratchFile:
         while left:
             count = os.preadv(self._file.fileno(), [left], at)
             if count == 0:
-                raise OSError(f"the scratch file ends at byte {at}")
+                raise OSError(f"unexpected end of the scratch file at byte {at}")
             left, at = left[count:], at + count
         return array
 

@@ -33,7 +33,7 @@ class Hierarchy:
         rows: [M] int64 row of each moving Gaussian in Θ, in an order that makes clusters contiguous.
         labels: for each layer, coarse to fine, the [M] int32 cluster index of each entry of ``rows``, ascending.
         starts: for each layer, the [K + 1] int64 boundaries of the clusters in ``rows``.
-        left_out: number of moving Gaussians that are in no cluster because their positions are not finite.
+        left_out: number of moving Gaussians that belong to no cluster because they have non-finite positions.
     """
 
     rows: Int
@@ -65,7 +65,7 @@ def build_hierarchy(
         seed: random seed of K-means.
 
     Raises:
-        ValueError: the numbers of clusters are not ascending.
+        ValueError: if the numbers of clusters are not ascending.
 
     >>> points = np.array([[0, 0, 0], [5, 0, 0], [0.1, 0, 0], [5.1, 0, 0], [9, 9, 9]])
     >>> moving = np.array([True, True, True, True, False])
@@ -76,7 +76,7 @@ def build_hierarchy(
     [[0, 2], [1, 3]]
     """
     if any(a >= b for a, b in pairwise(clusters)):
-        raise ValueError(f"clusters {clusters} must ascend from the coarsest layer to the finest")
+        raise ValueError(f"clusters must ascend from the coarsest to the finest layer; got {clusters}")
     finite = np.isfinite(means).all(axis=1)
     rows = np.flatnonzero(moving & finite)
     left_out = int(np.count_nonzero(moving & ~finite))
@@ -125,8 +125,8 @@ def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
     """Merges clusters into ``count`` larger ones, and returns the new labels [M].
 
     Agglomerative clustering of the centroids (as in the paper) initializes K-means over the clusters. K-means assigns
-    clusters at a border to the nearer parent, and keeps the layers nested. Without it, clusters that were merged early
-    would stay together even if they no longer belong together.
+    clusters at a border to the nearer parent, and keeps the layers nested. Without K-means, clusters that were merged
+    early would stay together even if they no longer belong together.
     """
     from sklearn.cluster import AgglomerativeClustering, KMeans
 

@@ -7,7 +7,7 @@ uses ``warm_start`` (start from the previous motion) and ``best_state`` (the bet
 how effects take part: values of the plan, and parts that act before and after the iterations. ``robust`` decides which
 images and which results are accepted.
 
-The objects that one update passes through, from ``Reconstruction.step`` to the commit:
+The objects that are involved in one update, from ``Reconstruction.step`` to the commit:
 
 1. ``engines.views.TrainingView``: one camera's image of the frame, created by ``view_factory``.
 2. ``checkpoint.CarryOver``: the data that the previous update passes on in addition to Θ_{t−1}; at the end, the data of

@@ -24,7 +24,7 @@ from scas4d_core.update.warm_start import Motion, warm_start
 VIEWS = 4
 """Number of probe views per frame."""
 SCALE = 0.5
-"""Scale of the images of probe views: a quarter of the pixels is sufficient for comparing states."""
+"""Scale of probe-view images; a quarter of the pixels is sufficient for comparing states."""
 FEWEST = 80
 """Minimum side of the scaled images, in pixels; if they are smaller, full-size images are compared. With 32, the
 extrapolated motion was preferred for ten consecutive frames while all cameras lost 1.2 dB.
@@ -41,7 +41,7 @@ def spread_cameras(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[s
 
 
 def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
-    """Returns the mean error over the named views that have one; NaN if there are none."""
+    """Returns the mean error over the named views that have an error, or NaN if there are none."""
     values = [errors[name] for name in names if name in errors]
     return float(np.mean(values)) if values else nan
 
@@ -79,7 +79,7 @@ class ProbeViews:
     Args:
         factory: factory of the rig's training views.
         engine: engine that computes the errors.
-        views: views of the frame, from which ``spread_cameras`` selects; if empty, nothing is compared.
+        views: views of the frame, from which ``spread_cameras`` selects the probe views; if empty, nothing is compared.
 
     Attributes:
         views: the probe views at full size, then the scaled ones if they are used.
@@ -101,7 +101,7 @@ class ProbeViews:
         """Returns the image loss of a state in each probe view, keyed by camera name.
 
         Args:
-            moved, learnt: select the state, see ``UpdateEngine.probe``.
+            moved, learnt: select the state; see ``UpdateEngine.probe``.
         """
         if not self._looked and self._names:  # the first evaluated state is that of the previous frame
             self._looked = True
@@ -121,7 +121,7 @@ class ProbeViews:
 
 
 def is_slow_motion(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
-    """Returns true if Θ_{t−1} fits a frame nearly as well as the kept state (``SLOW``).
+    """Returns whether Θ_{t−1} fits a frame nearly as well as the kept state (``SLOW``).
 
     Args:
         errors: error of each candidate in each probe view.
@@ -138,7 +138,7 @@ def committed_errors(rig: Rig, renderer: Renderer, views: Sequence[TrainingView]
     """Returns the image loss of a committed state in a few full-size probe views, under separate names.
 
     Args:
-        rig: rig as calibrated, without pose drift.
+        rig: calibrated rig, without pose drift.
         renderer: renderer that computes the image loss.
         views: views of the frame.
         state: the committed state.
@@ -156,7 +156,7 @@ class BestState:
         hierarchy: hierarchy of the moving Gaussians.
         motion: motion of the previous update, or None.
         seconds: time since that motion was measured, in seconds.
-        momentum: share of the motion of individual Gaussians that is extrapolated, see ``warm_start``.
+        momentum: share of the motion of individual Gaussians that is extrapolated; see ``warm_start``.
 
     Attributes:
         errors: error of each candidate in each probe view.
@@ -179,11 +179,11 @@ class BestState:
 
     @property
     def whole(self) -> bool:
-        """True if full-size images were compared."""
+        """Whether full-size images were compared."""
         return self._probes.whole
 
     def start(self, step: float | None = None) -> Tables:
-        """Sets the previous motion, or no motion if that fits the frame better, as the start in the engine.
+        """Starts the engine from the previous motion, or from no motion if that fits the frame better.
 
         Args:
             step: time since the previous frame in seconds, if that frame was skipped and the motion may have paused. If
@@ -212,11 +212,12 @@ class BestState:
         return tables
 
     def can_skip(self, skip_below: Mapping[str, float] | None, confirm_skip: Callable[[], bool] | None = None) -> bool:
-        """Returns true if Θ_{t−1} fits this frame within ``skip_below`` and ``confirm_skip`` agrees.
+        """Returns whether Θ_{t−1} fits this frame within ``skip_below`` and ``confirm_skip`` agrees.
 
         Args:
             skip_below: maximum error of each view, named as by ``label_by_size``. If None, the result is false.
-            confirm_skip: function that confirms the skip, called only if the errors allow it; None for no confirmation.
+            confirm_skip: function that confirms the skip, called only if the errors allow it, or None for no
+                confirmation.
         """
         still = self.errors.get(Candidate.PREVIOUS)
         if (
@@ -309,7 +310,7 @@ class BestState:
 
 
 def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
-    """Returns true if the mean error of the views with a limit is at most the mean limit; false without such views.
+    """Returns whether the mean error of the views with a limit is at most the mean limit; false without such views.
 
     >>> mean_is_within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), mean_is_within({"a": 1.0}, {"b": 2.0})
     (True, False)

@@ -29,7 +29,7 @@ from scas4d_core.update.warm_start import Motion, predicted
 Array = NDArray[np.float32]
 
 SMOOTH_GLOSS_EVERY = 10
-"""Iterations between two smoothing passes of the gloss changes over neighbours."""
+"""Number of iterations between two passes that smooth gloss changes over neighbours."""
 GLOSS_END = 0.1
 """Fraction to which the gloss learning rates decay by the end of an update."""
 
@@ -40,7 +40,7 @@ class FrameUpdate:
     Args:
         engine: engine that computes the updates; it is bound to the plan here.
         built: plan and parts of the active effects.
-        neighbours: neighbours of the moving Gaussians; None if no term needs them.
+        neighbours: neighbours of the moving Gaussians, or None if no term needs them.
 
     Attributes:
         settings: settings of the updates.

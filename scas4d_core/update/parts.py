@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 Arrays = dict[str, NDArray[Any]]
 NOTHING: Mapping[str, Arrays] = MappingProxyType({})
-"""No arrays of any effect."""
+"""Empty mapping, without arrays of any effect."""
 
 P = TypeVar("P", bound="UpdatePart")
 
@@ -48,9 +48,9 @@ class Attempt:
         views: training views that the attempt uses.
         rates: learning rates of this attempt.
         tables: initial deformation; a part may change it in ``begin``.
-        carried: arrays from the previous frame, keyed by effect name; in ``end``, parts replace them with those for the
-            next frame.
-        gains: [cameras, 3] initial camera gains; None if gains are not estimated.
+        carried: arrays from the previous frame, keyed by effect name; in ``end``, parts replace them with the arrays
+            for the next frame.
+        gains: [cameras, 3] initial camera gains, or None if gains are not estimated.
         kept: candidate that becomes Θ_t; valid in ``end``.
     """
 

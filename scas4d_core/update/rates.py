@@ -31,22 +31,23 @@ LAYER_ENDS = (0.5, 0.75, 1.0)
 """Share of the iterations after which a layer is frozen, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 gave similar results
 (docs/tried.md)."""
 FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
-"""The same for the first update, which runs in several view orders: motion that one order misses by then is found by
-another. These values gained 0.0 to 0.5 dB (docs/tried.md)."""
+"""Same as ``LAYER_ENDS``, but for the first update, which runs in several view orders: motion that one order misses by
+then is found by another. These values gained 0.0 to 0.5 dB (docs/tried.md)."""
 NEAR_FINEST = 4.0
 """Factor on the rates of the finest layer if the layers above it are frozen early."""
 NEAR_OWN = 2.0
-"""The same for the Gaussians' own displacements, which account for the remaining motion. Their rotations and scales
-keep their rates: with faster ones, synthetic scenes fit less well (docs/tried.md)."""
+"""Same as ``NEAR_FINEST``, but for the Gaussians' own displacements, which account for the remaining motion. Their
+rotations and scales keep their rates, because synthetic scenes fit less well with higher rates (docs/tried.md)."""
 LEAST_TIME = 0.3
 """Minimum share of the iterations for a layer before it is frozen."""
 NEAR = 0.6
 """Maximum unexplained share of the change for early freezing of layers. With every second frame left out, the share was
-about 0.55 to 1.2, and unconditional freezing cost 0.6 to 3.4 dB (docs/tried.md)."""
+about 0.55 to 1.2, and unconditional freezing cost 0.6 to 3.5 dB (docs/tried.md)."""
 
 
 FASTER_IN_CHANGING_LIGHT = 2.0
-"""Factor on the rate of static colours while the lighting changes: 0.1 to 0.2 dB for a lamp that crosses a room."""
+"""Factor on the rate of static colours while the lighting changes; gains 0.1 to 0.2 dB for a lamp that crosses a
+room."""
 
 
 def first_iteration(start: float, iterations: int) -> int:
@@ -99,7 +100,7 @@ class Rates:
     start: float = 0.0
 
     def factor(self, iteration: int, iterations: int, start: float = 0.0, rest: float = 1.0) -> float:
-        """Returns the factor on the rate of a parameter in an iteration; 0 while the parameter does not learn.
+        """Returns the factor on a parameter's rate in an iteration, which is 0 while the parameter is not learnt.
 
         A parameter learns for at least one iteration.
 
@@ -123,7 +124,7 @@ class Rates:
         return self.layer_starts[layer] if layer < len(self.layer_starts) else 0.0
 
     def layer_end(self, layer: int) -> float:
-        """Returns the share of the iterations after which a layer is frozen; 1 if it learns to the end."""
+        """Returns the share of the iterations after which a layer is frozen, or 1 if it learns to the end."""
         return self.layer_ends[layer] if layer < len(self.layer_ends) else 1.0
 
     def frozen_layers(self, iteration: int, iterations: int) -> int:
@@ -191,8 +192,8 @@ class Rates:
 
         Args:
             factor: factor on all rates.
-            rigid: whether only cluster rotations and translations learn.
-            freeze_colours: whether colours do not learn.
+            rigid: whether only cluster rotations and translations are learnt.
+            freeze_colours: whether colours are frozen.
         """
         if (factor, rigid, freeze_colours) == (1.0, False, False):
             return self
@@ -209,7 +210,7 @@ class Rates:
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
-        """Returns the rates for a number of layers and the reach of the rig, ``radius``, in metres (``Rig.reach``)."""
+        """Returns the rates for ``layers`` layers and a rig whose reach is ``radius`` metres (``Rig.reach``)."""
         layer_starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(

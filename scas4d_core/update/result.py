@@ -19,14 +19,14 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Takes the first PSNR of each camera in dB, and returns the cameras to exclude, with a reason for each."""
+"""Function that takes the first PSNR of each camera in dB, and returns the reason for each camera to exclude."""
 
 
 class Stopwatch:
     """Measures the time of each stage; the overhead of the timers counts as ``REPORT``.
 
     Args:
-        began: ``perf_counter`` value at the start; None for now.
+        began: ``perf_counter`` value at the start, or None for the current time.
 
     Attributes:
         seconds: time spent in each stage, in seconds.
@@ -63,20 +63,21 @@ class AttemptOptions:
     Attributes:
         name: name of the attempt in the report.
         rates: factor on all Adam learning rates.
-        rigid: whether only cluster rotations and translations learn.
-        freeze_colours: whether colours do not learn.
+        rigid: whether only cluster rotations and translations are learnt.
+        freeze_colours: whether colours are frozen.
         cold: whether to ignore the previous motion.
         iteration_factor: factor on the number of iterations.
         several_orders: whether several view orders are tried and the best result is used.
         layer_rate_factor: factor on the layers' rates without a previous motion.
-        stopping: rule that decides the number of iterations; None for the number in the settings.
-        gate: function that selects cameras to exclude from their first PSNR in dB, called once all cameras have been
-            rendered. No cameras are excluded if None.
+        stopping: rule that decides the number of iterations, or None for the number in the settings.
+        gate: function that selects cameras to exclude based on their first PSNR in dB, called once all cameras have
+            been rendered, or None to exclude no cameras.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
-        skip_below: maximum image loss of Θ_{t−1} in each probe view for skipping the iterations; never skipped if None.
-        confirm_skip: function called before a skip, which returns true if full-size images confirm it. No confirmation
-            is needed if None.
-        reference_errors: errors at the end of previous updates, named as by ``best_state.label_by_size``; None if
+        skip_below: maximum image loss of Θ_{t−1} in each probe view for skipping the iterations, or None to never skip
+            them.
+        confirm_skip: function called before a skip, which returns whether full-size images confirm it, or None if no
+            confirmation is needed.
+        reference_errors: errors at the end of previous updates, named as by ``best_state.label_by_size``, or None if
             unknown.
         step: time since the previous frame in seconds, if nothing was learnt from that frame (``BestState.start``);
             otherwise None.
@@ -107,9 +108,8 @@ class CameraFit(TypedDict):
     """The fit of one camera when it was last rendered; a row of the report on disk.
 
     Keys:
-        psnr: PSNR in dB.
-        colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1; None if not measured.
-        health: 1 if the camera fits as usual relative to the other cameras, 0 at the exclusion limit
+        psnr: PSNR in dB. colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1, or None if not
+        measured. health: 1 if the camera fits as usual relative to the other cameras, 0 at the exclusion limit
             (``outliers.health``).
     """
 
@@ -119,7 +119,7 @@ class CameraFit(TypedDict):
 
 
 def camera_fit(psnr: float, colour_shift: tuple[float, float, float] | None = None) -> CameraFit:
-    """Returns the fit of a camera without a usual level to compare with."""
+    """Returns the fit of a camera that has no usual level for comparison."""
     return {"psnr": psnr, "colour_shift": colour_shift, "health": 1.0}
 
 
@@ -191,8 +191,8 @@ class UpdateResult:
 
     Attributes:
         gaussians: new state Θ_t.
-        motion: motion for the next warm start; None for a cold start.
-        trace: trace of the attempt; for a rejected frame, that of the last attempt before any search.
+        motion: motion for the next warm start, or None for a cold start.
+        trace: trace of the attempt; for a rejected frame, the trace of the last attempt before any search.
         frozen: number of Gaussians that keep their previous state.
         bounded: number of axes clamped to their minimum or maximum length.
         outcome: outcome of the frame.

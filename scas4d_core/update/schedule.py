@@ -1,7 +1,7 @@
 """Schedule of an update, identical on every device: iterations, views, samples and weights.
 
-Layer starts and rate decay depend on the share of completed iterations (``rates``). The stopping rule therefore gives
-the total number of iterations before each iteration, and its decisions are recorded with the commit.
+Layer starts and rate decay depend on the share of completed iterations (``rates``). The stopping rule therefore
+determines the total number of iterations before each iteration, and its decisions are recorded with the commit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ IMAGE_WEIGHT = 1.0
 """Weight of the image loss, 0.8 L1 + 0.2 (1 − SSIM); other weights (``Weights``) are relative to it."""
 
 SOFT_COLOUR_WEIGHT = 0.01
-"""Weight of the mean absolute colour change (Dynamic3DGaussians; the paper does not give it)."""
+"""Weight of the mean absolute colour change (Dynamic3DGaussians; the paper does not specify it)."""
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
@@ -67,7 +67,7 @@ class ViewPlan:
 
 
 def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Returns disjoint random sets of ``NEIGHBOUR_SAMPLE`` of ``count`` Gaussians that cover all; one per iteration.
+    """Divides ``count`` Gaussians into disjoint random sets of ``NEIGHBOUR_SAMPLE``; one set is used per iteration.
 
     A remainder of less than a quarter of a set joins the previous set; otherwise a few Gaussians would get all the
     weight.
@@ -110,16 +110,16 @@ AFTER_S = 0.05
 
 
 class Stopping:
-    """Decides the length of an update: a number of iterations, a time limit, or an early stop without progress.
+    """Determines the length of an update by a number of iterations, a time limit, or an early stop without progress.
 
     Args:
         most: maximum number of iterations.
         end: ``clock`` time by which the last iteration must end, in seconds; at least one iteration is run. If None,
             ``most`` iterations are run.
-        iteration_seconds: time per iteration in previous updates, in seconds; None if unknown.
+        iteration_seconds: time per iteration in previous updates, in seconds, or None if unknown.
         gain: minimum relative decrease of the error on the probe views per ``LOOK_EVERY`` iterations; with less, the
-            update cools down and stops. Probe views are training views, never held-out ones. There is no early stop if
-            0.
+            update cools down and stops. Probe views are training views, never held-out ones. If 0, there is no early
+            stop.
         first: share of the iterations before which there is no early stop, so that late parameters have started.
         clock: function that returns the current time in seconds.
 
@@ -149,7 +149,7 @@ class Stopping:
         self._stop: int | None = None
 
     def planned(self, done: int) -> int:
-        """Returns the total number of iterations planned after ``done`` of them; the update ends when it is reached."""
+        """Returns the planned total number of iterations after ``done`` iterations; the update ends at this total."""
         total = self._total(done)
         if self._stop is not None:
             total = min(total, self._stop)
@@ -158,7 +158,7 @@ class Stopping:
         return total
 
     def needs_error(self, done: int) -> bool:
-        """Returns true if the error on the probe views is needed after ``done`` iterations."""
+        """Returns whether the error on the probe views is needed after ``done`` iterations."""
         return self._gain > 0 and self._stop is None and done % LOOK_EVERY == 0
 
     def record_error(self, done: int, error: float) -> None:
@@ -185,17 +185,17 @@ class Stopping:
 
 
 class TimeBudget:
-    """Time limit per frame of a scene; predicts the time needed after the iterations from previous frames.
+    """A scene's time limit per frame; predicts the time needed after the iterations, based on previous frames.
 
     Decoding happens before the iterations and is measured by the clock. The comparison and checks at the end, the
     checkpoint and the commit happen after the iterations, and their time is predicted.
 
     Attributes:
-        milliseconds: time limit per frame in milliseconds; no limit if None.
-        iteration_seconds: predicted time per iteration in seconds; None if unknown.
+        milliseconds: time limit per frame in milliseconds, or None for no limit.
+        iteration_seconds: predicted time per iteration in seconds, or None if unknown.
         after: predicted time from the last iteration to the end of the commit in seconds, without fits of added
             Gaussians.
-        births: whether the next frame reserves time for such fits, because the previous frame had some.
+        births: whether the next frame reserves time for such fits, because the previous frame had such fits.
     """
 
     def __init__(self, milliseconds: float | None) -> None:
@@ -205,12 +205,12 @@ class TimeBudget:
         self.births = False
 
     def end(self, began: float) -> float | None:
-        """Returns the time by which the last iteration must end, for a frame begun at ``began``; None for no limit."""
+        """Returns the time by which the last iteration of a frame begun at ``began`` must end, or None for no limit."""
         kept = FOR_BIRTHS * self.births * (self.milliseconds or 0.0) / 1000
         return None if (end := self.end_of_births(began)) is None else end - kept
 
     def end_of_births(self, began: float) -> float | None:
-        """Returns the time by which fits of added Gaussians must end; None for no limit."""
+        """Returns the time by which fits of added Gaussians must end, or None for no limit."""
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
     def record_birth_fits(self, spent: float, postponed: Sequence[str]) -> None:
@@ -222,7 +222,7 @@ class TimeBudget:
         """Records the time spent on a frame.
 
         Args:
-            moments: end of each iteration of the update, see ``UpdateTrace.iteration_ends``.
+            moments: end of each iteration of the update; see ``UpdateTrace.iteration_ends``.
             seconds: time spent in each stage of the update, in seconds.
             commit: time spent on checks and writing, in seconds.
         """

@@ -52,7 +52,7 @@ class ViewFactory:
 
         Args:
             frame: frame with images at the size of the rig's cameras.
-            exposures: [3, 2] gain and offset of each camera; 1 and 0 for missing cameras.
+            exposures: [3, 2] gain and offset of each camera; missing cameras get 1 and 0.
             use_masks: whether the views include masks.
 
         Raises:
@@ -64,16 +64,20 @@ class ViewFactory:
                 continue
             camera = CameraArrays.of(self.posed[name])
             image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
-            masked = mask is not None
-            target = np.empty((3 + masked, camera.height, camera.width), np.float32)
-            np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
-            if masked:
-                target[3] = mask
-            exposure = np.tile(np.array([1, 0], np.float32), (3 + masked, 1))
+            channels = 3 if mask is None else 4
+            levels = np.empty((channels, camera.height, camera.width), np.uint8)
+            levels[:3] = np.moveaxis(image, -1, 0)
+            target = np.empty(levels.shape, np.float32)
+            np.multiply(levels[:3], np.float32(1 / 255), out=target[:3])
+            if mask is not None:
+                target[3] = levels[3] = mask
+            exposure = np.tile(np.array([1, 0], np.float32), (channels, 1))
             exposure[:3] = exposures.get(name, exposure[:3])
-            views.append(TrainingView(name, camera, target, exposure))
+            views.append(TrainingView(name, camera, target, exposure, levels))
         if not views:
-            raise ValueError(f"frame {frame.index} has none of the rig's cameras ({', '.join(self.rig.names)})")
+            raise ValueError(
+                f"frame {frame.index} has no image of any of the rig's cameras ({', '.join(self.rig.names)})"
+            )
         return views
 
     def coarser(self, view: TrainingView, scale: float) -> TrainingView:

@@ -58,7 +58,7 @@ class Motion:
 
     @property
     def finite(self) -> bool:
-        """True if all values are finite; otherwise the motion cannot start an update."""
+        """Whether all values are finite; otherwise the motion cannot start an update."""
         return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.own_shifts, self.own_turns))
 
     def after(self, first: Motion) -> Motion:
@@ -137,7 +137,7 @@ def motion_between(
 
 
 def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_], count: int) -> Float:
-    """Returns the [count, C] mean of the chosen rows of each cluster; 0 for a cluster without chosen rows."""
+    """Returns the [count, C] mean of the chosen rows of each cluster, or 0 for a cluster without chosen rows."""
     own = labels[chosen]
     sums = np.stack([np.bincount(own, weights=column, minlength=count) for column in values[chosen].T], axis=1)
     means: Float = sums / np.maximum(np.bincount(own, minlength=count), 1)[:, None]
@@ -145,7 +145,7 @@ def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_
 
 
 def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
-    """Returns the motion without the parameters that are not free in the next update; None for no motion.
+    """Returns the motion without the parameters that are not free in the next update, or None for no motion.
 
     >>> motion = Motion([np.ones((1, 3))], [np.ones((1, 3))], np.ones((2, 3)), np.ones((2, 3)), 0.1)
     >>> predicted(motion, Freedom(cluster_rotation=True, prediction=True)).shifts
@@ -169,7 +169,7 @@ def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, mome
 
     Args:
         hierarchy: hierarchy of the moving Gaussians.
-        motion: motion of the previous update; None for no motion.
+        motion: motion of the previous update, or None for no motion.
         seconds: time since that motion was measured, in seconds.
         momentum: share of the individual motion of Gaussians, beyond that of the layers, from which Δp and ΔR start.
     """

@@ -1,6 +1,6 @@
 """Marker file of a service in its data folder.
 
-With the marker, a node verifies that it sees the shared folder and not a local folder at the same path.
+The marker lets a node verify that it sees the shared folder and not a local folder at the same path.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from server.storage.fencing import PART
 
 MARKER_NAME = ".service"
 VISIBLE_S = 10.0
-"""Seconds to wait for a new file to become visible, since NFS shows new files to other machines with a delay."""
+"""Maximum time in seconds for a new file to become visible; NFS shows new files to other machines with a delay."""
 
 
 def write_marker(data: Path, word: str) -> None:

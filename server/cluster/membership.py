@@ -20,15 +20,15 @@ from server.cluster.nodes import own_node_is_lost
 
 NAMESPACE = "scas4d"
 CONNECT_S = 5.0
-"""Seconds within which the head of the cluster must accept a connection."""
+"""Timeout in seconds for connecting to the head node."""
 SILENT_S = 3.0
-"""Seconds after which a head that does not respond is reported in the log."""
+"""Time in seconds after which an unresponsive head node is logged."""
 JOIN_S = 60.0
-"""Maximum seconds for an attempt to rejoin; without a node on this machine, it fails after about 10 s."""
+"""Timeout in seconds for an attempt to rejoin; without a node on this machine, the attempt fails after about 10 s."""
 LEAVE_S = 10.0
-"""Maximum seconds for leaving the cluster, since the head may not respond."""
+"""Timeout in seconds for leaving the cluster, since the head node may not respond."""
 CHECK_S = 2.0
-"""Seconds between checks of this machine's node, and between attempts to rejoin."""
+"""Interval in seconds between checks of this machine's node, and between attempts to rejoin."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -40,7 +40,7 @@ class Membership:
     lost each time its supervisor restarts it.
 
     Args:
-        address: address of the cluster's head; None selects the cluster on this machine or the one in RAY_ADDRESS.
+        address: address of the head node; None selects the cluster on this machine or the one in RAY_ADDRESS.
     """
 
     def __init__(self, address: str | None) -> None:
@@ -48,7 +48,7 @@ class Membership:
         self._silent = False
         self._said = ""
         self._thread = ThreadPoolExecutor(1, "membership")
-        """Dedicated thread for calls that may wait indefinitely for the head of the cluster."""
+        """Dedicated thread for calls to the head node that may block indefinitely."""
 
     def join(self) -> None:
         """Joins the cluster unless this process is already a member. Blocking.
@@ -70,7 +70,7 @@ class Membership:
                 if self._address is None:
                     raise _no_cluster_error("on this machine", error) from None
                 raise RuntimeError(
-                    f"the Ray cluster at {self._address} cannot be joined ({error}); start a node on this machine "
+                    f"cannot join the Ray cluster at {self._address} ({error}); start a Ray node on this machine "
                     "(`ray start --address`) and, if the cluster uses a token, set RAY_AUTH_MODE=token"
                 ) from None
 
@@ -86,11 +86,11 @@ class Membership:
         while True:
             await asyncio.sleep(CHECK_S)
             if await self._is_lost():
-                log.error("the Ray node of this machine and all scene processes are lost; rejoining the cluster")
+                log.error("lost this machine's Ray node and all scene processes; rejoining the cluster")
                 await _exit_on_failure(on_loss())
                 while not await self._is_done(self._rejoin_or_exit):
                     await asyncio.sleep(CHECK_S)
-                log.info("the service has rejoined the cluster")
+                log.info("rejoined the Ray cluster")
                 announced = False
             if not announced:  # the node may be lost again before `on_return` succeeds
                 announced = await self._is_done(on_return)
@@ -106,13 +106,13 @@ class Membership:
         try:
             leaving.result(LEAVE_S)
         except TimeoutError:
-            log.error("the service could not leave the Ray cluster within %g s; exiting anyway", LEAVE_S)
+            log.error("failed to leave the Ray cluster within %g s; exiting anyway", LEAVE_S)
             os._exit(1)
 
     async def _is_lost(self) -> bool:
-        """Asks the head whether this machine's node is lost.
+        """Asks the head node whether this machine's node is lost.
 
-        Also logs when the head stops responding and when it responds again.
+        Also logs when the head node stops responding and when it responds again.
         """
         answer = self._call(own_node_is_lost)
         done, _ = await asyncio.wait({answer}, timeout=SILENT_S)
@@ -120,22 +120,22 @@ class Membership:
             if not self._silent:
                 self._silent = True
                 log.warning(
-                    "the head of the Ray cluster does not respond: updates continue, but no process can be started; "
-                    "without Redis, Ray will end this process after a minute"
+                    "the Ray head node does not respond; updates continue, but no processes can be started; "
+                    "without Redis, Ray will terminate this process after a minute"
                 )
             await asyncio.wait({answer})  # at most one pending request
         if answer.exception() is not None:
             return False
         if self._silent:
             self._silent = False
-            log.info("the head of the Ray cluster responds again")
+            log.info("the Ray head node is responding again")
         return bool(answer.result())
 
     async def _rejoin_or_exit(self) -> None:
         """Rejoins the cluster; if Ray hangs, exits this process so that its supervisor restarts it."""
         joining = self._call(self._rejoin)
         if not (await asyncio.wait({joining}, timeout=JOIN_S))[0]:
-            log.critical("cannot rejoin the Ray cluster within %g s; exiting, restart the service", JOIN_S)
+            log.critical("failed to rejoin the Ray cluster within %g s; exiting (restart the service)", JOIN_S)
             os._exit(1)  # acknowledged frames are on disk, and a clean shutdown would wait for Ray
         joining.result()
 
@@ -149,10 +149,10 @@ class Membership:
     async def _is_done(self, call: Callable[[], Awaitable[None]]) -> bool:
         try:
             await call()
-        except Exception as error:  # whatever Ray raises, the service must not hang
+        except Exception as error:  # Ray may raise any exception, but the service must not hang
             if str(error) != self._said:
                 self._said = str(error)
-                log.warning("the service has not rejoined the cluster yet: %s", error)
+                log.warning("could not rejoin the Ray cluster yet; retrying: %s", error)
             return False
         self._said = ""
         return True
@@ -163,19 +163,19 @@ async def _exit_on_failure(losing: Awaitable[None]) -> None:
     try:
         await losing
     except Exception:
-        log.critical("cannot clean up after the loss of the cluster; exiting, restart the service", exc_info=True)
+        log.critical("cleanup after losing the Ray cluster failed; exiting (restart the service)", exc_info=True)
         os._exit(1)
 
 
 def _no_cluster_error(where: str, error: Exception) -> RuntimeError:
     return RuntimeError(
-        f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
+        f"no Ray cluster found {where} ({error}); start one with `ray start --head`, or specify its address with "
         "--placement ray=HOST:6379"
     )
 
 
 def _check_head(address: str) -> None:
-    """Checks that the head of the cluster accepts a connection.
+    """Checks that the head node accepts a connection.
 
     Raises:
         OSError: nothing accepts a connection at the address.

@@ -1,6 +1,6 @@
-"""Monitoring of the cluster's nodes.
+"""Monitors the nodes of the cluster.
 
-Ray is polled at a limited rate, and requests wait only briefly for the head of the cluster.
+Ray is polled at a limited rate, and requests wait only briefly for the head node.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any
 AllNodes = Sequence[Mapping[str, Any]]
 
 POLL_S = 2.0
-"""Minimum seconds between requests to the head."""
+"""Minimum interval in seconds between requests to the head node."""
 TIMEOUT_S = 2.0
-"""Maximum seconds to wait for the head before the previous answer is used."""
+"""Maximum time in seconds to wait for the head node before the previous answer is used."""
 LOST_KEPT_S = 900.0
-"""Seconds for which a lost node is reported, so that scrapers and operators do not miss it."""
+"""Time in seconds for which a lost node stays in reports, so that scrapers and operators do not miss it."""
 MOST_LOST = 16
 """Maximum number of lost nodes to report."""
 EXPECTED_REASON = (1, 4)
@@ -25,7 +25,7 @@ EXPECTED_REASON = (1, 4)
 
 
 class NodeWatch:
-    """Latest node list from the head of the cluster, and the recently lost nodes. For use on the event loop.
+    """Latest node list from the head node, and the recently lost nodes. For use on the event loop.
 
     Args:
         ask: requests the list of all current and former nodes, in Ray's format, from the head, and returns a future.
@@ -33,7 +33,7 @@ class NodeWatch:
 
     Attributes:
         nodes: node list in the latest answer.
-        head_responds: whether the head answered the latest request within `TIMEOUT_S`.
+        head_responds: whether the head node answered the latest request within `TIMEOUT_S`.
     """
 
     def __init__(self, ask: Callable[[], asyncio.Future[Any]], now: Callable[[], float] = time.monotonic) -> None:

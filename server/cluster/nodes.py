@@ -16,12 +16,12 @@ from server.cluster.resource_needs import ResourceNeeds
 RAY_LABEL_PREFIX = "ray.io/"
 """Prefix of the labels that Ray itself assigns to nodes."""
 CONNECT_S = 3.0
-"""Maximum seconds for a live node to accept a connection."""
+"""Timeout in seconds for connecting to a live node."""
 
 
 @dataclass(frozen=True)
 class PlacedProcess:
-    """Process that was requested, with its resource needs and its node.
+    """Requested process, with its resource needs and its node.
 
     Attributes:
         needs: resources reserved for the process.
@@ -48,10 +48,10 @@ def living_nodes() -> list[dict[str, Any]]:
 def is_lost(id: str) -> bool:
     """Returns whether a node is lost. Blocking.
 
-    A node is lost if it is dead, nothing listens at its address, or the head of the cluster does not respond. The
-    address is checked because the head takes several seconds to notice a dead node, whereas the loss of an actor is
-    noticed immediately. If this machine's own node is dead, every node counts as lost, because all actors of this
-    service are lost.
+    A node is lost if it is dead, nothing listens at its address, or the head node does not respond. The address is
+    checked because the head node takes several seconds to notice a dead node, whereas the loss of an actor is noticed
+    immediately. If this machine's own node is dead, every node counts as lost, because all actors of this service are
+    lost.
     """
     try:
         living = living_nodes()
@@ -62,7 +62,7 @@ def is_lost(id: str) -> bool:
 
 
 def own_node_is_lost() -> bool:
-    """Returns whether the head of the cluster reports this machine's node as dead. Blocking.
+    """Returns whether the head node reports this machine's node as dead. Blocking.
 
     Raises:
         Exception: any exception that Ray raises if its head does not respond.
@@ -71,7 +71,7 @@ def own_node_is_lost() -> bool:
 
 
 def own_node() -> str:
-    """Returns the id of the node on this machine through which this process joined the cluster."""
+    """Returns the id of the node that this process used to join the cluster."""
     return str(ray.get_runtime_context().get_node_id())
 
 
@@ -111,7 +111,7 @@ def describe_cluster(
         nodes: nodes in Ray's format.
         places: processes of this service with their nodes.
         lost: ids of recently lost nodes.
-        head_responds: whether the head of the cluster responds.
+        head_responds: whether the head node responds.
     """
     statuses = []
     for node in nodes:

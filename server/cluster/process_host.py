@@ -1,4 +1,4 @@
-"""Ray actor that hosts one process of a scene on the node that Ray has chosen.
+"""Ray actor that hosts one scene process on the node chosen by Ray.
 
 The process is a child of the actor. It therefore runs as it does without a cluster (signals, niceness, threads), and
 its exit code is available, which Ray does not report for actors. The process ends when its actor ends.
@@ -83,7 +83,7 @@ def _without_main_module() -> Iterator[None]:
 
 
 def _node_id() -> str:
-    """Returns the id of the node on which this actor runs."""
+    """Returns the id of the node that runs this actor."""
     import ray
 
     return str(ray.get_runtime_context().get_node_id())
@@ -94,7 +94,7 @@ class ProcessHost:
 
     Args:
         prepare: function that is called first in the process; see `Placement`.
-        data: data folder of the service, which must be visible on this node.
+        data: the service's data folder, which must be visible on this node.
         word: content of the service's marker file in that folder.
         priority: scheduling of the service's process; None keeps the scheduling of this process.
     """
@@ -115,7 +115,7 @@ class ProcessHost:
         """Starts the process if this node sees the data folder and can write to it."""
         node = _node_id()
         if not await asyncio.to_thread(has_marker, self._data, self._word):
-            fault = f"node {socket.gethostname()} does not see the data folder {self._data}; mount it there"
+            fault = f"node {socket.gethostname()} cannot see the data folder {self._data}; mount it on that node"
             return StartResult(node, fault=fault)
         if not os.access(self._data, os.R_OK | os.W_OK | os.X_OK):
             return StartResult(node, fault=f"node {socket.gethostname()} cannot write to the data folder {self._data}")

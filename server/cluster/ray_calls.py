@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 THREADS = 8
-"""Maximum number of calls that run or wait for the head of the cluster at the same time."""
+"""Maximum number of calls that run or wait for the head node at the same time."""
 
 T = TypeVar("T")
 

@@ -34,13 +34,13 @@ from server.processes.placement import STOP_SECONDS, Entry, Placement, ProcessEx
 from server.settings import ServerSettings
 
 WAIT_S = 3.0
-"""Seconds after which a worker without a node reports the resources for which it is waiting."""
+"""Time in seconds after which a worker without a node reports the resources that it needs."""
 LOST_S = 10.0
-"""Maximum seconds to wait for the head to report whether a node is lost."""
+"""Maximum time in seconds to wait for the head node to report whether a node is lost."""
 LOSE_S, CLOSE_S = 20.0, 3.0
-"""Maximum seconds to wait for pending Ray calls before leaving, after the loss of the cluster and at shutdown."""
+"""Maximum time in seconds to wait for pending Ray calls before leaving: after losing the cluster, and at shutdown."""
 STOPPED_S = 5.0
-"""Seconds within which an actor must report that its process has exited, in addition to those of the process."""
+"""Time in seconds for an actor to report the exit of its process, in addition to the time for the exit itself."""
 
 T = TypeVar("T")
 
@@ -52,8 +52,8 @@ class RayPlacement(Placement):
 
     Args:
         prepare: function that is called first in every process; see `Placement`.
-        address: address of the cluster's head; None selects the cluster on this machine or the one in RAY_ADDRESS.
-        server: settings of the service; its data folder must be visible on every node at the same path.
+        address: address of the head node; None selects the cluster on this machine or the one in RAY_ADDRESS.
+        server: service settings; the data folder must be visible on every node at the same path.
 
     Attributes:
         placed: processes that were requested and have not exited, keyed by the names of their actors.
@@ -117,7 +117,7 @@ class RayPlacement(Placement):
         for process in processes:
             await process.detach()
         if not await self._calls.wait(seconds):
-            log.warning("Ray has not responded within %g s; leaving the cluster anyway", seconds)
+            log.warning("Ray did not respond within %g s; leaving the cluster anyway", seconds)
         gc.collect()  # a later collection could release Ray objects while the service leaves
 
     async def _on_return(self) -> None:
@@ -141,7 +141,7 @@ class RayPlacement(Placement):
             self._announced = await self.call_ray(register_service, self._token, *self._listens)
 
     async def peers(self) -> Sequence[str]:
-        """Returns the addresses of the other services, or the last known addresses if the head does not respond.
+        """Returns the addresses of the other services, or the last known addresses if the head node does not respond.
 
         See `Placement`.
         """
@@ -176,7 +176,7 @@ class RayPlacement(Placement):
         return process
 
     def create_actor(self, name: str, needs: ResourceNeeds) -> Any:
-        """Creates the actor of a process. Blocking, since the head registers the actor's name."""
+        """Creates the actor of a process. Blocking, since the head node registers the actor's name."""
         made: Any = ray.remote(ProcessHost)
         return made.options(name=name, **needs.actor_options()).remote(
             self.prepare, self._server.data.resolve(), self._token, ProcessScheduling.current()
@@ -184,7 +184,7 @@ class RayPlacement(Placement):
 
 
 class RayProcess:
-    """Process of a scene on a node of the cluster, with which messages are exchanged through its actor.
+    """Scene process on a cluster node; messages are exchanged through its actor.
 
     For use on the event loop, which never waits for Ray.
     """
@@ -213,7 +213,7 @@ class RayProcess:
         self._actor: Any = None
         self._making: asyncio.Future[Any] = placement.call_ray(placement.create_actor, name, needs)
         self._answers: set[Any] = set()
-        """Results that are being awaited, or were when the cluster was lost."""
+        """Results that are being awaited, or were being awaited when the cluster was lost."""
         self._tasks: set[asyncio.Task[Any]] = set()
         self._task = self._start_task(self._run(*runs))
 
@@ -242,9 +242,9 @@ class RayProcess:
         await asyncio.wait({self._start_task(self._kill())}, timeout=STOPPED_S)  # continues after a timeout
 
     def mark_lost(self) -> None:
-        """Gives up the process because the cluster on which it was running is lost."""
+        """Gives up the process because its cluster is lost."""
         self._lost = True
-        self._give_up("the Ray node of the service's machine is lost", lost=True)
+        self._give_up("the service lost its Ray node", lost=True)
 
     async def detach(self) -> None:
         """Stops all calls to the actor, including its creation, and keeps its results alive."""
@@ -265,20 +265,20 @@ class RayProcess:
                     elif not self._over:
                         self._notify(message)
         except RayActorError as error:
-            log.warning("actor %s is lost: %s", self._name, error)
+            log.warning("lost actor %s: %s", self._name, error)
             if self._node is not None and await self._is_lost(self._node):
-                self._give_up(f"the node of its {role} is lost", lost=True)
+                self._give_up(f"the node of the {role} process was lost", lost=True)
             else:
-                self._give_up(f"the actor of its {role} ended: {_first_line(error)}")
+                self._give_up(f"the actor of the {role} process exited: {_first_line(error)}")
         except (RayError, _StartFailedError) as error:
-            log.warning("actor %s did not start: %s", self._name, error)
-            self._give_up(f"its {role} could not be started: {_first_line(error)}")
-        except Exception as error:  # whatever the error is, the scene must not hang
-            log.exception("actor %s", self._name)
-            self._give_up(f"its {role} was given up: {type(error).__name__}: {error}")
+            log.warning("actor %s failed to start: %s", self._name, error)
+            self._give_up(f"the {role} process could not be started: {_first_line(error)}")
+        except Exception as error:  # any error must be handled, or the scene would hang
+            log.exception("error in actor %s", self._name)
+            self._give_up(f"the {role} process was abandoned: {type(error).__name__}: {error}")
 
     async def _begin(self, entry: Entry, spec: Any) -> None:
-        """Starts the process; a worker without a node after `WAIT_S` reports the resources for which it is waiting."""
+        """Starts the process; a worker without a node after `WAIT_S` reports the resources that it needs."""
         self._actor = await asyncio.shield(self._making)
         starting = self._start_task(self._result(self._actor.start.remote(entry, spec)))
         starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # avoids a warning after `stop`
@@ -289,7 +289,7 @@ class RayProcess:
         while not (await asyncio.wait([starting], timeout=WAIT_S))[0]:
             if self._needs.role == "worker" and not said:
                 said = True
-                self._notify(WaitsForNode(f"its worker is waiting for a node with {self._needs.describe()}"))
+                self._notify(WaitsForNode(f"the worker is waiting for a node with {self._needs.describe()}"))
         started: StartResult = starting.result()
         if started.fault is not None:
             raise _StartFailedError(started.fault)
@@ -301,7 +301,7 @@ class RayProcess:
     async def _is_lost(self, node: str) -> bool:
         try:
             return await asyncio.wait_for(self._placement.call_ray(is_lost, node), LOST_S)
-        except TimeoutError:  # the head does not respond
+        except TimeoutError:  # the head node does not respond
             return True
 
     def _notify(self, message: Any) -> None:
@@ -328,7 +328,7 @@ class RayProcess:
         except RayActorError:
             pass  # `_run` receives the same error and handles it
         except RayError as error:  # the process has missed a message, so it must not continue
-            self._give_up(f"its {self._needs.role} did not receive a message: {_first_line(error)}")
+            self._give_up(f"could not send a message to the {self._needs.role} process: {_first_line(error)}")
 
     def _give_up(self, why: str, *, lost: bool = False) -> None:
         self._end(ProcessExit(None, why, lost=lost, out_of_memory=False))

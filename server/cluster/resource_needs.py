@@ -1,4 +1,4 @@
-"""Resource needs of scene processes, from which Ray's scheduler chooses their nodes.
+"""Resource needs of scene processes, which Ray's scheduler uses to choose their nodes.
 
 The needs are derived from the memory estimate of the scene.
 """
@@ -17,7 +17,7 @@ from server.processes.placement import Entry
 from server.settings import ServerSettings
 
 READER_CPUS = 0.25
-"""CPUs reserved for a reader, which works only while clients view the scene and then has priority over updates."""
+"""CPUs reserved for a reader, which works only while clients view the scene and has priority over updates."""
 BACKGROUND_CPUS = 0.1
 """CPUs reserved for a replay or an export, which use the remaining CPU time."""
 
@@ -27,11 +27,11 @@ class ResourceNeeds:
     """Resource needs of one process.
 
     Attributes:
-        role: role of the process, in one word.
-        scene: name of the scene.
+        role: one-word role of the process.
+        scene: scene name.
         cpus: number of CPUs, which may be fractional.
         memory: memory in bytes.
-        labels: labels that the node must have.
+        labels: required node labels.
     """
 
     role: str

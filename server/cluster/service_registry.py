@@ -1,4 +1,4 @@
-"""Registry through which the services of a cluster find each other.
+"""Registry that lets the services of a cluster find each other.
 
 Each service has an actor that provides its address. Ray ends the actor when the service exits.
 """
@@ -19,19 +19,19 @@ from server.cluster.nodes import own_machine, own_node
 from server.settings import is_loopback
 
 PREFIX = "service."
-"""Prefix of the names of these actors, followed by the identifier of the service."""
+"""Name prefix of these actors, followed by the identifier of the service."""
 ASK_S = 2.0
-"""Maximum seconds to wait for the addresses of the other services."""
+"""Timeout in seconds for getting the addresses of the other services."""
 
 log = logging.getLogger("scas4d.server")
 
 
 class ServiceAddress:
-    """Actor that reports the address at which a service listens.
+    """Actor that reports the address of a service.
 
     Args:
         url: URL of the service.
-        machine: address of the only machine from which the service is reachable; None if all machines can reach it.
+        machine: address of the only machine that can reach the service; None if all machines can reach it.
     """
 
     def __init__(self, url: str, machine: str | None) -> None:
@@ -47,14 +47,16 @@ def register_service(word: str, host: str, port: int) -> Any:
 
     Args:
         word: identifier of this service.
-        host: host on which the service listens; a wildcard address is announced as the address of this machine.
-        port: port on which the service listens.
+        host: listening host; a wildcard address is announced as the address of this machine.
+        port: listening port.
     """
     machine = own_machine()
     if host in ("0.0.0.0", "::", ""):
         host = machine
     elif is_loopback(host):
-        log.warning("other machines of the cluster cannot reach this service at %s; set another address: --host", host)
+        log.warning(
+            "other machines in the cluster cannot reach this service at %s; set a reachable address with --host", host
+        )
     url = f"http://{_authority(host, port)}"
     made: Any = ray.remote(ServiceAddress)
     here = NodeAffinitySchedulingStrategy(own_node(), soft=True)
@@ -87,8 +89,8 @@ def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]
         machine = own_machine()
     except (RayError, RuntimeError, ConnectionError) as error:
         if known is None:
-            raise RuntimeError(f"cannot get the list of services from the head of the cluster: {error}") from error
-        log.warning("cannot get the list of services from the head of the cluster: %s", error)
+            raise RuntimeError(f"cannot get the list of services from the head node: {error}") from error
+        log.warning("cannot get the list of services from the head node: %s", error)
         return dict(known)
     before = {name: url for name, url in (known or {}).items() if name in names and url != name}
     asked = _fetch_addresses([name for name in names if name not in before])

@@ -20,7 +20,7 @@ from server.storage.fencing import PART
 
 PROBE_NAME = ".probe"
 TIMEOUT_S = 180.0
-"""Maximum seconds for a node to respond; a node's first task starts a Python process, which is slow on a busy node."""
+"""Timeout in seconds for a node's response; its first task starts a Python process, which is slow on a busy node."""
 
 
 def check_folder(data: Path) -> None:
@@ -50,22 +50,24 @@ def check_folder(data: Path) -> None:
             except RayError as error:
                 raise RuntimeError(f"{name} does not respond: {error}") from None
             if fault is not None:
-                raise RuntimeError(f"{name} {fault}; mount the data folder {data} there, at the same path")
+                raise RuntimeError(f"{name} {fault}; mount the data folder {data} on this node at the same path")
             if not wait_for_content(data / f"{PROBE_NAME}-{word}-{id[:8]}", word):
-                raise RuntimeError(f"files that {name} writes to {data} are not visible here; is it the same folder?")
+                raise RuntimeError(
+                    f"files written to {data} by {name} are not visible here; mount the same folder there"
+                )
     finally:
         for path in data.glob(f"{PROBE_NAME}-{word}*"):  # including those of nodes that failed midway
             path.unlink(missing_ok=True)
 
 
 def probe_from_node(data: Path, word: str, id: str) -> str | None:
-    """Checks the folder on this node; returns None, or a fault that completes a sentence after the node's name.
+    """Checks the folder on this node; returns None, or a fault to be appended to the node's name.
 
     Blocking.
     """
     try:
         if not wait_for_content(data / f"{PROBE_NAME}-{word}", word):
-            return f"does not see what the service writes to {data}"
+            return f"cannot see files that the service writes to {data}"
         beside, path = (data / f"{PROBE_NAME}-{word}-{id[:8]}{end}" for end in (PART, ""))
         with open_atomically(path, beside) as file:
             file.write(word.encode())

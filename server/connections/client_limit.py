@@ -14,7 +14,7 @@ from server.connections.refusals import Refusal, problem
 class ClientLimit:
     """Middleware that limits the concurrent requests and WebSockets of each client address.
 
-    Above the limit, it responds with 429. A trusted proxy is exempt from the limit on connections per peer. Instead,
+    Requests above the limit get 429. A trusted proxy is exempt from the limit on connections per peer. Instead,
     the same limit applies to the requests of each client that the proxy names in X-Forwarded-For. uvicorn reads this
     header from trusted proxies only.
     """

@@ -21,19 +21,19 @@ from server.http.authentication import HEADERS
 
 END_OF_HEAD = b"\r\n\r\n"
 CHUNKED_BYTES = 64 << 10
-"""Maximum bytes of a chunked body to parse at once; the overhead is checked after each block."""
+"""Maximum number of bytes of a chunked body to parse at once; the overhead is checked after each block."""
 CHUNK_OVERHEAD_BYTES = 64 << 10
-"""Bytes by which chunk headers, extensions and trailers may exceed the content."""
+"""Maximum number of bytes by which chunk headers, extensions and trailers may exceed the content."""
 LARGE_READ = 16 << 10
-"""Minimum size in bytes of a piece of a body that is passed on without a copy."""
+"""Minimum size in bytes of a body piece that is passed on without a copy."""
 PIPELINED = 16
 """Maximum number of pipelined requests.
 
-If there are more, the connection is closed after these, and the client must resend the rest. Each request takes a few
-kilobytes, and a single read can contain thousands of them.
+If there are more, the connection is closed after this number, and the client must resend the rest. Each request takes
+a few kilobytes, and a single read can contain thousands of requests.
 """
 DROPPED_BYTES = 1 << 20
-"""Maximum bytes to read and discard after a refusal, so that the peer can read the response."""
+"""Maximum number of bytes to read and discard after a refusal, so that the peer can read the response."""
 
 
 class GuardedConnection(HttpToolsProtocol):
@@ -42,7 +42,7 @@ class GuardedConnection(HttpToolsProtocol):
     A frame has about 30 MB, and copying it takes as long as reading it.
 
     Attributes:
-        guard: connection guard of the service, set by `server.connections.config`.
+        guard: the service's connection guard, set by `server.connections.config`.
     """
 
     guard: ClassVar[ConnectionGuard]
@@ -50,7 +50,7 @@ class GuardedConnection(HttpToolsProtocol):
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self._fault: Refusal | None = None
-        """Fault found while parsing. Not raised, because uvicorn would respond to any exception as to a bad request."""
+        """Fault found while parsing. It is not raised, because uvicorn would treat any exception as a bad request."""
         self._head_bytes = 0
         self._left: int | None = None
         """Bytes of the body that have not arrived yet; None if it is chunked."""
@@ -76,7 +76,7 @@ class GuardedConnection(HttpToolsProtocol):
 
     @property
     def waiting_for_service(self) -> bool:
-        """Whether no bytes can arrive because the service is not reading or has not requested the body yet."""
+        """Whether no bytes can arrive because the service has stopped reading or has not requested the body yet."""
         return self.flow.read_paused or (self._record.phase is Phase.BODY and self.cycle.waiting_for_100_continue)
 
     def data_received(self, data: bytes) -> None:
@@ -137,7 +137,7 @@ class GuardedConnection(HttpToolsProtocol):
         return Refusal.URL_SIZE if 2 * len(self.url or b"") > self.guard.limits.header_bytes else Refusal.HEAD_SIZE
 
     def on_message_begin(self) -> None:
-        """Starts a request, possibly in the same piece in which the previous request ended."""
+        """Starts a request, possibly in the piece that also ended the previous request."""
         super().on_message_begin()
         if self._record.phase is not Phase.HEAD:
             self._begin_head()
@@ -206,7 +206,7 @@ class GuardedConnection(HttpToolsProtocol):
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Ends a request, whose response may still be in progress or already sent."""
+        """Ends a request; its response may still be in progress or already sent."""
         if self._fault is not None:
             return
         super().on_message_complete()

@@ -25,26 +25,26 @@ Browsers send about twenty, proxies add about ten, and WebSockets accept at most
 """
 
 SWEEP_S = 1.0
-"""Maximum seconds between sweeps."""
+"""Maximum interval in seconds between sweeps."""
 LINGER_S = 5.0
-"""Seconds within which each `PROGRESS_BYTES` of a body must arrive while the body is being discarded."""
+"""Time limit in seconds for each `PROGRESS_BYTES` of a body that is being discarded."""
 LINGER_LONGEST_S = 60.0
-"""Maximum seconds for which a body is read and discarded."""
+"""Maximum time in seconds to read and discard a body."""
 LINGER_BYTES = 64 << 20
-"""Maximum bytes of a body to read and discard after the response.
+"""Maximum number of bytes of a body to read and discard after the response.
 
 Closing the connection immediately would reset it, and the sender would lose the response.
 """
 REFUSED_S = 2.0
-"""Seconds for which data from a refused connection is read and discarded."""
+"""Time in seconds for which data from a refused connection is read and discarded."""
 REFUSED_AT_ONCE = 64
 """Maximum number of refused connections that wait for their peer to read the response; the oldest are aborted."""
 CLOSING_SOCKET_S = 5.0
-"""Seconds after which a closing WebSocket is aborted if its peer does not read."""
+"""Time in seconds after which a closing WebSocket is aborted if its peer does not read."""
 QUIET_S = 2.0
-"""Seconds without data after which an upload may be closed to make room for a new connection."""
+"""Time in seconds without data after which an upload may be closed to make room for a new connection."""
 SUMMARY_S = 10.0
-"""Minimum seconds between log lines about refused connections; one line per refusal would flood the log."""
+"""Minimum interval in seconds between log lines about refused connections; one line per refusal would flood the log."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -54,14 +54,14 @@ for refusal in Refusal:  # exports reasons that have not occurred yet as 0
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """Limits of connections.
+    """Limits on connections.
 
     Attributes:
-        header_seconds: maximum seconds to send a header.
+        header_seconds: time limit in seconds for sending a header.
         header_bytes: maximum size of a header in bytes.
-        body_seconds: maximum seconds for each `PROGRESS_BYTES` of a body.
-        keep_alive_seconds: seconds until an idle connection is closed.
-        unread_seconds: maximum seconds for a peer to read `PROGRESS_BYTES`.
+        body_seconds: time limit in seconds for each `PROGRESS_BYTES` of a body.
+        keep_alive_seconds: time in seconds until an idle connection is closed.
+        unread_seconds: time limit in seconds for a peer to read `PROGRESS_BYTES`.
         connections: maximum number of connections in total.
         per_peer: maximum number of connections per peer.
         proxies: networks of the trusted proxies.
@@ -78,7 +78,7 @@ class ConnectionLimits:
 
     @classmethod
     def of(cls, settings: ServerSettings) -> ConnectionLimits:
-        """Returns the limits defined by the settings of a service."""
+        """Returns the limits defined by the service settings."""
         return cls(
             header_seconds=settings.header_seconds,
             header_bytes=settings.header_kb << 10,
@@ -113,7 +113,7 @@ class ConnectionLimits:
 
 
 def peer_key(address: str) -> str:
-    """Returns the key by which the connections of a peer are counted.
+    """Returns the key used to count a peer's connections.
 
     For an IPv6 address, this is its /64 network, which typically belongs to one customer.
     """
@@ -129,7 +129,7 @@ def peer_key(address: str) -> str:
 
 
 class ConnectionGuard:
-    """Registry of the open connections of a service, with the sweep that enforces their limits."""
+    """Registry of a service's open connections, with the sweep that enforces their limits."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits
@@ -150,8 +150,8 @@ class ConnectionGuard:
         """Registers a new connection; returns its record, and the refusal if it must be refused.
 
         At a limit, the new connection replaces one that has not sent a complete header, is idle, or has stopped sending
-        its body, since an idle peer must not block a peer with a request. At the limit on all connections, those of any
-        peer may be replaced, because a peer with many addresses has few connections per address.
+        its body, since an idle peer must not block a peer with a request. At the limit on all connections, any peer's
+        connection may be replaced, because a peer with many addresses has few connections per address.
         """
         now = loop.time()
         proxy = self.limits.is_proxy(address)
@@ -275,7 +275,7 @@ class ConnectionGuard:
             self._peers.pop(peer.address, None)
 
     def _evict(self, peers: Collection[Peer], now: float) -> bool:
-        """Closes the most dispensable connection of these peers; returns False if all are needed."""
+        """Closes the least important connection of these peers; returns False if all are needed."""
         for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
             oldest = [(len(queue), next(iter(queue))) for queue in queues if queue]
             if oldest:
@@ -304,7 +304,7 @@ class ConnectionGuard:
                 self._check_deadline(record, now, passed)
         if self._pending and now - self._logged >= SUMMARY_S:
             reasons = ", ".join(f"{count} {reason}" for reason, count in self._pending.most_common())
-            log.warning("refused connections: %s (docs/operations.md, `reason`)", reasons)
+            log.warning("refused connections: %s (see `reason` in docs/operations.md)", reasons)
             self._pending.clear()
             self._logged = now
         go_on = bool(self._records or self._pending)
@@ -344,8 +344,8 @@ class ConnectionGuard:
     def _check_unread(self, record: OpenConnection, now: float) -> bool:
         """Aborts a connection whose peer does not read the response; returns whether it was aborted.
 
-        Only connections to which nothing is being written are checked, because writing is paused or the connection is
-        closing. A decrease in unread bytes then means that the peer has read them.
+        Only connections that are closing or whose writing is paused are checked. Nothing is being written to them, so
+        a decrease in unread bytes means that the peer has read them.
         """
         closing = record.transport.is_closing()
         size = unread_bytes(record.transport) if closing or record.write_paused else 0

@@ -10,7 +10,7 @@ from typing import Protocol
 from server.connections.refusals import Refusal
 
 PROGRESS_BYTES = 16 << 10
-"""Minimum bytes to transfer within `body_seconds` or `unread_seconds`; slower peers are probably attackers."""
+"""Minimum number of bytes per `body_seconds` or `unread_seconds`; slower peers are probably attackers."""
 
 
 class Phase(Enum):
@@ -31,7 +31,7 @@ class Phase(Enum):
     SOCKET = auto()
     """The connection is a WebSocket, which may be idle indefinitely because pings check that its peer is alive."""
     REFUSED = auto()
-    """The connection was refused, and bytes that still arrive are discarded."""
+    """The connection was refused, and further bytes are discarded."""
 
 
 KINDS = {
@@ -52,7 +52,7 @@ class Handler(Protocol):
 
     @property
     def waiting_for_service(self) -> bool:
-        """Whether no bytes can arrive because the service is not reading at the moment."""
+        """Whether no bytes can arrive because the service is currently not reading."""
 
     def refuse(self, refusal: Refusal) -> None:
         """Sends the refusal as a response, if possible, and closes the connection."""
@@ -64,16 +64,16 @@ class OpenConnection:
 
     Attributes:
         handler: protocol that handles the connection.
-        transport: transport of the connection.
+        transport: transport that carries the connection.
         peer: peer at the other end of the connection.
         since: loop time at which the phase, or its current time window, began.
         quiet_since: loop time of the last sweep that found received bytes.
         phase: current phase.
-        queue: queue of the peer that contains the connection, or None.
+        queue: the peer's queue that contains the connection, or None.
         counted: whether the connection counts towards the limits.
         closed: whether the connection is closed.
         entered: loop time at which the phase began.
-        body: bytes of the body received in the current window, or in all windows if the body is being discarded.
+        body: body bytes received in the current window, or in all windows if the body is being discarded.
         dropped: value of `body` at the start of the current window if the body is being discarded.
         moved: whether `PROGRESS_BYTES` of the current body have arrived in one window.
         received: bytes received since the last sweep.
@@ -106,12 +106,12 @@ class OpenConnection:
 
     @property
     def is_begun(self) -> bool:
-        """Whether less than `PROGRESS_BYTES` of the body arrived in every window, or the body is being discarded."""
+        """Whether every window so far received less than `PROGRESS_BYTES`, or the body is being discarded."""
         return self.phase is Phase.LINGER or not self.moved
 
     @property
     def last_bytes_at(self) -> float:
-        """Latest loop time at which bytes of the body may have arrived."""
+        """Latest possible loop time at which body bytes arrived."""
         return max(self.since, self.quiet_since)
 
 

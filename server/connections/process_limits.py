@@ -18,9 +18,9 @@ else:
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 RETAINED_BYTES = 32 << 20
-"""Maximum bytes of freed memory that glibc retains."""
+"""Maximum number of bytes of freed memory that glibc retains."""
 OTHER_FILES = 256
-"""Number of open files other than those of connections: pipes to scenes' processes, journals, temporary files."""
+"""Number of open files besides connections: pipes to scene processes, journals and temporary files."""
 FILES_EACH = 2
 """Number of open files per connection: its socket, and the record file of an upload."""
 

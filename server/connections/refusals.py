@@ -9,7 +9,7 @@ from server import problems
 from server.problems import Problem
 
 RETRY_SECONDS = 5
-"""Value of `Retry-After` in seconds if there are too many connections; by then, incomplete headers have timed out."""
+"""`Retry-After` value in seconds when there are too many connections; by then, incomplete headers have timed out."""
 
 
 class Refusal(StrEnum):
@@ -44,7 +44,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
             what, unit = ("has more lines", "") if lines else ("is larger", " kB")
             return Problem(
                 414 if refusal is Refusal.URL_SIZE else 431,
-                f"the header of the request {what} than {limit:g}{unit}",
+                f"the request header {what} than {limit:g}{unit}",
                 field="path" if refusal is Refusal.URL_SIZE else "headers",
                 value=f"more than {limit:g}{unit}",
                 remedy="send fewer headers" if lines else "send fewer or shorter headers, or raise SCAS4D_HEADER_KB",
@@ -52,26 +52,26 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.HEAD_TIME:
             return Problem(
                 408,
-                f"the header of the request was not complete after {limit:g} s",
+                f"the request header was not complete within {limit:g} s",
                 field="headers",
                 value=f"more than {limit:g} s",
-                remedy="send the whole header at once (SCAS4D_HEADER_SECONDS)",
+                remedy="send the whole header at once, or raise SCAS4D_HEADER_SECONDS",
             )
         case Refusal.BODY_TIME:
             return Problem(
                 408,
-                f"less than 16 kB of the body arrived in {limit:g} s",
+                f"received less than 16 kB of the request body in {limit:g} s",
                 field="body",
                 value=f"less than 16 kB in {limit:g} s",
-                remedy="send the request again, without a pause (SCAS4D_BODY_SECONDS)",
+                remedy="resend the request without pausing, or raise SCAS4D_BODY_SECONDS",
             )
         case Refusal.BODY_OVERHEAD:
             return Problem(
                 400,
-                "the body has more chunk headers, extensions or trailers than content",
+                "the chunked body has more overhead (chunk headers, extensions and trailers) than content",
                 field="Transfer-Encoding",
                 value="chunked",
-                remedy="send chunks of at least a few hundred bytes, or a Content-Length",
+                remedy="send chunks of at least a few hundred bytes, or set Content-Length",
             )
         case Refusal.PEER_CONNECTIONS | Refusal.CLIENT_REQUESTS:
             return Problem(
@@ -85,7 +85,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.CONNECTIONS:
             return Problem(
                 503,
-                f"the service already has {limit:g} open connections, all of them busy",
+                f"the service already has {limit:g} open connections, all in use",
                 field="client",
                 value=f"more than {limit:g}",
                 remedy="try again later, or raise SCAS4D_MAX_CONNECTIONS",
@@ -94,9 +94,9 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.MALFORMED | Refusal.PIPELINED | Refusal.UNREAD | Refusal.DISPLACED:
             return Problem(
                 400,
-                "the request is not HTTP/1.1",
+                "the request is not valid HTTP/1.1",
                 field="request",
-                value="bytes that cannot be parsed",
+                value="unparseable bytes",
                 remedy="send a valid HTTP request (RFC 9112), without TLS",
             )
 
@@ -106,7 +106,7 @@ def response(refused: Problem, headers: dict[str, str]) -> bytes:
 
     Args:
         refused: problem to report.
-        headers: default headers of every response of the service.
+        headers: default headers of all the service's responses.
     """
     status = HTTPStatus(refused.status_code)
     answer = problems.problem_response(refused.document, {**headers, **(refused.headers or {}), "Connection": "close"})

@@ -16,13 +16,13 @@ from server.connections.refusals import Refusal, problem, response
 from server.http.authentication import HEADERS
 
 EARLY_BYTES = 1 << 16
-"""Maximum message size in bytes until the handshake is answered; no client needs to send messages that early."""
+"""Maximum message size in bytes before the handshake is answered; clients need not send messages that early."""
 SMALL_FRAGMENT = 4096
-"""Maximum size in bytes of a fragment that is joined with the previous one."""
+"""Maximum size in bytes of a fragment to join with the previous one."""
 PONG = b"\x8a"
 """First byte of a pong frame."""
 LIMIT = "scas4d.message_limit"
-"""Key of the scope extension through which the application sets the maximum message size."""
+"""Key of the scope extension that the application uses to set the maximum message size."""
 
 
 class GuardedWebSocket(WebSocketsSansIOProtocol):
@@ -31,13 +31,13 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     A larger message is rejected with close code 1009 without being read.
 
     Attributes:
-        guard: connection guard of the service, set by `server.connections.config`.
+        guard: the service's connection guard, set by `server.connections.config`.
     """
 
     guard: ClassVar[ConnectionGuard]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Takes over the connection from the HTTP request that requested the upgrade."""
+        """Takes over the connection of the HTTP request that requested the upgrade."""
         super().connection_made(transport)
         self._pong = b""
         """Pong for the newest ping, held back while the peer is not reading."""
@@ -52,7 +52,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
 
     @property
     def waiting_for_service(self) -> bool:
-        """Always False, because a WebSocket has a deadline only while it is closing, when the service reads."""
+        """Always False: a WebSocket has a deadline only while it is closing, and the service reads during that time."""
         return False
 
     def refuse(self, refusal: Refusal) -> None:
@@ -62,7 +62,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.transport.close()
 
     def data_received(self, data: bytes) -> None:
-        """Handles received data, and refuses an invalid handshake, after which uvicorn would wait forever."""
+        """Handles received data and refuses an invalid handshake, which would make uvicorn wait forever."""
         self._record.received += len(data)
         if self._record.phase is Phase.LINGER:
             self._record.body += len(data)
@@ -98,7 +98,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
             frames.append(bytearray(event.data))
 
     def handle_parser_exception(self) -> None:
-        """Closes a connection that violates the protocol or whose message is too large (1009).
+        """Closes a connection after a protocol violation or an oversized message (1009).
 
         Data that the peer continues to send is read and discarded for a while. uvicorn would close the connection
         immediately, which would reset it, so that the peer would not receive the reason.

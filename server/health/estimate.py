@@ -18,7 +18,7 @@ PIXEL = 8
 SCALED_PIXEL = 112
 """Bytes per scaled pixel for the images of an update.
 
-These are the target image (3 or 4 channels of float32) and the image of the static Gaussians. The box around the moving
+These are the target image (3 or 4 float32 channels) and the image of the static Gaussians. The box around the moving
 Gaussians also has a copy of the target and SSIM's two moments. Without masks, the targets and moments of two frames are
 kept.
 """
@@ -29,7 +29,7 @@ Of these, 21 are for detecting new content in each camera (an image, an error ma
 the distance maps for carving, or for the image crops to which the new Gaussians are fitted.
 """
 VOXELS = 150e6
-"""Maximum bytes of the voxels that carve a new object and of the grid that separates objects."""
+"""Maximum memory in bytes of the voxels that carve a new object and the grid that separates objects."""
 GAUSSIAN = 2200
 """Bytes per Gaussian in the worker: state, deformation layers, Adam moments, neighbors and render buffers."""
 READ_GAUSSIAN = 500
@@ -49,7 +49,7 @@ CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 
 def machine_mb() -> float:
-    """Returns the memory of the machine or, if smaller, the limit of the container, in MB."""
+    """Returns the memory of the machine, or the container's limit if that is lower, in MB."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         return min(total, int(CGROUP.read_text())) / 1e6
@@ -99,12 +99,12 @@ def refuse_if_too_large(rig: RigModel, settings: Settings, server: ServerSetting
         return
     smaller = [scale for scale in SCALES if scale < settings.scene.image_scale]
     fits = next((s for s in smaller if estimate(rig, settings, server, s).memory_mb <= needed.limit_mb), None)
-    remedy = "send fewer or smaller pictures, lower settings.static.max_gaussians, or raise SCAS4D_MAX_SCENE_MEMORY_MB"
+    remedy = "use fewer or smaller images, lower settings.static.max_gaussians, or raise SCAS4D_MAX_SCENE_MEMORY_MB"
     if fits is not None:
-        remedy = f"set settings.scene.image_scale to {fits:g}; or {remedy}"
+        remedy = f"set settings.scene.image_scale to {fits:g}, or {remedy}"
     raise Problem(
         422,
-        f"the scene is estimated to take {needed.memory_mb:.0f} MB, more than {needed.limit_mb:.0f} MB",
+        f"the scene needs an estimated {needed.memory_mb:.0f} MB of memory; the limit is {needed.limit_mb:.0f} MB",
         field="rig.cameras",
         value=f"{count_noun(len(rig.cameras), 'camera')}, {needed.scaled_pixels} pixels, {needed.gaussians} Gaussians",
         remedy=remedy,

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.(?:ticket|read)\.|(?:token|ticket)=)[^\s\"',;&]+")
-"""Pattern of secrets with the text before them. They are masked in all messages, since any may quote a request."""
+"""Pattern of secrets and the text before them. Secrets are masked in all messages, since any may quote a request."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
 

@@ -67,7 +67,7 @@ class ServiceState:
         free = shutil.disk_usage(self.settings.data).free
         yield GaugeMetricFamily("scas4d_disk_free_bytes", "Free space on the disk of the data folder.", value=free)
         if self.ready_after is not None:
-            help = "Seconds from the start of the service until its kernels were warmed up."
+            help = "Seconds from service start until the kernels were warmed up."
             yield GaugeMetricFamily("scas4d_ready_after_seconds", help, value=self.ready_after)
         if self.cluster is not None:
             yield from cluster_gauges(self.cluster)
@@ -76,10 +76,10 @@ class ServiceState:
 def cluster_gauges(cluster: Cluster) -> Iterator[Metric]:
     """Yields the gauges of the cluster's nodes and of this service's processes on them.
 
-    The node gauges have no samples while the head of the cluster does not respond.
+    The node gauges have no samples while the head node does not respond.
     """
     yield GaugeMetricFamily(
-        "scas4d_cluster_up", "1 if the head of the cluster responds, otherwise 0.", value=cluster.head_responds
+        "scas4d_cluster_up", "1 if the cluster's head node responds, otherwise 0.", value=cluster.head_responds
     )
     nodes = cluster.nodes if cluster.head_responds else []
     for name, help, field, unit in (

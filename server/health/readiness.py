@@ -25,7 +25,7 @@ from server.settings import ServerSettings
 log = logging.getLogger("scas4d.server")
 
 LOG_S = 5.0
-"""Seconds between log lines about the progress of the compilation."""
+"""Interval in seconds between log lines about the compilation progress."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
 
 
 class Readiness:
-    """Readiness of the service; its construction starts to warm up the kernels.
+    """Readiness of the service; creating an instance starts the warm-up of the kernels.
 
     Attributes:
-        after: seconds from the start until the service was ready; None if it is not ready yet.
+        after: startup time of the service in seconds; None if it is not ready yet.
         fault: reason why the kernels could not be compiled, or None. The service continues without the warm-up, and
             its first frame reports the error.
         compiled: progress of the compilation of the kernels for a first frame; None if unknown.
@@ -83,35 +83,35 @@ class Readiness:
         self._logged_at = self._began
         self._process: ProcessHandle | None = None
         if settings.warm_up:
-            log.info("loading the kernels; on the first start they are compiled, which takes half a minute")
+            log.info("loading the kernels; they are compiled on the first start, which takes about half a minute")
             self._process = placement.start(main, None, self._on_message, self._on_end)
         else:
             self.after = 0.0
 
     def check(self) -> float:
-        """Returns the seconds from the start until the service was ready.
+        """Returns the startup time of the service in seconds.
 
         Raises:
             Problem: 503 if the service is not ready; `warming_up` is true if it will become ready on its own.
         """
         waited = time.monotonic() - self._began
         if self.stopping:
-            raise Problem(503, "the service is shutting down", remedy="wait until it is restarted", seconds=waited)
+            raise Problem(503, "the service is shutting down", remedy="retry after it has restarted", seconds=waited)
         if self.fault is not None:
             raise Problem(
                 503,
                 f"the kernels could not be compiled: {self.fault}",
-                remedy="see the traceback in the service's log; SCAS4D_WARM_UP=false skips the compilation",
+                remedy="see the traceback in the service log; set SCAS4D_WARM_UP=false to skip the compilation",
                 seconds=waited,
             )
         if self.after is None:
             now = self.compiled
             more: dict[str, Any] = {} if now is None else {"kernels_compiled": now.done, "kernels": now.total}
-            so_far = "" if now is None else f": {now.done} of {now.total}"
+            so_far = "" if now is None else f" ({now.done} of {now.total} done)"
             raise Problem(
                 503,
-                f"kernels have been loading for {waited:.1f} s; on the first start they are compiled{so_far}",
-                remedy="try again",
+                f"the kernels have been loading for {waited:.1f} s; they are compiled on the first start{so_far}",
+                remedy="try again later",
                 headers={"Retry-After": "1"},
                 seconds=waited,
                 warming_up=True,

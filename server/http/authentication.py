@@ -23,7 +23,7 @@ from server.problems import Problem
 from server.settings import ServerSettings, is_loopback
 
 PROBES = frozenset({"/health/live", "/health/ready", "/health/ingest"})
-"""Paths that orchestrators probe without a token; their responses reveal at most the number of scenes."""
+"""Paths that orchestrators probe without a token; the responses reveal at most the number of scenes."""
 OPEN = PROBES | {"/", "/viewer", "/favicon.ico", "/docs", "/redoc", "/openapi.json"}
 """Paths that expose no data and need no token: the probes, the viewer page and the API description."""
 OPEN_FOLDERS = ("/viewer/", "/docs/")
@@ -93,7 +93,7 @@ class AuthMiddleware:
             if name.lower() in IN_URL:
                 raise Problem(
                     400,
-                    "a secret must not be sent in a URL, which ends up in logs and browser histories",
+                    "secrets must not be sent in URLs, because URLs end up in logs and browser histories",
                     field=name,
                     remedy="send the token as `Authorization: Bearer`, or a ticket as a WebSocket subprotocol; if this "
                     "was a real secret, replace it",
@@ -123,7 +123,7 @@ class AuthMiddleware:
             401,
             "the token is invalid" if given else "the service requires a token",
             field="Authorization",
-            remedy="send `Authorization: Bearer` with the token that the service was started with",
+            remedy="send the service's token as `Authorization: Bearer`",
             headers={"WWW-Authenticate": 'Bearer realm="scas4d"' + (', error="invalid_token"' if given else "")},
         )
 
@@ -184,14 +184,14 @@ def _add_headers(send: Send) -> Send:
 def _answer_closed_handshake(scope: Scope, receive: Receive, send: Send) -> Send:
     """Wraps `send` to respond with a 404 problem if the application closes a WebSocket before accepting it.
 
-    In that case, the path has no WebSocket endpoint.
+    Closing it that early means that the path has no WebSocket endpoint.
     """
     accepted = False
 
     async def sending(message: Message) -> None:
         nonlocal accepted
         if message["type"] == "websocket.close" and not accepted:
-            detail = message.get("reason") or f"there is no WebSocket endpoint at {scope['path']}"
+            detail = message.get("reason") or f"no WebSocket endpoint at {scope['path']}"
             problem = Problem(
                 404, detail, field="path", value=scope["path"], remedy="see docs/stream.md for the endpoints"
             )

@@ -50,7 +50,7 @@ def serve_file(
     """
     file = files.get(name)
     if file is None:
-        raise Problem(404, f"the page has no file {name!r}", field="name", value=name, remedy=f"open {page}")
+        raise Problem(404, f"no such file: {name!r}", field="name", value=name, remedy=f"open {page}")
     answer = FileResponse(file, media_type=MEDIA_TYPES[file.suffix], headers=dict(headers), stat_result=file.stat())
     if matches_etag(request, tag := answer.headers["etag"]):
         return Response(status_code=304, headers={**headers, "ETag": tag})

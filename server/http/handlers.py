@@ -39,7 +39,11 @@ def install_handlers(app: FastAPI) -> None:
         given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if first["loc"][0] == "body" and given and not JSON.fullmatch(given):
             problem = Problem(
-                415, f"the body has type {given}", field="Content-Type", value=given, remedy="send application/json"
+                415,
+                f"unsupported body type {given}",
+                field="Content-Type",
+                value=given,
+                remedy="send a body of type application/json",
             )
             return problem_response(problem.document)
         route = request.scope.get("route")
@@ -54,9 +58,7 @@ def install_handlers(app: FastAPI) -> None:
 
     async def from_fault(request: Request, error: Exception) -> Response:
         log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
-        return problem_response(
-            Problem(500, f"the service failed: {type(error).__name__}", remedy=SERVICE_FAULT).document
-        )
+        return problem_response(Problem(500, f"internal error: {type(error).__name__}", remedy=SERVICE_FAULT).document)
 
     app.openapi = lambda: openapi_document(app)  # type: ignore[method-assign]
     app.add_exception_handler(HTTPException, from_problem)
@@ -81,9 +83,9 @@ def _framework_problem(request: Request, status: int, detail: str, headers: Mapp
     field = value = None
     remedy = "see /openapi.json"
     if status == 404:
-        field, value, remedy = "path", request.url.path, "GET /openapi.json lists all paths"
+        field, value, remedy = "path", request.url.path, "see /openapi.json for all paths"
     elif status == 405:
         field, value, remedy = "method", request.method, f"use {headers.get('Allow') or 'another method'}"
     elif status == 400:
-        field, remedy = "body", "send a body that matches its Content-Type; the schema is at /openapi.json"
+        field, remedy = "body", "send a body that matches its Content-Type; see /openapi.json for the schema"
     return Problem(status, detail, field=field, value=value, remedy=remedy).document

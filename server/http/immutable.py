@@ -20,7 +20,7 @@ from server.problems import Problem
 RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 TAG_BYTES = 16
 PIECE = 256 * 1024
-"""Size in bytes of the blocks in which a file is read."""
+"""Block size in bytes for reading a file."""
 KEEP = "private, no-cache"
 """Cache-Control value; caches must revalidate a stored response, because a damaged state may be recomputed."""
 
@@ -162,7 +162,7 @@ def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
     if start >= size or start >= end:
         raise Problem(
             416,
-            f"the range is outside the {size} bytes available",
+            f"the range is not within the {size} bytes of the body",
             field="Range",
             value=given,
             remedy="request a range that starts before the end, or omit Range to get the whole body",

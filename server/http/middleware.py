@@ -77,7 +77,7 @@ class AccessLog:
 class BodyLimit:
     """Middleware that responds with 413 to bodies of more than `limit` bytes.
 
-    A body with a Content-Length is rejected immediately, any other body while it is being read.
+    A body with a Content-Length is rejected immediately; any other body is rejected while it is being read.
     """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
@@ -108,10 +108,10 @@ class BodyLimit:
     def _problem(self, value: str) -> Problem:
         return Problem(
             413,
-            f"the body is larger than {self.limit} bytes",
+            f"the body exceeds the limit of {self.limit} bytes",
             field="Content-Length",
             value=value,
-            remedy="send smaller or more strongly compressed pictures, or raise SCAS4D_MAX_BODY_MB",
+            remedy="send smaller or more strongly compressed images, or raise SCAS4D_MAX_BODY_MB",
         )
 
 

@@ -1,9 +1,9 @@
 """Checks of the Host and Origin headers, which prevent pages of other sites from using the service.
 
-Any web page can send requests to a server on the loopback interface of the machine on which it is displayed. Headers
+Any web page can send requests to a server on the loopback interface of the machine that displays it. Headers
 that no page can forge reveal such requests. `Origin` is the site of the requesting page; `Sec-Fetch-Site` serves the
 same purpose for images and forms, whose requests omit Origin. `Host` is the name by which the client addresses the
-service. An unknown name indicates DNS rebinding, which makes a foreign page appear to belong to the service.
+service. An unknown name indicates DNS rebinding, which makes another site's page appear to belong to the service.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def check_origin(scope: Scope, allowed_hosts: Sequence[str], allowed_origins: Se
 def _foreign_problem(field: str, value: str) -> Problem:
     return Problem(
         403,
-        "pages of other sites are not allowed to use the service",
+        "requests from pages of other sites are not allowed",
         field=field,
         value=value,
         remedy="use the service's own page, or add the site to SCAS4D_ALLOWED_ORIGINS",
@@ -70,10 +70,10 @@ def _host(headers: Headers) -> str:
     if len(hosts) != 1 or split_authority(hosts[0]) is None:
         raise Problem(
             400,
-            "a request needs exactly one Host header, host or host:port",
+            "a request must have exactly one Host header of the form host or host:port",
             field="Host",
             value=", ".join(hosts),
-            remedy="send the address to which you connect",
+            remedy="set Host to the address of the service",
         )
     return hosts[0]
 

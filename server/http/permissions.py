@@ -10,7 +10,7 @@ from starlette.types import Scope
 from server.problems import Problem
 
 READS = re.compile(r"/v1/(tickets|estimate|scenes/[^/]+/(render|tracks/query))")
-"""Pattern of the paths at which POST is a read operation with the query in the body."""
+"""Pattern of paths where POST is a read operation with the query in the body."""
 READ_SOCKETS = re.compile(r"/v1/scenes/[^/]+/stream")
 """Pattern of the WebSocket paths that only send data to the client."""
 
@@ -50,14 +50,14 @@ def check(permission: Permission, scope: Scope) -> None:
                 "this link gives access to one scene only",
                 field="path",
                 value=path,
-                remedy=f"request {own}, or send the token of the service",
+                remedy=f"request {own}, or send the service's token",
             )
     if not (permission.write or reading):
         raise Problem(
             403,
             "this token is read-only",
             field="Authorization",
-            remedy="send the token that the service was started with, SCAS4D_TOKEN",
+            remedy="send the service's token (SCAS4D_TOKEN)",
         )
 
 

@@ -23,7 +23,7 @@ class Sharing:
     """Issuer and verifier of read-only tokens.
 
     Args:
-        secret: the token of the service.
+        secret: the service's token.
     """
 
     def __init__(self, secret: str) -> None:
@@ -51,7 +51,7 @@ class Sharing:
                 401,
                 "the link or read-only token has expired",
                 field="Authorization",
-                remedy="ask its sender for a new one: POST /v1/shares, or scas4d scenes share",
+                remedy="ask the sender for a new one (POST /v1/shares, or scas4d scenes share)",
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
             )
         return Permission(scene=None if scene == ALL_SCENES else scene, end=int(end))

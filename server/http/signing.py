@@ -1,4 +1,4 @@
-"""Signing of short texts with the token of the service.
+"""Signing of short texts with the service's token.
 
 Every service with the same token can verify a signed text. Nothing is stored, so changing the token invalidates all
 signatures.
@@ -15,7 +15,7 @@ class Signer:
     """Signer and verifier of texts, using HMAC-SHA256.
 
     Args:
-        secret: token of the service.
+        secret: the service's token.
         purpose: purpose of the signatures; a signature for one purpose is invalid for any other.
 
     >>> signer = Signer("a-token-of-the-service", "an example")

@@ -1,9 +1,9 @@
-"""Tickets with which browsers authenticate WebSockets.
+"""Tickets that browsers use to authenticate WebSockets.
 
 A browser cannot send a bearer token when it opens a WebSocket, so it fetches a ticket and offers it as a subprotocol.
 A ticket is valid for a few seconds and opens one WebSocket per service. It is sent as `scas4d.ticket.<ticket>` in
 Sec-WebSocket-Protocol and never in a URL, which would end up in logs and browser histories. Tickets are signed with the
-service's token, so every service of a cluster accepts them, no matter to which one a load balancer routes the browser.
+service's token, so every service in a cluster accepts them, wherever a load balancer routes the browser.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Tickets:
     """Issuer and verifier of tickets, which remembers used tickets until they expire.
 
     Args:
-        secret: token of the service. If None, only this service accepts its tickets.
+        secret: the service's token. If None, only this service accepts its tickets.
         clock: returns the time in seconds since the epoch; the clocks of a cluster must agree to within a few seconds.
     """
 
@@ -65,10 +65,10 @@ class Tickets:
         if len(self._used) >= MOST_TICKETS:
             raise Problem(
                 429,
-                f"{count_noun(len(self._used), 'ticket')} of at most {MOST_TICKETS} were used in {TICKET_SECONDS:g} s",
+                f"{count_noun(len(self._used), 'ticket')} used (maximum {MOST_TICKETS} in {TICKET_SECONDS:g} s)",
                 field="tickets",
                 value=MOST_TICKETS,
-                remedy=f"wait {TICKET_SECONDS:g} s",
+                remedy=f"try again in {TICKET_SECONDS:g} s",
                 headers={"Retry-After": str(max(1, round(TICKET_SECONDS)))},
             )
         self._used[number] = float(until)

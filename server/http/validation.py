@@ -20,22 +20,22 @@ MISSING = "nothing"
 EXCERPT = 20
 """Number of characters to quote on either side of a JSON syntax error."""
 
-BOUNDS = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
+BOUNDS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
 UNION = re.compile(r"constrained-\w+|(function|literal|lax-or-strict|nullable).*|.*\[.*\]|str|int|float|[A-Z]\w+")
 """Pattern of the parts of pydantic's `loc` that name a member of a union instead of a field."""
 
 KINDS = {
-    "int": "a whole number",
+    "int": "an integer",
     "float": "a number",
     "decimal": "a number",
-    "finite": "a finite number: neither NaN nor infinity",
+    "finite": "a finite number (not NaN or infinity)",
     "bool": "true or false",
     "string": "text",
-    "list": "a list: […]",
-    "tuple": "a list: […]",
-    "dict": "an object: {…}",
-    "model": "an object: {…}",
-    "mapping": "an object: {…}",
+    "list": "a list […]",
+    "tuple": "a list […]",
+    "dict": "an object {…}",
+    "model": "an object {…}",
+    "mapping": "an object {…}",
 }
 """Description of the expected type, keyed by the first word of pydantic's error type."""
 
@@ -47,7 +47,7 @@ def validation_problem(
     prefix: str = "",
     others: int = 0,
     text: str | None = None,
-    schema: str = "the schema is at /openapi.json",
+    schema: str = "see /openapi.json for the schema",
 ) -> Problem:
     """Returns the problem for one validation error.
 
@@ -55,10 +55,10 @@ def validation_problem(
         error: entry of `ValidationError.errors()`.
         model: model that was validated, used to suggest field names. The error's `loc`, without a leading "body", is
             relative to it.
-        prefix: prefix of the field name in the problem.
+        prefix: prefix for the problem's field name.
         others: number of further errors.
         text: text that was sent, if it may be malformed JSON.
-        schema: hint where all fields are listed, for the remedy.
+        schema: hint in the remedy about where all fields are listed.
     """
     loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))
     fault, ours = fault_and_remedy(error)
@@ -135,22 +135,22 @@ def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str)
     if kind == "extra_forbidden":
         near = difflib.get_close_matches(name, known, 1)
         meant = f"did you mean {near[0]!r}? " if near else ""
-        return f"{meant}leave it out, or use one of {', '.join(known)}" if known else f"leave it out; {schema}"
+        return f"{meant}omit it, or use one of {', '.join(known)}" if known else f"omit it; {schema}"
     if bounds := [f"{words} {context[bound]:g}" for bound, words in BOUNDS.items() if bound in context]:
-        return f"give a number {' and '.join(bounds)}"
+        return f"use a number that is {' and '.join(bounds)}"
     if kind in ("literal_error", "enum"):
-        return f"give one of {context['expected']}"
+        return f"use one of {context['expected']}"
     if kind == "union_tag_invalid":
-        return f"give one of {context['expected_tags']} as {str(context['discriminator']).strip(chr(39))!r}"
+        return f"use one of {context['expected_tags']} for {str(context['discriminator']).strip(chr(39))!r}"
     if kind == "union_tag_not_found":
         return f"add {str(context['discriminator']).strip(chr(39))!r}; {schema}"
     if kind in ("too_short", "too_long", "string_too_short", "string_too_long"):
         count = context.get("min_length", context.get("max_length"))
         what = "character" if kind.startswith("string") else "item"
-        return f"give at {'least' if 'min_length' in context else 'most'} {count_noun(int(count), what)}"
+        return f"pass at {'least' if 'min_length' in context else 'most'} {count_noun(int(count), what)}"
     if kind == "string_pattern_mismatch":
-        return f"give text that matches {context['pattern']}"
+        return f"use text that matches {context['pattern']}"
     if kind == "value_error":
-        return f"give another value; {schema}"
+        return f"use another value; {schema}"
     wanted = KINDS.get(kind.partition("_")[0])
-    return f"give {wanted}" if wanted else f"send another value; {schema}"
+    return f"use {wanted}" if wanted else f"use another value; {schema}"

@@ -24,9 +24,9 @@ T = TypeVar("T")
 MAX_SOCKETS = 64
 """Maximum number of WebSockets that send frames to one scene; clients may use one per camera."""
 MAX_RETRY_S = 60.0
-"""Maximum retry delay in seconds to send to clients; longer predictions are unreliable."""
+"""Maximum retry delay in seconds that is sent to clients; longer predictions are unreliable."""
 PAUSED_RETRY_S = 5.0
-"""Retry delay in seconds for a paused scene, since it cannot be predicted when the scene is resumed."""
+"""Retry delay in seconds for a paused scene, since the time of resumption cannot be predicted."""
 
 
 @dataclass(eq=False)
@@ -40,7 +40,7 @@ class ReceivedFiles:
     file: str | None
     size: int
     kept: bool = False
-    """Whether an event references the record, so that it must not be removed."""
+    """Whether an event references the record, which must then be kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,8 @@ class IngestRules:
     """Rules for accepting frames of a scene, with the service's defaults filled in.
 
     Attributes:
-        rig: rig of the scene.
-        frames_per_second: frame rate from which the time of a frame is computed if the client sends none.
+        rig: the scene's rig.
+        frames_per_second: frame rate used to compute the time of a frame if the client sends none.
         queue_frames: maximum number of acknowledged but unfinished frames.
         when_full: whether a full queue refuses the next frame or skips the waiting frames.
         minimum_cameras: minimum number of cameras per frame.
@@ -83,7 +83,7 @@ class Ingest:
     """Admission and acknowledgement of one scene's frames, one at a time; uploads may run concurrently.
 
     Args:
-        log: journal, ledger and frame log of the scene.
+        log: the scene's journal, ledger and frame log.
         rules: rules for accepting frames.
         updates: scheduler of the scene's updates, triggered when a frame is accepted.
         publisher: publisher of the scene's events.
@@ -121,10 +121,10 @@ class Ingest:
         if self._sockets >= MAX_SOCKETS:
             raise Problem(
                 429,
-                f"this scene already has {count_noun(self._sockets, 'WebSocket')} for sending frames, the maximum",
+                f"this scene already has the maximum of {count_noun(self._sockets, 'WebSocket')} for sending frames",
                 field="id",
                 value=self.ledger.scene,
-                remedy="close one of them, or send over HTTP",
+                remedy="close one of them, or send frames over HTTP",
                 headers={"Retry-After": "5"},
             )
         self._sockets += 1
@@ -234,7 +234,8 @@ class Ingest:
                 f"frame {index} is being sent camera by camera",
                 field="n",
                 value=index,
-                remedy=f"send the other cameras, or close it: POST /v1/scenes/{self.ledger.scene}/frames/{index}/close",
+                remedy="send the other cameras' images, or close the frame: "
+                f"POST /v1/scenes/{self.ledger.scene}/frames/{index}/close",
                 received=self.ledger.open[index].cameras,
             )
         self.check_time(index, seconds)
@@ -273,7 +274,7 @@ class Ingest:
         expected = self.ledger.next_frame
         return Problem(
             409,
-            f"frame {index} would leave a gap, but each frame is reconstructed from the previous one",
+            f"received frame {index}, but expected frame {expected}; frames must arrive without gaps",
             field="n",
             value=index,
             remedy=f"send frame {expected} first, or declare it missing: POST …/frames/{expected}/missing",
@@ -286,10 +287,10 @@ class Ingest:
         if not (math.isfinite(seconds) and (before is None or seconds > before)):
             raise Problem(
                 422,
-                f"the time of frame {index} is not later than that of the previous frame",
+                f"the time of frame {index} must be finite and later than that of the previous frame",
                 field="time",
                 value=seconds,
-                remedy="give a finite time" if before is None else f"give a time above {before:g} s",
+                remedy="use a finite time" if before is None else f"use a time after {before:g} s",
             )
 
     def has_room(self) -> bool:
@@ -311,7 +312,7 @@ class Ingest:
             remedy = f"send the same frame again in {count_noun(math.ceil(seconds), 'second')}"
         return Problem(
             429,
-            f"the queue is full: {count_noun(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} waiting"
+            f"the queue is full: {count_noun(ledger.unfinished, 'frame')} waiting (maximum {self.rules.queue_frames})"
             + (", and the scene is paused" if ledger.paused else ""),
             field="n",
             value=index,
@@ -343,7 +344,7 @@ class Ingest:
         receipt = entry.receipt
         if receipt is not None and receipt.identity == identity:
             return receipt
-        known = "already known with different content or another time"
+        known = "already stored with different content or a different time"
         if receipt is None:
             missing = entry.state == FrameState.MISSING
             known = "declared missing" if missing else f"{entry.state}: {entry.error or RECORD_LOST}"
@@ -352,7 +353,7 @@ class Ingest:
             f"frame {index} is {known}",
             field="n",
             value=index,
-            remedy=f"send the next frame, {self.ledger.next_frame}; an acknowledged frame cannot be changed",
+            remedy=f"send the next frame ({self.ledger.next_frame}); acknowledged frames cannot be changed",
             expected=self.ledger.next_frame,
             identity=entry.identity,
         )

@@ -31,16 +31,16 @@ async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameRec
                 if name in given:
                     raise Problem(
                         422,
-                        f"{name!r} is given twice",
+                        f"duplicate file {name!r}",
                         field=name,
                         value=value.filename,
-                        remedy="send one file per camera and kind",
+                        remedy="send one image and at most one mask per camera",
                     )
                 given[name] = value
             else:
                 raise Problem(
                     422,
-                    f"{name!r} is not a file",
+                    f"{name!r} must be a file",
                     field=name,
                     value=value,
                     remedy="send it as a form field with a file name",
@@ -108,7 +108,7 @@ async def receive_file(
 
 
 async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: int | None) -> bytearray:
-    """Reads a file of a camera, and refuses it as soon as it exceeds the maximum size for that camera."""
+    """Reads a camera's file, and refuses it as soon as it exceeds the maximum size for that camera."""
     data = bytearray()
     try:
         check_size(camera, field, length or 0)
@@ -128,7 +128,7 @@ def _check_camera(rig: Rig, camera: str, field: str) -> None:
             f"the rig has no camera {camera!r}",
             field=field,
             value=camera,
-            remedy=f"the cameras are {', '.join(rig.names)}",
+            remedy=f"use one of {', '.join(rig.names)}",
         )
 
 
@@ -136,7 +136,7 @@ def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: b
     if not files:
         raise Problem(
             422,
-            "the frame has no pictures",
+            "the frame contains no images",
             field="body",
             value="nothing",
             remedy="send one file per camera, with the camera's name as its field name",
@@ -165,10 +165,10 @@ def _only_camera(head: FrameHead, camera: str | None) -> str:
     if len(names) != 1 or camera not in (None, names[0]):
         raise Problem(
             422,
-            f"the files belong to {count_noun(len(names), 'camera')}: {', '.join(names)}",
+            f"expected files of one camera, got files of {count_noun(len(names), 'camera')}: {', '.join(names)}",
             field="head.files",
             value=", ".join(names),
-            remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as in the URL"),
+            remedy="send only the files of one camera" + ("" if camera is None else f", {camera!r}, as in the URL"),
         )
     return names[0]
 
@@ -181,9 +181,9 @@ def _seconds(value: str) -> float:
     if not math.isfinite(seconds):
         raise Problem(
             422,
-            "time is not a finite number",
+            "time must be a finite number",
             field="time",
             value=value,
-            remedy="give seconds, such as 1.25, or leave it out",
+            remedy="use seconds, such as 1.25, or omit time",
         )
     return seconds

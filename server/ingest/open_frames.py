@@ -28,8 +28,8 @@ class OpenFrames:
     """Open frames of one scene.
 
     Args:
-        ingest: frame ingest of the scene.
-        background: background tasks of the scene.
+        ingest: the scene's frame ingest.
+        background: the scene's background tasks.
     """
 
     def __init__(self, ingest: Ingest, background: Background) -> None:
@@ -76,10 +76,10 @@ class OpenFrames:
             if frame is not None and frame.time is not None and frame.time != head.time:
                 raise Problem(
                     422,
-                    f"the time that camera {camera!r} gives for frame {index} differs from the previous cameras' time",
+                    f"the time of frame {index} from camera {camera!r} differs from the previous cameras' time",
                     field="time",
                     value=head.time,
-                    remedy=f"give {frame.time!r} or none; the first time that was given applies to the frame",
+                    remedy=f"send {frame.time!r} or no time; the first time sent applies to the frame",
                 )
 
     async def accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
@@ -105,13 +105,13 @@ class OpenFrames:
                     f"camera {camera!r} has already sent different content for frame {index}",
                     field=camera,
                     value=index,
-                    remedy="send the next frame; an acknowledged frame cannot be changed",
+                    remedy="send the next frame; acknowledged frames cannot be changed",
                 )
             if not all(kind in before for kind in kinds):
                 if index < ledger.next_frame:
                     raise Problem(
                         409,
-                        f"frame {index} was closed without this file of camera {camera!r}",
+                        f"frame {index} was closed before this file of camera {camera!r} arrived",
                         field=camera,
                         value=index,
                         remedy=f"send frame {ledger.next_frame}",
@@ -211,10 +211,10 @@ class OpenFrames:
             if frame is None:
                 raise Problem(
                     404,
-                    f"no picture of frame {index} has arrived",
+                    f"no image of frame {index} has been received",
                     field="n",
                     value=index,
-                    remedy=f"send its pictures, or declare it missing; the next frame is {ledger.next_frame}",
+                    remedy=f"send its images, or declare it missing; the next frame is {ledger.next_frame}",
                 )
             if index > ledger.next_frame:
                 raise self.ingest.gap_problem(index)
@@ -222,10 +222,10 @@ class OpenFrames:
             if len(frame.cameras) < least:
                 raise Problem(
                     409,
-                    f"only {count_noun(len(frame.cameras), 'camera')} of the required {least} sent a picture",
+                    f"received images of {count_noun(len(frame.cameras), 'camera')}, but at least {least} are required",
                     field="n",
                     value=index,
-                    remedy="send pictures of more cameras, or declare the frame missing",
+                    remedy="send images of more cameras, or declare the frame missing",
                     received=frame.cameras,
                 )
             if not self.ingest.has_room():
@@ -260,10 +260,10 @@ class OpenFrames:
                 if report.state != FrameState.MISSING:
                     raise Problem(
                         409,
-                        f"frame {index} is {report.state}, so it was accepted",
+                        f"frame {index} has already been accepted and is {report.state}",
                         field="n",
                         value=index,
-                        remedy=f"declare only frames missing that never arrived; the next frame is {ledger.next_frame}",
+                        remedy=f"declare only lost frames as missing; the next frame is {ledger.next_frame}",
                         expected=ledger.next_frame,
                     )
                 return report
@@ -272,7 +272,11 @@ class OpenFrames:
                 raise self.ingest.gap_problem(index)
             if self.ingest.is_receiving(index):
                 raise Problem(
-                    409, f"frame {index} is being received", field="n", value=index, remedy="wait for its end"
+                    409,
+                    f"frame {index} is being received",
+                    field="n",
+                    value=index,
+                    remedy="wait until it has been received",
                 )
             parts = ledger.open.get(index)
             await self._log.append(FrameMissing(index=index, reason=reason or "declared missing"))

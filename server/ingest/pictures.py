@@ -26,9 +26,9 @@ MASK = "mask."
 EXIF_ORIENTATION = 0x0112
 
 PIXEL_BYTES = 5
-"""Maximum bytes per pixel of a file; RGBA noise in a PNG needs slightly more than 4."""
+"""Maximum number of bytes per pixel in a file; RGBA noise in a PNG needs slightly more than 4."""
 METADATA_BYTES = 1_000_000
-"""Maximum bytes of metadata in a file, such as a colour profile or a preview."""
+"""Maximum size in bytes of the metadata in a file, such as a colour profile or a preview."""
 
 
 def field_of(file: FrameFile) -> str:
@@ -55,10 +55,10 @@ def check_size(camera: Camera, field: str, size: int) -> None:
     if size > (most := largest_file(camera)):
         raise Problem(
             413,
-            f"{field}: the file has {size} bytes; a picture of {camera.width}x{camera.height} has at most {most}",
+            f"{field}: the file has {size} bytes, but a {camera.width}x{camera.height} image has at most {most}",
             field=field,
             value=size,
-            remedy="send only the picture, encoded as JPEG, PNG or WebP",
+            remedy="send only the image, encoded as JPEG, PNG or WebP",
         )
 
 
@@ -80,15 +80,15 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
                 f"the rig has no camera {file.camera!r}",
                 field=field,
                 value=file.camera,
-                remedy=f"the cameras are {', '.join(rig.names)}",
+                remedy=f"use one of {', '.join(rig.names)}",
             )
         if file.camera in seen[file.kind]:
             raise Problem(
                 422,
-                f"{field!r} is given twice",
+                f"duplicate file {field!r}",
                 field=field,
                 value=file.camera,
-                remedy="send one file per camera and kind",
+                remedy="send one image and at most one mask per camera",
             )
         check_size(rig[file.camera], field, file.size)
         seen[file.kind].add(file.camera)
@@ -100,10 +100,10 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
             image = kind == FileKind.IMAGE
             raise Problem(
                 422,
-                f"no {'picture' if image else 'mask'} from {count_noun(len(missing), 'camera')}: {', '.join(missing)}",
+                f"no {'image' if image else 'mask'} for {count_noun(len(missing), 'camera')}: {', '.join(missing)}",
                 field=missing[0] if image else MASK + missing[0],
                 value="nothing",
-                remedy=f"add {'one' if len(missing) == 1 else 'one each'}"
+                remedy=f"add {'it' if len(missing) == 1 else 'one for each'}"
                 + (
                     ", or send camera by camera: PUT …/frames/{n}/cameras/{c}" if image else ", or send no masks at all"
                 ),
@@ -111,7 +111,7 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
 
 
 def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
-    """Checks that a file is complete, in an accepted format, not rotated by EXIF, and of the camera's size.
+    """Checks that a file is complete, in an accepted format, not rotated by EXIF, and has the camera's image size.
 
     Raises:
         Problem: 422 with the name of the file, its fault and the remedy.
@@ -125,19 +125,23 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
     if (header.width, header.height) != (camera.width, camera.height):
         raise Problem(
             422,
-            f"{field}: the picture is {header.width}x{header.height}, but the camera is {camera.width}x{camera.height}",
+            f"{field}: the image is {header.width}x{header.height}, but the camera is {camera.width}x{camera.height}",
             field=field,
             value=f"{header.width}x{header.height}",
-            remedy="send pictures in the size for which the camera was calibrated",
+            remedy="send images of the size for which the camera was calibrated",
         )
     if file.kind == FileKind.MASK and header.format != "png":
         raise Problem(
-            422, f"{field}: the mask is {header.format}", field=field, value=header.format, remedy="send masks as PNG"
+            422,
+            f"{field}: masks must be PNG, got {header.format}",
+            field=field,
+            value=header.format,
+            remedy="encode masks as PNG",
         )
     if header.exif and (orientation := _orientation(data)) != 1:
         raise Problem(
             422,
-            f"{field}: EXIF orientation {orientation} would rotate the picture",
+            f"{field}: EXIF orientation {orientation} would rotate the image",
             field=field,
             value=orientation,
             remedy="store the pixels in the calibrated orientation and remove the tag",
@@ -196,17 +200,17 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
     if start[:4] == b"RIFF" and start[8:] == b"WEBP":
         return _webp(data)
     if not start:
-        raise StructureError("the file is empty", "send the picture as JPEG, PNG or WebP")
+        raise StructureError("the file is empty", "send the image as JPEG, PNG or WebP")
     raise StructureError(
-        f"the file starts with {start[:8].hex(' ')}, so it is not JPEG, PNG or WebP",
-        "encode the picture as one of these",
+        f"not a JPEG, PNG or WebP file: it starts with {start[:8].hex(' ')}",
+        "encode the image in one of these formats",
     )
 
 
 def _truncated(kind: str, size: int) -> StructureError:
     return StructureError(
         f"the {kind} file is truncated after {size} bytes",
-        "send it again from its source",
+        "send the original file again",
     )
 
 
@@ -218,9 +222,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
         if at + 2 > len(data):
             raise _truncated("JPEG", len(data))
         if data[at] != 0xFF:
-            raise StructureError(
-                f"the JPEG file has no marker at byte {at}", "the file is damaged: send it again from its source"
-            )
+            raise StructureError(f"missing JPEG marker at byte {at}", "the file is damaged; send the original again")
         marker = data[at + 1]
         if marker == 0xD9:
             break
@@ -232,13 +234,13 @@ def _jpeg(data: memoryview) -> ImageHeader:
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             if length < 8:
                 raise StructureError(
-                    "the JPEG file has a short frame header", "the file is damaged: send it again from its source"
+                    "the JPEG frame header is too short", "the file is damaged; send the original again"
                 )
             bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
             if bits != 8 or channels not in (1, 3):
                 kind = "CMYK, " if channels == 4 else ""
                 value = f"{kind}{channels} channels of {bits} bits"
-                raise StructureError(f"the JPEG file has {value}", "send 8-bit RGB or greyscale", value)
+                raise StructureError(f"unsupported JPEG format: {value}", "send 8-bit RGB or greyscale", value)
             header = ImageHeader("jpeg", width, height)
             components = channels if marker in (0xC0, 0xC1) else 0
         exif |= marker == 0xE1 and bytes(data[at + 4 : at + 10]) == b"Exif\0\0"
@@ -250,7 +252,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
                 break
             at = _end_of_scan(data, at)
     if header is None:
-        raise StructureError("the JPEG file has no frame header", "the file is damaged: send it again from its source")
+        raise StructureError("the JPEG file has no frame header", "the file is damaged; send the original again")
     return replace(header, exif=exif)
 
 
@@ -276,25 +278,27 @@ def _png(data: memoryview) -> ImageHeader:
             raise _truncated("PNG", len(data))
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
             raise StructureError(
-                f"the {kind!r} chunk at byte {at} of the PNG file fails its checksum",
-                "the file was damaged in transit: send it again",
+                f"checksum mismatch in the {kind!r} chunk at byte {at} of the PNG file",
+                "the file was damaged in transit; send it again",
             )
         if header is None:
             if kind != b"IHDR" or length != 13:
                 raise StructureError(
-                    "the PNG file does not start with its header", "the file is damaged: send it again from its source"
+                    "the PNG file does not start with a valid header", "the file is damaged; send the original again"
                 )
             header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
             if data[at + 16] == 16:
-                raise StructureError("the PNG file has 16 bits per channel", "convert the picture to 8 bits", "16 bits")
+                raise StructureError(
+                    "the PNG file has 16 bits per channel", "convert the image to 8 bits per channel", "16 bits"
+                )
         if kind == b"acTL":
-            raise StructureError("the PNG file is animated", "send one picture per file", "animated")
+            raise StructureError("the PNG file is animated", "send a single still image", "animated")
         pixels |= kind == b"IDAT"
         if kind == b"IEND":
             break
         at = end
     if not pixels:
-        raise StructureError("the PNG file has no pixels", "the file is damaged: send it again from its source")
+        raise StructureError("the PNG file contains no pixels", "the file is damaged; send the original again")
     return header
 
 
@@ -309,7 +313,7 @@ def _webp(data: memoryview) -> ImageHeader:
         if len(body) < length or at + 8 + length > size:
             raise _truncated("WebP", len(data))
         if kind in (b"ANIM", b"ANMF"):
-            raise StructureError("the WebP file is animated", "send one picture per file", "animated")
+            raise StructureError("the WebP file is animated", "send a single still image", "animated")
         if kind == b"VP8X" and length >= 10:
             width, height = int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
             header = ImageHeader("webp", width, height)
@@ -321,5 +325,5 @@ def _webp(data: memoryview) -> ImageHeader:
             header, pixels = header or ImageHeader("webp", (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1), True
         at += 8 + length + length % 2
     if header is None or not pixels:
-        raise StructureError("the WebP file has no pixels", "the file is damaged: send it again from its source")
+        raise StructureError("the WebP file contains no pixels", "the file is damaged; send the original again")
     return header

@@ -23,7 +23,7 @@ from server.storage.frame_store import BLOCK, Upload
 T = TypeVar("T")
 
 BATCH = 4_000_000
-"""Maximum total bytes of files that are checked, hashed and written together; a larger file is its own batch."""
+"""Maximum total size in bytes of files that are checked, hashed and written together; larger files go alone."""
 MAX_SPARE_BUFFERS = 8
 """Maximum number of batch buffers to keep for reuse, because allocating memory takes as long as filling it."""
 
@@ -39,8 +39,8 @@ class FrameReceiver:
     While one batch is being filled, a thread checks, hashes and writes the previous one.
 
     Args:
-        folder: folder of the frame log.
-        head: head of the frame, with the names and sizes of the files.
+        folder: frame log folder.
+        head: frame header, with the names and sizes of the files.
         seconds: time of the frame in seconds, or None if it is not known yet.
         check: called with each file and its contents.
         keep: whether to write the files; if False, they are only checked and hashed.
@@ -133,8 +133,8 @@ class FrameReceiver:
             try:
                 await asyncio.shield(self._at_work)
             except FileNotFoundError:  # the folder no longer exists
-                remedy = "GET /v1/scenes lists the scenes"
-                raise Problem(404, "the scene was deleted in the meantime", field="id", remedy=remedy) from None
+                remedy = "list all scenes with GET /v1/scenes"
+                raise Problem(404, "the scene was deleted during the request", field="id", remedy=remedy) from None
             self._at_work = None
 
     def _return_buffers(self) -> None:
@@ -150,11 +150,11 @@ async def read_framed(
 
     Args:
         chunks: chunks of the body as they arrive.
-        begin: called with the head; raises `Problem` or returns the receiver.
+        begin: called with the header; raises `Problem` or returns the receiver.
         total: announced number of bytes, or None.
 
     Raises:
-        Problem: 422 if the body is not a frame or contradicts its head; also any problem raised by `begin` or the
+        Problem: 422 if the body is not a frame or contradicts its header; also any problem raised by `begin` or the
             checks.
     """
     start = bytearray()
@@ -176,10 +176,12 @@ async def read_framed(
                 receiving = begin(head)
             if len(view) > receiving.missing:
                 over = len(view) - receiving.missing
-                raise FramingError(f"has {over} or more bytes after its last file", "send nothing after the files")
+                raise FramingError(
+                    f"has at least {over} extra bytes after its last file", "end the body after the last file"
+                )
             await receiving.take(view)
         if head is None or receiving is None:
-            raise FramingError(f"ends after {len(start)} bytes, within its head", "send the whole frame")
+            raise FramingError(f"ends after {len(start)} bytes, before the end of its header", "send the whole frame")
         if receiving.missing:
             raise FramingError(f"ends {receiving.missing} bytes before the end of its files", "send the whole frame")
         return head, receiving
@@ -208,7 +210,9 @@ def framing_problem(error: FramingError) -> Problem:
 def _check_length(head: FrameHead, start: int, total: int | None) -> None:
     expected = start + sum(file.size for file in head.files)
     if total is not None and total != expected:
-        raise FramingError(f"has {total} bytes, but its head announces {expected}", "send what the head announces")
+        raise FramingError(
+            f"has {total} bytes, but its header declares {expected}", "send the files that the header lists"
+        )
 
 
 def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
@@ -241,9 +245,9 @@ async def receive_frame(
     """Receives and acknowledges a complete frame as S4DF.
 
     Args:
-        ingest: frame ingest of the scene.
-        index: frame index from the URL, or None if only the head contains it.
-        body: body of the request in chunks.
+        ingest: the scene's frame ingest.
+        index: frame index from the URL, or None if only the header contains it.
+        body: request body in chunks.
         length: announced number of bytes, or None.
 
     Raises:
@@ -258,7 +262,7 @@ async def receive_frame(
         if keep:
             ingest.begin_receiving(head.index)
             begun.append(head.index)
-        whole = head.model_copy(update={"single_camera": False})  # the URL takes precedence over the head
+        whole = head.model_copy(update={"single_camera": False})  # the URL takes precedence over the header
         return frame_receiver(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
 
     try:
@@ -310,11 +314,11 @@ async def drain(body: AsyncIterator[bytes]) -> None:
 
 
 def check_index(head: FrameHead, index: int | None) -> None:
-    """Raises `Problem` (422) if the index in the head differs from `index`, which is the one in the URL, if any."""
+    """Raises `Problem` (422) if the index in the header differs from `index`, the index in the URL, if there is one."""
     if index is not None and head.index != index:
         raise Problem(
             422,
-            f"the head gives frame {head.index}, but the URL gives frame {index}",
+            f"the header contains frame index {head.index}, but the URL contains {index}",
             field="head.index",
             value=head.index,
             remedy="use the same index in both",

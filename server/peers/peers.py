@@ -20,9 +20,9 @@ from server.problems import Problem
 PROXIED_HEADER = "x-scas4d-proxied"
 """Header of a request from one service to another, which must handle the request itself instead of forwarding it."""
 FRESH_S = 3.0
-"""Seconds for which the list of peers, or the fact that no peer owns a scene, is cached."""
+"""Time in seconds for which the list of peers, or the fact that no peer owns a scene, is cached."""
 LIST_S = 2.0
-"""Maximum seconds for which a request waits for the first list of peers; later requests use the previous list."""
+"""Maximum time in seconds that a request waits for the first list of peers; later requests use the previous list."""
 ASK_S = 5.0
 """Timeout in seconds of a request to a peer about its scenes."""
 CONNECT_S = 3.0
@@ -30,7 +30,7 @@ CONNECT_S = 3.0
 SILENT_S = 130.0
 """Read timeout in seconds of a forwarded request, longer than the time limit of a query."""
 REMEMBERED_S = 600.0
-"""Seconds for which a lost service is expected to return; clients of its scenes are asked to retry."""
+"""Time in seconds within which a lost service is expected to return; clients of its scenes are asked to retry."""
 MOST_KNOWN = 100_000
 """Maximum number of scenes whose owner is cached."""
 MOST_UNKNOWN = 1_000
@@ -47,7 +47,7 @@ class Peers:
 
     Args:
         listed: returns the addresses of the peers, such as `http://10.0.0.2:8000`; it may be slow.
-        secret: token shared by all services of the cluster; None if there is no token.
+        secret: token shared by all services in the cluster; None if there is no token.
         client: HTTP client; None creates one.
 
     Attributes:
@@ -97,7 +97,7 @@ class Peers:
             now = time.monotonic()
             seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
             self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # previous ones were listed until now
-        except Exception:  # the head of the cluster does not respond, or its response is unexpected
+        except Exception:  # the head node does not respond, or its response is unexpected
             log.exception("cannot list the peers; using the previous list")
         finally:
             self._asked, self._listing = time.monotonic(), None
@@ -178,7 +178,9 @@ class Peers:
             return None
         if answer.status_code in (200, 404):
             return answer.status_code == 200
-        log.warning("cannot tell whether service %s has scene %s: status %d", address, scene, answer.status_code)
+        log.warning(
+            "cannot determine whether service %s owns scene %s: HTTP status %d", address, scene, answer.status_code
+        )
         return None
 
     async def _get(self, address: str, path: str, permission: Permission) -> httpx.Response | None:
@@ -191,7 +193,9 @@ class Peers:
             self._refusing.discard(address)
         elif address not in self._refusing:
             self._refusing.add(address)
-            log.warning("service %s rejects the token; give all services of a cluster the same SCAS4D_TOKEN", address)
+            log.warning(
+                "service %s rejects the token; set the same SCAS4D_TOKEN on all services in the cluster", address
+            )
         return answer
 
 
@@ -199,15 +203,15 @@ def unreachable_problem(scene: str, *, refused: bool = False) -> Problem:
     """Returns the 503 problem for a scene whose owner, or possible owner, does not respond.
 
     Args:
-        scene: id of the scene.
-        refused: whether the peer responds but rejects the token of this service.
+        scene: scene id.
+        refused: whether the peer responds but rejects this service's token.
     """
     fault, remedy = "does not respond", "try again later; all acknowledged frames are on disk"
     if refused:
-        fault, remedy = "rejects this service's token", "give all services of a cluster the same SCAS4D_TOKEN"
+        fault, remedy = "rejects this service's token", "set the same SCAS4D_TOKEN on all services in the cluster"
     return Problem(
         503,
-        f"the service of the cluster that owns, or may own, this scene {fault}",
+        f"the service that owns, or may own, this scene {fault}",
         field="id",
         value=scene,
         remedy=remedy,

@@ -173,7 +173,7 @@ async def _forward_request(
             await send({"type": "http.response.body", "body": part, "more_body": True})
         await send({"type": "http.response.body", "body": b""})
     except httpx.HTTPError as error:  # the client receives an incomplete body
-        log.warning("the response of %s ended early: %s: %s", owner, type(error).__name__, error)
+        log.warning("the response from %s ended early: %s: %s", owner, type(error).__name__, error)
     finally:
         await answer.aclose()
     return answer.status_code

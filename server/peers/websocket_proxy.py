@@ -37,8 +37,8 @@ async def proxy_websocket(
 
     Args:
         address: URL of the WebSocket at the peer, `http://…`.
-        scene: id of the scene.
-        headers: headers of the request to the peer.
+        scene: scene id.
+        headers: headers for the request to the peer.
         most_bytes: maximum size in bytes of a message from the client.
         scope: ASGI scope of the client's WebSocket.
         receive: ASGI `receive` callable of the client's WebSocket.
@@ -118,7 +118,7 @@ async def _from_peer(peer: ClientConnection, send: Send) -> None:
 
 
 def _may_be_sent(code: int) -> bool:
-    """Returns whether a close code may be sent; some codes are reserved for local use (RFC 6455, 7.4)."""
+    """Returns whether a close code may be sent on the wire; some codes are for local use only (RFC 6455, 7.4)."""
     return 1000 <= code < 5000 and code not in (1004, 1005, ABNORMAL, 1015)
 
 
@@ -129,7 +129,7 @@ async def _refuse_handshake(refused: InvalidStatus, scope: Scope, receive: Recei
         problem = Problem(
             answer.status_code,
             "the service that owns the scene refused the connection",
-            remedy="see GET /v1/scenes/ID of the scene for the reason",
+            remedy="request GET /v1/scenes/ID to see the reason",
         )
         await problems.refuse(problem, scope, receive, send)
         return

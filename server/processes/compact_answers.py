@@ -38,9 +38,9 @@ def write_compact(
 
     Args:
         file: path of the output; an existing file is replaced.
-        history: committed states of the scene.
+        history: the scene's committed states.
         asked: indices of the requested frames in ascending order.
-        head: header of the output.
+        head: header for the output.
         labels: [N] part label of each Gaussian, or None.
 
     Returns:

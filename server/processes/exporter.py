@@ -54,10 +54,10 @@ def explain(error: Exception) -> str:
     if isinstance(error, DiskReserveError) or no_room(error):
         return f"the disk is full ({message_of(error)}); export fewer frames, or choose a smaller format"
     if isinstance(error, DamagedFrameError):
-        return f"{message_of(error)}; export again later: the service repairs the file if it can"
+        return f"{message_of(error)}; try again later; the service repairs the file if possible"
     if isinstance(error, HistoryError):
         return (
-            f"{message_of(error)}: its state was deleted during the export, by the scene's retention or a restart of "
+            f"{message_of(error)}: the state was deleted during the export by the retention rules or a restart of "
             "its reconstruction; export later frames, or keep more states (keep_states)"
         )
     if isinstance(error, InputError):

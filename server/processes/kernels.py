@@ -17,7 +17,7 @@ log = logging.getLogger("scas4d.worker")
 
 
 def wait_for_first(settings: Settings, points: bool, connection: Connection[Any, Any]) -> float:
-    """Waits until the kernels of the first frame are compiled and returns the seconds waited.
+    """Waits until the first frame's kernels are compiled and returns the time waited in seconds.
 
     The kernels of updates are compiled afterwards, while the first frame is being reconstructed.
 
@@ -33,7 +33,7 @@ def wait_for_first(settings: Settings, points: bool, connection: Connection[Any,
 
 
 def wait_for_updates(settings: Settings, connection: Connection[Any, Any] | None) -> float:
-    """Waits until the kernels of updates and of rendering are compiled and returns the seconds waited.
+    """Waits until the update and rendering kernels are compiled and returns the time waited in seconds.
 
     Args:
         settings: settings of the scene.

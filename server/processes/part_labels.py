@@ -76,7 +76,7 @@ class PartLabels:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            log.warning("cannot read %s (%s): parts get new numbers", file, error)
+            log.warning("cannot read %s (%s); renumbering the parts", file, error)
             return None
 
     def _write(self, count: int | None, known: StoredLabels) -> None:
@@ -89,6 +89,6 @@ class PartLabels:
                 np.savez(opened, **arrays)
             beside.replace(file)
         except OSError as error:  # a full disk must not fail the query; only the numbering after a restart is lost
-            log.warning("cannot write %s (%s): after a restart, parts get new numbers", file, error)
+            log.warning("cannot write %s (%s); parts will be renumbered after a restart", file, error)
             with contextlib.suppress(OSError):
                 beside.unlink()

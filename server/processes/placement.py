@@ -28,23 +28,23 @@ Entry = Callable[..., None]
 """
 
 STOP_SECONDS = 5.0
-"""Seconds within which a process must exit on its own when its scene or the service stops.
+"""Time in seconds for a process to exit on its own when its scene or the service stops.
 
 An unfinished frame is processed again after the restart.
 """
 PARENT_CHECK_S = 0.5
-"""Interval in seconds at which a process checks that the service is still running."""
+"""Interval in seconds between a process's checks that the service is still running."""
 
 _context = multiprocessing.get_context("spawn")
 
 
 class ProcessExit(str):
-    """Reason for the exit of a process, as a sentence.
+    """Reason why a process exited, as text.
 
     Attributes:
         exit_code: exit code as in multiprocessing, −N for signal N; None if unknown.
-        lost: whether the machine of the process is down or unreachable.
-        out_of_memory: whether the kernel's OOM killer killed processes in the control group of the process. If None,
+        lost: whether the process's machine is down or unreachable.
+        out_of_memory: whether the kernel's OOM killer killed processes in the process's control group. If None,
             the caller must check the control group of this machine.
     """
 
@@ -55,8 +55,8 @@ class ProcessExit(str):
     def __new__(
         cls, exit_code: int | None, why: str = "", *, lost: bool = False, out_of_memory: bool | None = None
     ) -> ProcessExit:
-        """Creates the reason from the exit code, or from `why` if given."""
-        self = super().__new__(cls, why or f"its process exited unexpectedly (exit code {exit_code})")
+        """Creates the reason from `why` if given, otherwise from the exit code."""
+        self = super().__new__(cls, why or f"exit code {exit_code}")
         self.exit_code, self.lost, self.out_of_memory = exit_code, lost, out_of_memory
         return self
 
@@ -242,7 +242,7 @@ class Placement:
         return LocalProcess(entry, spec, on_message, on_end, self.prepare)
 
     async def cluster(self) -> Cluster | None:
-        """Returns the machines on which processes run, or None if all run on this machine."""
+        """Returns the machines that run processes, or None if all processes run on this machine."""
         return None
 
     async def announce(self, host: str, port: int) -> None:

@@ -29,7 +29,7 @@ MOST_WAITING = 64
 This corresponds to one or two seconds of rendering. A longer queue would only add latency.
 """
 ANSWER_SECONDS = 120.0
-"""Seconds after which a query fails with 503; the longest accepted query takes about half of that."""
+"""Timeout in seconds, after which a query fails with 503; the longest accepted query takes about half of that."""
 
 OnDamage = Callable[[Mapping[str, str]], None]
 """Callback that receives a mapping from the name of each unreadable file in the states folder to the reason."""
@@ -52,13 +52,13 @@ class _WaitingQuery:
 
 
 class QueryExecutor:
-    """Reader process with a queue of queries, of which it handles one at a time; cancelled queries are never started.
+    """Reader process with a queue of queries, handled one at a time; cancelled queries are never started.
 
     Args:
-        entry: entry point of the process.
-        spec: specification of the scene.
+        entry: process entry point.
+        spec: scene specification.
         placement: starts the process.
-        grace: seconds for which the process may continue with a cancelled query before it is stopped.
+        grace: time in seconds that the process may spend on a cancelled query before it is stopped.
         damaged: called with a mapping from the name of each damaged file to the reason.
 
     Attributes:
@@ -131,7 +131,7 @@ class QueryExecutor:
                 f"no answer within {ANSWER_SECONDS:g} s",
                 field="id",
                 value=self._spec.folder.name,
-                remedy="request less at once, or try again later",
+                remedy="request less data at once, or try again later",
                 headers={"Retry-After": "5"},
             ) from None
         finally:
@@ -187,7 +187,7 @@ class QueryExecutor:
         if self._at_work is not turn or self.process is None:
             return
         log.warning(
-            "scene %s: a %s query was cancelled; restarting its reader", self._spec.folder.name, turn.query.kind
+            "scene %s: a %s query was cancelled; restarting the reader", self._spec.folder.name, turn.query.kind
         )
         task = asyncio.ensure_future(self.process.stop(0))
         self._ending.add(task)
@@ -208,7 +208,7 @@ class QueryExecutor:
                 turn.lost = True
                 self._waiting.appendleft(turn)
             else:
-                fault = f"the reader exited while it was working on this query: {reason}"
+                fault = f"the reader exited while processing this query ({reason})"
                 turn.end(QueryRefused(turn.number, fault, status=503 if reason.lost else 500))
         self._pause = asyncio.get_running_loop().call_later(pause, self._restart)
 

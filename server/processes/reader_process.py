@@ -156,25 +156,28 @@ class QueryReader:
             try:
                 return self._answer(ask.number, ask.query)
             except DamagedFrameError as error:
-                log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                log.warning("scene %s: %s failed: %s", self.spec.folder.name, asked, error)
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # computed from the remaining states
                     continue
                 return QueryRefused(
-                    ask.number, message_of(error), "try again later: the service repairs the file if it can", status=503
+                    ask.number,
+                    message_of(error),
+                    "try again later; the service repairs the file if possible",
+                    status=503,
                 )
             except UnreadableFrameError as error:  # deleted after the service checked
-                log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
+                log.warning("scene %s: %s failed: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
                 return QueryRefused(ask.number, message_of(error), status=404)
             except InputError as error:
-                log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
+                log.warning("scene %s: %s refused: %s", self.spec.folder.name, asked, error)
                 status = 404 if isinstance(ask.query, GaussiansQuery) else 422
                 return QueryRefused(ask.number, without_paths(error.fault), without_paths(error.remedy), status)
             except ValueError as error:
-                log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
+                log.warning("scene %s: %s refused: %s", self.spec.folder.name, asked, error)
                 return QueryRefused(ask.number, message_of(error))
             except Exception as error:
-                log.exception("scene %s, %s", self.spec.folder.name, asked)
+                log.exception("scene %s: %s failed", self.spec.folder.name, asked)
                 return QueryRefused(ask.number, f"{type(error).__name__}: {message_of(error)}", status=500)
         raise AssertionError("the last iteration always returns")
 

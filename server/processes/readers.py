@@ -33,15 +33,15 @@ from server.processes.queries import (
 from server.processes.query_executor import OnDamage, QueryExecutor
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
-"""Seconds for which a process may continue with a cancelled query; starting a new process takes 1 to 2 s."""
+"""Time in seconds that a process may spend on a cancelled query; starting a new process takes 1 to 2 s."""
 MOST_STALE = 10_000
 """Maximum number of changed frames to track individually; if there are more, the states folder is listed again."""
 COUNTS_KEPT = 8
 """Maximum number of part counts whose labels are cached."""
 
-NOT_COMMITTED = "request a frame that the scene's status counts as committed"
+NOT_COMMITTED = "request a committed frame; see the scene's status"
 REMEDIES = {404: NOT_COMMITTED, 500: SERVICE_FAULT, 503: "try again later"}
-"""Default remedy for each HTTP status, used if the process gives none."""
+"""Default remedy for each HTTP status, used if the process specifies none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,5 +175,5 @@ def _check_answer(answer: Answer | QueryRefused, query: Query) -> Answer:
         headers = {"Retry-After": "1"} if answer.status == 503 else None
         raise Problem(answer.status, answer.fault, remedy=remedy, headers=headers)
     field, value = refused_field(query)
-    remedy = answer.remedy or f"give another {field}"
+    remedy = answer.remedy or f"use another {field}"
     raise Problem(answer.status, answer.fault, field=field, value=value, remedy=remedy)

@@ -24,7 +24,7 @@ class StateCompactor:
     """Compactor that converts all but the newest states of a scene to the compact format.
 
     Args:
-        spec: specification of the scene. If ``retention.exact_states`` is None, all states stay exact.
+        spec: scene specification. If ``retention.exact_states`` is None, all states stay exact.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -44,7 +44,7 @@ class StateCompactor:
         """Compacts due states until a message arrives; if the disk is full, retries at the next message.
 
         Args:
-            history: committed states of the scene.
+            history: the scene's committed states.
             waits: returns whether a message is waiting.
         """
         exact = self._rules.exact_states
@@ -58,7 +58,7 @@ class StateCompactor:
                     return
         except Exception as error:  # compaction is optional, so the scene continues with exact states
             if no_room(error):
-                log.warning("scene %s: states cannot be compacted: %s", self._spec.folder.name, error)
+                log.warning("scene %s: cannot compact states: %s", self._spec.folder.name, error)
                 return
             log.exception("scene %s: compaction is disabled until its worker restarts", self._spec.folder.name)
             self._failed = True

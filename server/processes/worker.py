@@ -136,7 +136,7 @@ class Worker:
             report = history.report(history.indices[-1]) if history.indices else {}
             self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
         except (HistoryError, ValueError) as error:  # damaged data raises ValueError
-            log.exception("scene %s: cannot resume", self.spec.folder.name)
+            log.exception("scene %s: cannot resume from the committed states", self.spec.folder.name)
             self.connection.send(ResumeFailed(f"{type(error).__name__}: {message_of(error)}"))
             return False
         return True
@@ -154,7 +154,7 @@ class Worker:
             except Exception as error:  # a full disk can surface as another error, such as one from closing a zip file
                 if not no_room(error):
                     raise
-                log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
+                log.warning("scene %s: cannot commit frame %d yet: %s", self.spec.folder.name, message.index, error)
                 self.connection.send(WaitingForDisk(message.index, message_of(error), stall))
             self._await_room(stall)
             stall = min(2 * stall, LONGEST_STALL_S)
@@ -193,7 +193,7 @@ class Worker:
             frame, dropped = decode(self.spec.rig, message, read(self._pictures, message))
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
-                reason = f"usable pictures: {len(frame.images)}, but the scene requires at least {least}"
+                reason = f"usable images: {len(frame.images)} (the scene requires at least {least})"
                 return FrameFailedInWorker(message.index, reason, dropped)
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
@@ -201,7 +201,7 @@ class Worker:
         except Exception as error:  # any failure in the core must be reported, and the service must keep running
             if no_room(error):
                 raise
-            log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
+            log.exception("scene %s: error in frame %d", self.spec.folder.name, message.index)
             # Without a first frame the scene cannot continue.
             first = self.reconstruction is None
             return FrameFailedInWorker(
@@ -328,7 +328,7 @@ def read(folder: Path, message: FrameReady) -> Encoded:
             contents.faults.append(f"a record in the frame log is damaged: {error}")
             continue
         if len(message.files) == 1 and frame_identity(pictures.hashes, message.time) != message.identity:
-            raise FrameDamage(f"{name}: its pictures differ from the acknowledged ones")
+            raise FrameDamage(f"{name}: its images differ from the acknowledged ones")
         contents.images.update(pictures.images)
         contents.masks.update(pictures.masks)
     return contents
@@ -354,7 +354,7 @@ def _pictures_of(camera: Camera, encoded: Encoded) -> tuple[Picture, Picture | N
     """Returns a camera's image and mask, if any, or the reason for leaving the camera out."""
     name, size = camera.name, (camera.width, camera.height)
     if name not in encoded.images:
-        return "; ".join(encoded.faults) or f"camera {name!r} had sent no picture when the frame was closed"
+        return "; ".join(encoded.faults) or f"camera {name!r} had not sent an image when the frame was closed"
     try:
         image = decode_image(bytes(encoded.images[name]), size=size, name=f"image of camera {name!r}")
         if name not in encoded.masks:

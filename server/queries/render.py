@@ -30,7 +30,7 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
     if pixels > MOST_PIXELS:
         raise Problem(
             422,
-            f"the view has {pixels} pixels",
+            f"the view has {pixels} pixels, more than {MOST_PIXELS}",
             field="camera" if request.width is None else "width",
             value=f"{camera.width}x{camera.height}",
             remedy=f"request at most {MOST_PIXELS} pixels",
@@ -39,10 +39,10 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
     if request.format not in SEVERAL and len(kinds) > 1:
         raise Problem(
             422,
-            f"{request.format} cannot store {count_noun(len(kinds), 'kind')}",
+            f"{request.format} can store only one kind, got {count_noun(len(kinds), 'kind')}",
             field="kinds",
             value=", ".join(kinds),
-            remedy="request one kind, or format npz or float32",
+            remedy="request one kind, or use format npz or float32",
         )
     if request.format in LOSSY and kinds[0] in ("depth", "parts"):
         raise Problem(
@@ -50,7 +50,7 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
             f"{request.format} would distort {kinds[0]}",
             field="format",
             value=request.format.value,
-            remedy="request png, npz or float32",
+            remedy="use format png, npz or float32",
         )
     own = scene.spec.settings.scene.background
     return RenderQuery(

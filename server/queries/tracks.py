@@ -44,7 +44,11 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if len(asked) != 1:
         given = ", ".join(name for name, _ in asked) or "none"
         raise Problem(
-            422, f"the query gives {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
+            422,
+            f"expected exactly one of ids, pixels, points; got {given}",
+            field="ids",
+            value=given,
+            remedy="pass exactly one of them",
         )
     scene.committed_frame(None, "from")
     start = scene.committed[0] if request.first is None else request.first
@@ -53,7 +57,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if not frames:
         raise Problem(
             422,
-            f"there is no committed frame from {start} to {end}",
+            f"no committed frames from {start} to {end}",
             field="from",
             value=start,
             remedy=f"request frames from {scene.committed[0]} to {scene.committed[-1]}",
@@ -62,7 +66,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if len(queries) * len(frames) > MOST_POINTS:
         raise Problem(
             422,
-            f"{count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')}",
+            f"too many tracks: {count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')}",
             field=field,
             value=len(queries) * len(frames),
             remedy=f"request at most {MOST_POINTS} points times frames at once",
@@ -70,10 +74,10 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if request.format == "json" and len(queries) * len(frames) > MOST_JSON_POINTS:
         raise Problem(
             422,
-            f"{count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')} as JSON",
+            f"too many tracks for JSON: {count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')}",
             field="format",
             value="json",
-            remedy=f"request npz, or at most {MOST_JSON_POINTS} points times frames",
+            remedy=f"use format npz, or request at most {MOST_JSON_POINTS} points times frames",
         )
     check_ids(request.ids or ())
     if request.pixels is not None and request.camera is None:
@@ -82,15 +86,15 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
             "pixels require a camera",
             field="camera",
             value="nothing",
-            remedy=f"give one of {', '.join(scene.rig.names)}",
+            remedy=f"set camera to one of {', '.join(scene.rig.names)}",
         )
     if request.points is not None and max(abs(value) for row in request.points for value in row) > FARTHEST:
         raise Problem(
             422,
-            "a point is too far away",
+            "a point has a coordinate that is too large",
             field="points",
             value=max((row for row in request.points), key=lambda row: max(map(abs, row))),
-            remedy=f"give coordinates up to {FARTHEST:g}, in the rig's units",
+            remedy=f"use coordinates within ±{FARTHEST:g}, in the rig's units",
         )
     query = TracksQuery(
         frames=frames,
@@ -107,7 +111,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if len(cameras) * len(frames) > MOST_VIEWS:
         raise Problem(
             422,
-            f"visibility in {count_noun(len(cameras), 'camera')} over {count_noun(len(frames), 'frame')}",
+            f"too many depth maps: {count_noun(len(cameras), 'camera')} over {count_noun(len(frames), 'frame')}",
             field="project" if request.project else "camera",
             value=len(cameras) * len(frames),
             remedy=f"request at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
@@ -125,10 +129,10 @@ def _check_pixels(query: TracksQuery) -> None:
         value = query.pixels[outside[0]].tolist()
         raise Problem(
             422,
-            f"pixel {int(outside[0])} is outside the picture of camera {query.camera.name!r}",
+            f"pixel {int(outside[0])} is outside the image of camera {query.camera.name!r}",
             field="pixels",
             value=value,
-            remedy=f"give 0 ≤ u < {width}, 0 ≤ v < {height}",
+            remedy=f"use 0 ≤ u < {width} and 0 ≤ v < {height}",
         )
 
 
@@ -143,7 +147,7 @@ def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
                 f"two different cameras are named {camera.name!r}",
                 field="project",
                 value=camera.name,
-                remedy="give them different names; answers are keyed by name",
+                remedy="use different names; answers are keyed by camera name",
             )
     return tuple(by_name.values())
 
@@ -156,10 +160,10 @@ def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
         size = f"{camera.width}x{camera.height}"
         raise Problem(
             422,
-            f"camera {camera.name!r} has a picture size of {size}",
+            f"the image size {size} of camera {camera.name!r} is too large",
             field="camera",
             value=size,
-            remedy=f"give at most {MOST_PIXELS} pixels",
+            remedy=f"use at most {MOST_PIXELS} pixels",
         )
     return camera.camera()
 
@@ -168,5 +172,5 @@ def check_ids(ids: Iterable[int]) -> None:
     """Raises `Problem` if an id is outside the range of Gaussian ids."""
     for id in ids:
         if not 0 <= id <= LARGEST_ID:
-            remedy = "use ids from an answer of the service"
-            raise Problem(422, f"{id} is not a valid id", field="ids", value=id, remedy=remedy)
+            remedy = "use ids from a response of the service"
+            raise Problem(422, f"invalid id {id}", field="ids", value=id, remedy=remedy)

@@ -26,13 +26,13 @@ from server.storage.ledger import SceneLog
 SENTENCES_KEPT = 100
 """Maximum number of damage messages that are kept; the oldest messages are dropped."""
 RETRY_S = 5.0
-"""Seconds before a repair that failed because of a full disk is retried."""
+"""Delay in seconds before a repair that failed because of a full disk is retried."""
 RECOMPUTE_OUTCOMES = frozenset(
     {RepairOutcome.RECOMPUTED, RepairOutcome.LOST, RepairOutcome.LATER, RepairOutcome.NO_ROOM}
 )
 """Outcomes that end the recomputation of a state; other outcomes may belong to an earlier request for the file."""
 MAX_DEATHS = 2
-"""Number of worker crashes while recomputing a state, after which the state is declared lost."""
+"""Number of worker crashes during the recomputation of a state after which the state is declared lost."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -55,7 +55,7 @@ class DamageLog:
     Repeated messages are counted, or ignored if they concern the same lasting damage.
 
     Args:
-        sentences: messages from the recovery of the scene.
+        sentences: messages from the scene's recovery.
     """
 
     def __init__(self, sentences: Iterable[str] = ()) -> None:
@@ -65,7 +65,7 @@ class DamageLog:
             self._keep(without_paths(sentence))
 
     def add(self, kind: DamageKind, sentence: str, *, lasting: bool = False) -> None:
-        """Adds a message; `lasting` marks damage that cannot be repaired and that every check therefore finds again."""
+        """Adds a message; `lasting` marks damage that cannot be repaired, so every check finds it again."""
         sentence = without_paths(sentence)
         if lasting and sentence in self._counts:
             return
@@ -89,9 +89,9 @@ class RepairQueue:
     """Repair queue of one scene. All methods run on the event loop.
 
     Args:
-        log: journal, ledger and frame log of the scene.
-        damage: damage messages of the scene.
-        background: background tasks of the scene.
+        log: the scene's journal, ledger and frame log.
+        damage: the scene's damage messages.
+        background: the scene's background tasks.
         to_worker: function that sends a message to the worker; returns False if no worker can receive it.
         recompute: frames whose states were found damaged during recovery, with the reason.
 
@@ -175,7 +175,7 @@ class RepairQueue:
         """Sends the next waiting state to an idle worker for recomputation.
 
         Returns:
-            If the disk was full, the number of seconds after which to call this method again; otherwise 0.
+            The delay in seconds before the next call of this method if the disk was full, otherwise 0.
         """
         if (left := self._full_until - asyncio.get_running_loop().time()) > 0:
             return left
@@ -203,12 +203,12 @@ class RepairQueue:
             self.at_work = None
         match message.outcome:
             case RepairOutcome.WHOLE:
-                log.warning("%s could not be read once (%s), but is intact", message.name, reason)
+                log.warning("%s could not be read (%s), but is intact", message.name, reason)
             case RepairOutcome.WRITTEN:
-                self._log_damage(message.name, f"{message.reason}; it was rewritten, and nothing is lost")
+                self._log_damage(message.name, f"{message.reason}; it was rewritten, and nothing was lost")
             case RepairOutcome.REPORT_LOST:
                 self._log_damage(
-                    message.name, f"{message.reason}; its state is intact and was rewritten, but its report is lost"
+                    message.name, f"{message.reason}; the state is intact and was rewritten, but the report is lost"
                 )
             case RepairOutcome.DAMAGED if index is not None:
                 self._decide(index, message.reason)
@@ -225,7 +225,7 @@ class RepairQueue:
                 self._ledger.frames.replace_record(index, message.report)
                 self._log_damage(
                     message.name,
-                    f"frame {index}: {reason}; its state was recomputed from its images, not bit-identically",
+                    f"frame {index}: {reason}; the state was recomputed from its images and is not bit-identical",
                 )
             case RepairOutcome.LOST:
                 assert index is not None
@@ -274,12 +274,12 @@ class RepairQueue:
         if not entry.files:
             self._declare_unrecoverable(index, "its images are no longer stored")
         elif degraded is not None:
-            self._declare_unrecoverable(index, f"its frame was degraded: {degraded}")
+            self._declare_unrecoverable(index, f"the frame was degraded: {degraded}")
         elif self._base(index) is None:
             self._declare_unrecoverable(index, "the previous state cannot be read")
 
     def _base(self, index: int) -> int | None:
-        """Returns the committed frame on which a frame is based, or None if its state was deleted or never existed."""
+        """Returns the committed frame that a frame is based on, or None if its state was deleted or never existed."""
         for before in range(index - 1, -1, -1):
             entry = self._ledger.frames[before]
             if entry.state == FrameState.COMMITTED:

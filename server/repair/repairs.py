@@ -40,7 +40,7 @@ def repair_at_start(history: History) -> list[str]:
         log.warning("cannot repair a file that every frame needs: %s", error)
         return []
     history.pop_faults()  # these files were just rewritten or are listed in `History.damaged`
-    return [f"{reason}; it was rewritten from its copy" for reason in mended.values()]
+    return [f"{reason}; it was restored from its copy" for reason in mended.values()]
 
 
 def repair_files(
@@ -85,7 +85,7 @@ def _repair_file(
 
 
 def _rewrite_with_report(history: History, files: FrameFiles, index: int, message: RepairFiles) -> RepairOutcome:
-    """Rewrites a file in which only the report or the time is damaged and the state is intact."""
+    """Rewrites a file whose report or time is damaged but whose state is intact."""
     try:
         arrays = files.read(index, PER_FRAME, WHOLES)
         report = message.reports.get(index)
@@ -145,7 +145,7 @@ def _recompute(spec: SceneSpec, history: History, message: RecomputeState, decod
     try:
         frame, dropped = decode()
         if len(frame.images) < spec.minimum_cameras:
-            reason = f"images of {len(frame.images)} cameras are left, but the minimum is {spec.minimum_cameras}"
+            reason = f"only {len(frame.images)} cameras have images, but the minimum is {spec.minimum_cameras}"
             return RepairResult(name, RepairOutcome.LOST, reason)
         budget = message.frame.budget.model_dump()
         notes = {"budget": budget}

@@ -1,4 +1,4 @@
-"""Scrubbing of a scene: slowly rereads all files and verifies checksums to find damage before a file is needed.
+"""Scrubbing of a scene: slowly rereads all files and verifies their checksums to find damage before a file is needed.
 
 Files are read sequentially in pieces in a thread. Pauses limit the read rate to the configured value, or to a quarter
 of it while a frame is being updated. Pages that only the scrub needed are dropped from the page cache.
@@ -42,7 +42,7 @@ AT_WORK = 0.25
 EVENT_WEIGHT = 8
 """CPU cost per byte of the journal relative to arrays; it is higher because the journal has many small records."""
 CHECK_S = 5.0
-"""Seconds between checks whether the journal file is still at its path."""
+"""Interval in seconds between checks that the journal file is still at its path."""
 
 GONE = "gone"
 """Fault of a missing file."""
@@ -54,11 +54,11 @@ class Scrub:
     """Periodic scrubbing of one scene.
 
     Args:
-        definition: definition of the scene.
-        folder: folder of the scene.
-        log: journal, ledger and frame log of the scene.
-        damage: damage messages of the scene.
-        mending: repair queue of the scene.
+        definition: scene definition.
+        folder: scene folder.
+        log: the scene's journal, ledger and frame log.
+        damage: the scene's damage messages.
+        mending: the scene's repair queue.
         mb_per_second: maximum read rate in MB/s; 0 disables scrubbing.
         pause_seconds: pause before each pass, in seconds.
     """
@@ -189,7 +189,11 @@ class Scrub:
         fault = await self._read(iter_verified(path))
         if fault is None or fault == GONE:
             return
-        used = "not needed, as the first frame is committed" if self._ledger.committed else "upload the points again"
+        used = (
+            "it is no longer needed, because the first frame is committed"
+            if self._ledger.committed
+            else "upload the points again"
+        )
         self._damage.add(DamageKind.POINTS, f"{fault}; {used}", lasting=True)
 
     async def _scrub_frames(self) -> None:

@@ -70,7 +70,7 @@ def only_known(connection: HTTPConnection) -> None:
     """Rejects unknown query parameters, so that misspelled names do not go unnoticed.
 
     Raises:
-        Problem: 422 if a parameter is unknown; names the valid ones.
+        Problem: 422 if a parameter is unknown; lists the valid parameters.
     """
     route = connection.scope.get("route")
     if not isinstance(route, APIRoute):  # a WebSocket
@@ -82,7 +82,7 @@ def only_known(connection: HTTPConnection) -> None:
             continue
         near = difflib.get_close_matches(name, names, 1)
         meant = f"did you mean {near[0]!r}? " if near else ""
-        there = f"the valid parameters are {', '.join(names)}" if names else "this address takes no parameters"
+        there = f"the valid parameters are {', '.join(names)}" if names else "this endpoint takes no parameters"
         raise Problem(422, f"unknown parameter {name!r}", field=name, value=value, remedy=meant + there)
 
 

@@ -18,9 +18,9 @@ async def get(scene: TheRecord) -> SceneBudget:
 
 @router.put("/{id}/budget")
 async def put(scene: TheRecord, budget: Budget) -> SceneBudget:
-    """Sets the budget for all frames whose reconstruction has not started; null restores the setting of the scene.
+    """Sets the budget for all frames whose reconstruction has not started; null restores the scene's setting.
 
-    The budget is on disk when the response is sent. After a crash or restart, each frame gets the budget that applied
+    The budget is on disk when the response is sent. After a crash or restart, each frame keeps the budget that applied
     to it.
     """
     await scene.set_budget(budget)

@@ -21,7 +21,7 @@ router = APIRouter(prefix="/v1/cluster", tags=["service"])
 
 @router.get("")
 async def get(request: Request, response: Response, scenes: AllScenes, server: TheSettings) -> Cluster:
-    """Returns the machines on which scenes run, with the resources reserved according to estimates per scene.
+    """Returns the machines that run scenes, with the estimated resources reserved for each scene.
 
     On a cluster with several services, the response covers the scenes of all services. The header X-Unreachable names
     services that do not respond.

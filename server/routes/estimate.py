@@ -17,6 +17,6 @@ router = APIRouter(prefix="/v1/estimate", tags=["service"])
 async def of_scene(request: SceneCreate, server: TheSettings) -> SceneEstimate:
     """Estimates the memory and disk usage of a scene without creating it.
 
-    A scene above the service's limit cannot be created.
+    Scenes that exceed the service's limit cannot be created.
     """
     return estimate(request.rig, scene_settings(request), server)

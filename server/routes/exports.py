@@ -28,7 +28,7 @@ FILE: dict[int | str, dict[str, Any]] = {
 
 @router.post("/{id}/exports", status_code=202)
 async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, response: Response) -> ExportModel:
-    """Starts an export of committed frames in the background; the `Location` header contains its address.
+    """Starts an export of committed frames in the background; the `Location` header contains its URL.
 
     The service runs one export at a time, in a separate low-priority process, so that updates and views have priority.
     A scene can have up to 8 exports. Files are kept for one day, but not across restarts of the service.
@@ -36,10 +36,10 @@ async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, r
     if request.ids is not None and request.format != "tracks":
         raise Problem(
             422,
-            f"ids are given for format {request.format!r}",
+            f"format {request.format!r} does not support ids",
             field="ids",
             value=request.ids,
-            remedy="omit ids, which select the Gaussians for format 'tracks'",
+            remedy="omit ids, or use format 'tracks'",
         )
     made = exports.begin(scene, request, _frames(scene, request)).model()
     response.headers["Location"] = f"/v1/scenes/{scene.id}/exports/{made.id}"
@@ -60,7 +60,7 @@ async def get(id: SceneId, export: ExportId, exports: AllExports) -> ExportModel
 
 @router.get("/{id}/exports/{export}/file", response_class=Response, responses=FILE)
 async def file(id: SceneId, export: ExportId, exports: AllExports, request: Request) -> Response:
-    """Returns the file of a finished export; formats with numbered files are packed into one .zip file.
+    """Returns the file of a finished export; numbered files are packed into one .zip file.
 
     `Range` and `If-None-Match` are supported.
     """
@@ -104,9 +104,9 @@ def _frames(scene: Scene, request: ExportRequest) -> tuple[int, ...]:
     if not frames:
         raise Problem(
             422,
-            f"no committed frame from {first} to {last}",
+            f"no committed frames from {first} to {last}",
             field="first",
             value=first,
-            remedy=f"give a range within {committed[0]} to {committed[-1]}",
+            remedy=f"use a range within {committed[0]} to {committed[-1]}",
         )
     return frames

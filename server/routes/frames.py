@@ -58,9 +58,9 @@ PICTURE: dict[str, Any] = {
     }
 }
 MOST_STATES = 120
-"""Maximum number of frames in a requested compact file: a few seconds of reader time and a few megabytes."""
+"""Maximum number of frames in a requested compact file; they take a few seconds of reader time and a few megabytes."""
 SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"), b"RI": ("image/webp", ".webp")}
-"""Maps the first two bytes of an image file to its media type and file extension."""
+"""Media type and file extension of an image file, keyed by its first two bytes."""
 FILE: dict[int | str, dict[str, Any]] = {
     200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "File as uploaded."}
 }
@@ -90,10 +90,10 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
         raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
     raise Problem(
         415,
-        f"a frame must be {FRAME_MEDIA_TYPE} or multipart/form-data",
+        f"the body of a frame must be {FRAME_MEDIA_TYPE} or multipart/form-data",
         field="Content-Type",
         value=request.headers.get("content-type", ""),
-        remedy="send one file per camera, with the camera name as field name",
+        remedy="send one file per camera, named after the camera",
     )
 
 
@@ -108,7 +108,7 @@ async def put_camera(
         FileKind.IMAGE
     ),
 ) -> CameraReceipt:
-    """Accepts one camera's image of frame n, for rigs in which each camera has its own sender.
+    """Accepts one camera's image of frame n, for rigs whose cameras send separately.
 
     The image is on disk when the response is sent. The frame closes when the images of all cameras have arrived, on
     POST …/close, or at the scene's deadline. A camera may be a few frames ahead of the others. Frames close in order.
@@ -131,8 +131,8 @@ async def picture(
 ) -> Response:
     """Returns one camera's image of frame n, byte for byte as uploaded.
 
-    Images are kept according to the scene's `ingest.keep_frames`. A 404 states what is missing: the camera, the frame,
-    all of its images, or this image.
+    The scene's `ingest.keep_frames` determines how long images are kept. A 404 states what is missing: the camera, the
+    frame, all of its images, or this image.
     """
     data = await _stored(scene, n, c, kind)
     media_type, ending = SENT_AS[bytes(data[:2])]
@@ -208,7 +208,7 @@ async def compact(
     """Returns committed frames as a compact 4D file, which `scas4d export` converts to other formats.
 
     Frames that the scene already stores in a compact file are copied unchanged. The response then ends where that file
-    ends, and may start before the requested range, at the keyframe on which the range depends.
+    ends, and may start before the requested range, at the keyframe that the range depends on.
     """
     scene.committed_frame(None, "first")
     begin = bisect_left(scene.committed, first)
@@ -216,10 +216,10 @@ async def compact(
     if not frames:
         raise Problem(
             404,
-            f"no committed frame from {first} on",
+            f"no committed frames from {first} on",
             field="first",
             value=first,
-            remedy=f"give a frame from {scene.committed[0]} to {scene.committed[-1]}",
+            remedy=f"use a frame from {scene.committed[0]} to {scene.committed[-1]}",
         )
     answer = await ask(request, scene, CompactQuery(frames, parts))
     after = bisect_right(scene.committed, int(answer.headers["X-Last-Frame"]))

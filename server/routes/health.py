@@ -31,7 +31,7 @@ async def live(scenes: AllScenes) -> Health:
 
 @router.get("/ready")
 async def ready(request: Request, scenes: AllScenes, settings: TheSettings) -> Health:
-    """Returns 200 once scenes are recovered and kernels are compiled, else 503; `ready_after` is the startup time in s.
+    """Returns 200 once scenes are recovered and kernels compiled, else 503; `ready_after` is the startup time in s.
 
     A full disk affects only `ingest_ready`: views, tracks and exports keep working.
     """
@@ -53,13 +53,13 @@ async def ingest(scenes: AllScenes, settings: TheSettings) -> Health:
             503,
             missing,
             field="SCAS4D_DATA",
-            remedy="free space in the service's data folder, or shorten the retention of scenes; reads still work",
+            remedy="free space in the service's data folder, or shorten the retention of scenes; reading still works",
             headers={"Retry-After": "30"},
         )
     return Health(status="ready", version=__version__, scenes=len(scenes), ingest_ready=True)
 
 
 def room_missing(settings: ServerSettings) -> str | None:
-    """Returns a message if the disk of the data folder has less than `ROOM_MB` free, otherwise None; blocks."""
+    """Returns a message if the data folder's disk has less than `ROOM_MB` MB free, otherwise None. Blocking."""
     free = shutil.disk_usage(settings.data).free / 1e6
-    return None if free >= ROOM_MB else f"the disk of the data folder has {free:.0f} MB free, less than {ROOM_MB}"
+    return None if free >= ROOM_MB else f"the disk of the data folder has {free:.0f} MB free; {ROOM_MB} MB are required"

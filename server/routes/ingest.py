@@ -47,7 +47,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
     The sender may pipeline messages: one is received while the previous one is synced to disk. Answers are sent in the
     order of the messages. A rejected message is also answered, and the socket stays open. A message with `part`
     corresponds to PUT …/cameras/{c}. The handshake is refused if the scene does not exist (404) or has too many senders
-    (429). A message larger than any possible frame of the rig closes the connection (1009).
+    (429). A message that is larger than any possible frame of the rig closes the connection (1009).
     """
     scenes: Scenes = socket.app.state.scenes
     server: ServerSettings = socket.app.state.settings
@@ -67,7 +67,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
 
 
 async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
-    """Processes messages until the sender closes the socket or sends text, or the scene is no longer available."""
+    """Processes messages until the sender closes the socket or sends text, or the scene becomes unavailable."""
     taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
     whole_before = True
@@ -137,8 +137,8 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
     except asyncio.CancelledError:
         raise
     except Exception as error:
-        log.exception("scene %s: a frame over the WebSocket failed", scene.id)
-        detail = f"the service failed: {type(error).__name__}"
+        log.exception("scene %s: receiving a frame over the WebSocket failed", scene.id)
+        detail = f"internal error: {type(error).__name__}"
         return _refusal(head.index, Problem(500, detail, remedy=SERVICE_FAULT))
 
 

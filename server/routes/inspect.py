@@ -13,7 +13,7 @@ from server.routes.access import TheRecord, TheScene
 router = APIRouter(prefix="/v1/scenes")
 
 MOST_FRAMES = 500
-"""Maximum number of frames per response, limited because each report lists every camera."""
+"""Maximum number of frames per response; each report lists every camera."""
 
 
 @router.get("/{id}/rig", tags=["scenes"])

@@ -44,11 +44,12 @@ async def put(
     reconstruction: Annotated[
         int | None,
         Query(
-            ge=0, description="Number of the reconstruction: the current one (default), or the next before it starts."
+            ge=0,
+            description="Number of the reconstruction: the current one (default), or the next one before it starts.",
         ),
     ] = None,
 ) -> PointsReceipt:
-    """Accepts the point cloud from which frame 0 is initialized; it must be uploaded before frame 0.
+    """Accepts the point cloud that initializes frame 0; it must be uploaded before frame 0.
 
     The body is an npz with `positions` [P, 3] in the rig's world frame and units, and `colours` [P, 3] in 0…1.
     `foreground` [P] in 0…1 is optional. Alternatively, the npz contains `data` [P, 6 or 7] with these as columns, like
@@ -93,7 +94,7 @@ def check_number(number: int, own: int, next_frame: int) -> None:
     """
     if number == own + 1 or (number == own == 0 and next_frame == 0):
         return
-    fault = f"reconstruction {number} is not the next one: the current one is {own}"
+    fault = f"reconstruction {number} is not the next one (the current one is {own})"
     if number <= own:
         fault = "this reconstruction has already started without these points"
     raise Problem(
@@ -115,17 +116,17 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
         if unpacked > 64 * limit:
             raise Problem(
                 413,
-                f"the point cloud unpacks to {unpacked} bytes",
+                f"the point cloud is too large: {unpacked} bytes after decompression",
                 field="points",
                 value=unpacked,
-                remedy=f"give at most {limit} points",
+                remedy=f"send at most {limit} points",
             )
         with np.load(io.BytesIO(body), allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files if name in (*shapes, "data")}
     except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:
         raise Problem(
             422,
-            f"the body is not an npz file that can be read without pickle ({error})",
+            f"cannot read the body as an npz file without pickled objects ({error})",
             field="points",
             value=count_noun(len(body), "byte"),
             remedy="send the output of numpy.savez(positions=…, colours=…, foreground=…) with numeric arrays",
@@ -142,19 +143,25 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
             given = "missing" if array is None else f"{array.dtype} {array.shape}"
             raise Problem(
                 422,
-                f"{name} is {given}",
+                f"invalid {name}: {given}",
                 field=name,
                 value=given,
-                remedy=f"give numbers of shape {'[P, 3]' if columns else '[P]'}, 1 ≤ P ≤ {limit}",
+                remedy=f"use a numeric array of shape {'[P, 3]' if columns else '[P]'}, 1 ≤ P ≤ {limit}",
             )
         arrays[name] = array.astype(kind)
         if not np.isfinite(arrays[name]).all():
             raise Problem(
-                422, f"{name} contains NaN or infinity", field=name, value="NaN", remedy="give finite numbers only"
+                422, f"{name} contains NaN or infinity", field=name, value="NaN", remedy="use finite numbers only"
             )
         if name != "positions" and (arrays[name].min() < 0 or arrays[name].max() > 1):
             top = f"{arrays[name].min():g} … {arrays[name].max():g}"
-            raise Problem(422, f"{name} has values {top}", field=name, value=top, remedy="give values in 0 … 1")
+            raise Problem(
+                422,
+                f"{name} must be in 0 … 1, got values in {top}",
+                field=name,
+                value=top,
+                remedy="scale the values to 0 … 1",
+            )
     return arrays
 
 
@@ -167,10 +174,10 @@ def columns_of(data: NDArray[Any]) -> dict[str, NDArray[Any]]:
     if data.ndim != 2 or data.shape[1] not in (6, 7):
         raise Problem(
             422,
-            f"data is {data.dtype} {data.shape}",
+            f"data must be an array of shape [P, 6] or [P, 7], got {data.dtype} {data.shape}",
             field="data",
             value=f"{data.dtype} {data.shape}",
-            remedy="give numbers of shape [P, 7]: x y z, r g b, foreground; or positions and colours instead",
+            remedy="use the columns x y z, r g b and, optionally, foreground; or send positions and colours instead",
         )
     columns = {"positions": data[:, :3], "colours": data[:, 3:6]}
     return columns | ({"foreground": data[:, 6]} if data.shape[1] == 7 else {})

@@ -20,11 +20,11 @@ FILES = ("image/png", "image/jpeg", "image/webp", "application/vnd.numpy.npz", "
 PICTURES: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {media_type: {"schema": {"type": "string", "format": "binary"}} for media_type in FILES},
-        "description": "Rendered view; the header X-Frame gives its frame.",
+        "description": "Rendered view; the X-Frame header contains its frame index.",
     }
 }
 ENDINGS = {one: f".{'jpg' if one == RenderFormat.JPEG else one.value}" for one in RenderFormat}
-"""Maps each image format to its file extension."""
+"""File extension of each image format."""
 
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
@@ -93,9 +93,9 @@ def _colour(text: str) -> tuple[float, float, float]:
     if not all(0 <= value <= 1 for value in (red, green, blue)):
         raise Problem(
             422,
-            "background is not three numbers in 0…1",
+            "background must be three numbers in 0…1",
             field="background",
             value=text,
-            remedy="give background=1,1,1",
+            remedy="use, for example, background=1,1,1",
         )
     return red, green, blue

@@ -40,7 +40,7 @@ def setting_problems() -> Iterator[None]:
         if error.validation is not None:
             raise validation.first_problem(error.validation, model=Settings, prefix="settings") from None
         unknown = error.setting == "preset"
-        fault = f"there is no preset {error.value!r}" if unknown else error.fault
+        fault = f"unknown preset {error.value!r}" if unknown else error.fault
         field = error.setting if unknown else f"settings.{error.setting}"
         raise Problem(422, fault, field=field, value=str(error.value), remedy=error.remedy) from None
 
@@ -75,12 +75,12 @@ def check_device(settings: Settings, placement: Placement) -> None:
     if settings.device != "gpu" or placement.has_labels:
         return
     if fault := gpu_fault():
-        remedy = "give 'auto' or 'cpu', or see docs/gpu.md"
-        raise Problem(422, f"no GPU can be used: {fault}", field="settings.device", value="gpu", remedy=remedy)
+        remedy = "use 'auto' or 'cpu', or see docs/gpu.md"
+        raise Problem(422, f"no usable GPU: {fault}", field="settings.device", value="gpu", remedy=remedy)
 
 
 def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings, placement: Placement) -> None:
-    """Raises `Problem` if the settings do not fit rig and machine, or the scene would exceed the memory limit."""
+    """Raises `Problem` if the settings do not fit the rig or the machine, or the scene exceeds the memory limit."""
     check_rig(request, settings)
     check_device(settings, placement)
     estimate.refuse_if_too_large(request.rig, settings, server)
@@ -95,7 +95,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
         if pixels > server.max_image_pixels:
             raise Problem(
                 422,
-                f"camera {camera.name!r} has {pixels} pixels, more than {server.max_image_pixels}",
+                f"camera {camera.name!r} has {pixels} pixels, more than the maximum of {server.max_image_pixels}",
                 field="rig.cameras",
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller images with matching intrinsics, or raise SCAS4D_MAX_IMAGE_PIXELS",
@@ -165,7 +165,7 @@ async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
         if not scene.idle:
             raise Problem(
                 409,
-                "the scene is not idle: frames are waiting, or a request, a viewer or a sender is connected",
+                "the scene is not idle: frames are waiting, or a client, viewer or sender is connected",
                 field="id",
                 value=id,
                 remedy="wait until its frames are processed, and disconnect its viewers and senders",

@@ -34,7 +34,7 @@ async def tracks(
     ids: Annotated[str | None, Query(max_length=10_000, description="Ids of Gaussians, separated by commas.")] = None,
     pixel: Annotated[Many, Query(description="u,v in the image of `camera`; may be repeated.")] = None,
     camera: Annotated[
-        str | None, Query(max_length=64, description="Name of the camera of the rig in which pixels are given.")
+        str | None, Query(max_length=64, description="Name of the rig camera whose pixels are given.")
     ] = None,
     point: Annotated[Many, Query(description="x,y,z in the rig's world and units; may be repeated.")] = None,
     at: Annotated[
@@ -77,7 +77,7 @@ def ids_in(text: str) -> list[int]:
     except ValueError:
         raise Problem(
             422,
-            "ids must be whole numbers",
+            "ids must be integers",
             field="ids",
             value=text,
             remedy="separate ids by commas, such as ids=3,17,2048",
@@ -94,7 +94,11 @@ def _numbers(texts: list[str], field: str, count: int) -> list[list[float]]:
         if len(row) != count or not all(math.isfinite(value) for value in row):
             example = ",".join("12.5" for _ in range(count))
             raise Problem(
-                422, f"{field} is not {count} finite numbers", field=field, value=text, remedy=f"give {field}={example}"
+                422,
+                f"{field} must be {count} finite numbers",
+                field=field,
+                value=text,
+                remedy=f"use, for example, {field}={example}",
             )
         rows.append(row)
     return rows

@@ -1,4 +1,4 @@
-"""Routes for the trade-off between accuracy and update time of a scene on its machine."""
+"""Routes for a scene's trade-off between accuracy and update time on its machine."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ async def get(scene: TheRecord) -> TradeoffModel:
 async def replay(scene: TheScene, request: ReplayRequest | None = None) -> TradeoffModel:
     """Measures other iteration counts by replaying the updates of the newest frames in the background, in memory.
 
-    A scene runs one replay at a time, on one low-priority thread. The iteration count of the scene is also measured,
-    so that ratios are comparable. The field `replay` reports the progress.
+    A scene runs one replay at a time, on one low-priority thread. The scene's own iteration count is also measured, so
+    that ratios are comparable. The field `replay` reports the progress.
     """
     scene.replays.start(request or ReplayRequest())
     return await answer(scene)

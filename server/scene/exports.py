@@ -37,11 +37,11 @@ MAX_PER_SCENE = 8
 Equally many failed or cancelled exports are remembered.
 """
 KEEP_S = 24 * 3600.0
-"""Seconds for which an exported file is kept."""
+"""Time in seconds for which an exported file is kept."""
 BYTES_PER_GAUSSIAN = {"ply": 68, "splat": 32, "spz": 20, "spz4": 20, "glb": 70, "usd": 120, "tracks": 60, "s4d": 12}
 """Approximate bytes per Gaussian and frame of each format, without view-dependent colour; other formats are small.
 
-Writing USD temporarily takes twice the size.
+Writing USD temporarily takes twice as much space.
 """
 MEDIA_TYPES = {".zip": "application/zip", ".glb": "model/gltf-binary", ".csv": "text/csv"}
 FINAL_STATES = frozenset({ExportState.DONE, ExportState.FAILED, ExportState.CANCELLED})
@@ -55,14 +55,14 @@ class Export:
 
     Attributes:
         id: export ID.
-        spec: specification passed to the export process.
+        spec: specification for the export process.
         name: suggested name for the downloaded file.
-        created: time at which the export was requested.
+        created: time of the request.
         state: current state.
         done: number of frames exported so far.
         size: size on disk in bytes.
         error: reason for a failure, or None.
-        ended: time at which the export finished, or None.
+        ended: time when the export finished, or None.
         timer: timer that removes the finished export when it expires.
         task: task that runs the export.
     """
@@ -116,7 +116,7 @@ class Exports:
     """All exports of the service. Its methods must be called on the event loop.
 
     Args:
-        scenes: registry of the service's scenes.
+        scenes: the service's scene registry.
         placement: starts the export processes.
     """
 
@@ -149,7 +149,7 @@ class Exports:
         self._scenes.status(scene)
         known_export = self._known.get(scene, {}).get(export)
         if known_export is None:
-            remedy = f"GET /v1/scenes/{scene}/exports lists the exports; request a new one if it was removed"
+            remedy = f"list the exports with GET /v1/scenes/{scene}/exports, or start a new one if it was removed"
             raise Problem(404, f"the scene has no export {export!r}", field="export", value=export, remedy=remedy)
         return known_export
 
@@ -186,7 +186,7 @@ class Exports:
         if len(waiting) >= MAX_WAITING:
             raise Problem(
                 429,
-                f"the service already has {count_noun(len(waiting), 'unfinished export')}, the maximum",
+                f"the service already has the maximum of {count_noun(len(waiting), 'unfinished export')}",
                 field="id",
                 value=id,
                 remedy="try again after one has finished",
@@ -200,10 +200,10 @@ class Exports:
         if len(kept) >= MAX_PER_SCENE:
             raise Problem(
                 409,
-                f"the scene already has {count_noun(len(kept), 'export')}, the maximum",
+                f"the scene already has the maximum of {count_noun(len(kept), 'export')}",
                 field="id",
                 value=id,
-                remedy=f"remove one: DELETE /v1/scenes/{id}/exports/EXPORT, such as {kept[0].id}",
+                remedy=f"remove one with DELETE /v1/scenes/{id}/exports/EXPORT, such as {kept[0].id}",
             )
         parent = self._folder.parent
         needed = (
@@ -232,7 +232,7 @@ class Exports:
                 export.size = (await asyncio.to_thread(export.spec.file.stat)).st_size
         except Exception as error:
             log.exception("scene %s: an export failed", export.scene)
-            fault = f"the service failed: {type(error).__name__}: {message_of(error)}"
+            fault = f"internal error: {type(error).__name__}: {message_of(error)}"
         if fault is not None:
             log.warning("scene %s: export %s failed: %s", export.scene, export.id, fault)
             await self._remove_files(folder)
@@ -248,7 +248,7 @@ class Exports:
             self._drop(one)
 
     async def _run_process(self, export: Export) -> str | None:
-        """Runs the process of an export and returns the reason for a failure, or None on success."""
+        """Runs an export's process and returns the reason if it fails, or None on success."""
         ended: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
 
         def end(fault: str | None) -> None:
@@ -256,7 +256,7 @@ class Exports:
                 ended.set_result(fault)
 
         def gone(reason: ProcessExit) -> None:
-            end(f"the export process exited: {reason}")
+            end(f"the export process exited unexpectedly ({reason})")
 
         process = self._placement.start(exporter.main, export.spec, partial(self._on_message, export, end), gone)
         try:

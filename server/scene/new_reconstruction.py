@@ -24,7 +24,7 @@ log = logging.getLogger("scas4d.server")
 
 
 def restart_remedy(ledger: Ledger) -> str:
-    """Returns the remedy for a failed scene, which is to restart its reconstruction."""
+    """Returns the remedy for a failed scene: restarting its reconstruction."""
     number = ledger.reconstruction + 1
     return (
         f"restart its reconstruction: PUT /v1/scenes/{ledger.scene}/reconstructions/{number}, "
@@ -46,7 +46,7 @@ class NewReconstruction:
         number: number of the new reconstruction.
         request: request to restart the reconstruction.
         settings: validated scene settings, including the changes in the request.
-        rig: rig of the scene.
+        rig: the scene's rig.
     """
 
     number: int
@@ -55,11 +55,11 @@ class NewReconstruction:
     rig: Rig
 
     def event(self, ledger: Ledger, folder: SceneFolder) -> ReconstructionBegun | None:
-        """Returns the event that starts the reconstruction, or None if the same request already started it.
+        """Returns the event that starts the reconstruction, or None if the same request has already started it.
 
         Args:
-            ledger: current ledger of the scene.
-            folder: current folder of the scene.
+            ledger: the scene's current ledger.
+            folder: the scene's current folder.
 
         Raises:
             Problem: 409 if `number` is not the next number, the reconstruction cannot start with the requested frame,
@@ -103,7 +103,7 @@ class NewReconstruction:
         )
 
     def _is_repeated(self, ledger: Ledger) -> bool:
-        """Returns whether the same request already started the reconstruction."""
+        """Returns whether the same request has already started the reconstruction."""
         now = ledger.reconstruction
         if self.number == now and ledger.begun is not None and ledger.begun.request == self.request:
             return True
@@ -111,7 +111,7 @@ class NewReconstruction:
             reason = "has already started" if self.number <= now else "is not the next one"
             raise Problem(
                 409,
-                f"reconstruction {self.number} {reason}: the current one is {now}",
+                f"reconstruction {self.number} {reason} (the current one is {now})",
                 field="n",
                 value=self.number,
                 remedy=f"start reconstruction {now + 1}",
@@ -130,18 +130,18 @@ class NewReconstruction:
             return index
         fault = f"frame {index} is {entry.state}"
         if _takes_part(entry):
-            fault = f"the pictures of frame {index} were deleted"
+            fault = f"the images of frame {index} were deleted"
         held = next((other.index for other in frames.with_pictures() if _takes_part(other)), None)
         remedy = f"start with the next frame to arrive, {ledger.next_frame}"
         if held is not None:
-            remedy = f"start with frame {held}, the first whose pictures are available, or with the next to arrive, "
+            remedy = f"start with frame {held}, the first with stored images, or with the next frame to arrive, "
             remedy += f"{ledger.next_frame}"
         raise Problem(
             409,
             fault,
             field="frame",
             value=index,
-            remedy=f"{remedy}; ingest.keep_frames of a scene sets how many are kept",
+            remedy=f"{remedy}; ingest.keep_frames sets how many frames keep their images",
             expected=ledger.next_frame if held is None else held,
         )
 

@@ -25,11 +25,11 @@ class Replays:
     """Replays of one scene.
 
     Args:
-        spec: specification of the scene.
-        ledger: ledger of the scene.
+        spec: scene specification.
+        ledger: the scene's ledger.
         placement: starts the replay processes.
         damaged: called with a mapping from the name of each unreadable file to the reason.
-        background: background tasks of the scene.
+        background: the scene's background tasks.
 
     Attributes:
         status: status of the newest replay.
@@ -70,10 +70,10 @@ class Replays:
         if self._process is not None:
             raise Problem(
                 409,
-                f"a replay of this scene is running: {self.status.done} of {count_noun(self.status.total, 'update')}",
+                f"a replay is already running: {self.status.done} of {count_noun(self.status.total, 'update')}",
                 field="id",
                 value=id,
-                remedy=f"wait for it: GET /v1/scenes/{id}/tradeoff reports its progress",
+                remedy=f"wait for it; GET /v1/scenes/{id}/tradeoff reports its progress",
             )
         base, indices = self._chosen(request.frames)
         own = self._own_iterations()
@@ -124,11 +124,11 @@ class Replays:
             held = len(indices) - 1 - indices.index(bare[-1])
             raise Problem(
                 409,
-                f"the pictures of frame {bare[-1]} were deleted",
+                f"the images of frame {bare[-1]} were deleted",
                 field="frames",
                 value=count,
                 remedy=(f"request at most {count_noun(held - 1, 'frame')}, or " if held > 1 else "")
-                + "create scenes that keep more pictures (ingest.keep_frames)",
+                + "create scenes that keep more images (ingest.keep_frames)",
             )
         return base, indices
 
@@ -181,7 +181,7 @@ class Replays:
     def _on_end(self, life: object, reason: ProcessExit) -> None:
         if life is self._life:
             self._process = None
-            self._finish(f"the replay process exited: {reason}")
+            self._finish(f"the replay process exited unexpectedly ({reason})")
 
     def _finish(self, fault: str | None) -> None:
         self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED

@@ -52,15 +52,15 @@ class Scene:
     worker, `Updates._commit` records the commit, and `Publisher.publish_frame` publishes its report.
 
     Args:
-        found: scene as stored in its folder, which also exists for a new scene.
-        server: settings of the service.
+        found: the scene as stored in its folder; a new scene also has a folder.
+        server: service settings.
         placement: starts the scene's processes.
         hub: publishes the scene's events.
 
     Attributes:
         has_place: whether the scene has a slot and may have processes; otherwise, it is asleep.
         users: number of active requests and connections.
-        used: time at which the last request or connection ended, from `time.monotonic`.
+        used: value of `time.monotonic` when the last request or connection ended, in seconds.
         log: journal, ledger and frame log.
         ingest: ingest of complete frames.
         open_frames: ingest of frames sent camera by camera.
@@ -252,10 +252,10 @@ class Scene:
         if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
             reason = "unknown" if entry is None else entry.state.value
             if entry is not None and entry.deleted:
-                reason = "deleted by the scene's retention"
+                reason = "deleted by the retention rules"
             raise Problem(
                 404,
-                f"frame {index} is {reason}; only committed frames that were not deleted can be read",
+                f"frame {index} is {reason}; only committed frames that have not been deleted can be read",
                 field=field,
                 value=index,
                 remedy=other,
@@ -351,7 +351,7 @@ class Scene:
     # Events.
 
     def _all_events(self) -> Iterator[JournalEvent]:
-        """Returns a snapshot of all known events, from which `Journal` can rewrite itself."""
+        """Returns a snapshot of all known events, which `Journal` uses to rewrite itself."""
         return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
 
     def _journal_renewed(self, fault: str) -> None:
@@ -359,6 +359,6 @@ class Scene:
         self._publisher.publish_status()
 
     def _failed(self, error: BaseException) -> None:
-        self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
+        self.ledger.fatal = f"internal error: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
         self._publisher.publish_status()

@@ -37,9 +37,9 @@ class Scenes:
     """Registry of all scenes of the service.
 
     Attributes:
-        awake: scenes that are in memory, with or without a slot for processes, by ID.
-        asleep: all other recovered scenes, by ID.
-        recovering: recovery of the scenes that were found at startup.
+        awake: scenes in memory, with or without a slot for processes, keyed by ID.
+        asleep: all other recovered scenes, keyed by ID.
+        recovering: recovery of the scenes found at startup.
         unreadable: reason for each scene folder that cannot be read, keyed by scene ID; the folders are left unchanged.
     """
 
@@ -56,7 +56,7 @@ class Scenes:
         self._promised = 0
         """Number of slots reserved for scenes that are not in `awake` yet."""
         self._beginning: dict[str, asyncio.Task[None]] = {}
-        """Tasks of scenes whose reconstruction is being restarted, by scene ID."""
+        """Tasks of scenes whose reconstruction is being restarted, keyed by scene ID."""
         self._turns = Transitions()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -105,7 +105,7 @@ class Scenes:
 
         Args:
             id: scene ID.
-            place: whether to give the scene a slot for processes; requests that need no processes pass False.
+            place: whether the scene gets a slot for processes; requests that need no processes pass False.
 
         Raises:
             Problem: see `refuse`; 429 if the scene needs a slot and none can be freed.
@@ -150,7 +150,7 @@ class Scenes:
         self._promised += 1
 
     async def put_to_sleep(self, scene: Scene) -> None:
-        """Stops a scene's processes and releases its slot if it is still idle; all its data is in its folder."""
+        """Stops a scene's processes and releases its slot if the scene is still idle; all its data is in its folder."""
         if self.awake.get(scene.id) is scene and scene.id not in self._turns and scene.idle:
             self._turns.begin(scene.id, self._fall_asleep(scene))
         await self._turns.end(scene.id)
@@ -161,7 +161,7 @@ class Scenes:
             await scene.stop()
             await asyncio.to_thread(write_status_cache, scene.spec.folder, status)
         except Exception:  # harmless: all data of the scene is in its folder
-            log.exception("scene %s did not stop properly", scene.id)
+            log.exception("scene %s did not stop cleanly", scene.id)
         del self.awake[scene.id]
         log.info("scene %s fell asleep", scene.id)
 
@@ -181,7 +181,7 @@ class Scenes:
                 try:
                     await self.put_to_sleep(scene)
                 except Exception:  # a failure must not keep other scenes awake
-                    log.exception("scene %s did not fall asleep", scene.id)
+                    log.exception("scene %s could not be put to sleep", scene.id)
 
     async def _register_stored(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
         """Registers a stored scene as awake or asleep; returns False and records the reason if it cannot be read.
@@ -190,7 +190,7 @@ class Scenes:
         free.
 
         Args:
-            folder: folder of the scene.
+            folder: scene folder.
             said: messages about damage that was found earlier.
             wake: whether to load the scene into memory even if it would be asleep.
         """
@@ -215,7 +215,7 @@ class Scenes:
                 await asyncio.to_thread(write_status_cache, folder, status)
         except Exception as error:  # a faulty scene must not affect the others
             known = isinstance(error, DefinitionError | OSError)
-            reason = message_of(error) if known else f"the service failed: {type(error).__name__}: {message_of(error)}"
+            reason = message_of(error) if known else f"internal error: {type(error).__name__}: {message_of(error)}"
             self.unreadable[folder.name] = reason
             log.error("folder %s cannot be read: %s", folder.path, reason, exc_info=None if known else error)
             return False
@@ -318,7 +318,9 @@ class Scenes:
         """
         self.recovering.check(id)
         reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
-        raise Problem(404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes")
+        raise Problem(
+            404, f"no scene {id!r}{reason}", field="id", value=id, remedy="list all scenes with GET /v1/scenes"
+        )
 
     async def delete(self, id: str) -> None:
         """Stops a scene's processes and removes its folder; the deletion takes effect when the folder is renamed.

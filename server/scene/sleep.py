@@ -1,6 +1,6 @@
 """Sleep of idle scenes, which release their processes and slots until the next request wakes them.
 
-Of a sleeping scene, only the status is in memory. To wake it, the service reads its folder as after a crash.
+Only the status of a sleeping scene is in memory. To wake the scene, the service reads its folder as after a crash.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from server.settings import ServerSettings
 from server.storage.layout import SceneFolder
 
 GRACE_S = 30.0
-"""Seconds after its last use during which a scene keeps its slot, because its rig may be about to send a frame."""
+"""Time in seconds that a scene keeps its slot after its last use, because its rig may be about to send a frame."""
 CHECK_S = 5.0
-"""Maximum seconds between checks for idle scenes; checks are more frequent if `sleep_seconds` is short."""
+"""Maximum interval in seconds between checks for idle scenes; checks are more frequent if `sleep_seconds` is short."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class SleepingScene:
 
     Attributes:
         id: scene ID.
-        created: time at which the scene was created.
+        created: creation time of the scene.
         status: status recorded when the scene fell asleep, or read from disk.
     """
 

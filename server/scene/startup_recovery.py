@@ -16,7 +16,7 @@ class StartupRecovery:
     """Recovery of the scenes that were found at startup.
 
     Args:
-        data: data folder of the service.
+        data: the service's data folder.
         read: loads a scene from its folder; must not raise.
     """
 

@@ -44,11 +44,11 @@ def state_of(ledger: Ledger, *, at_work: bool, degraded: bool) -> SceneState:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFacts:
-    """Data from which the status of a scene is computed.
+    """Data used to compute a scene's status.
 
     Attributes:
-        definition: definition of the scene.
-        ledger: ledger of the scene.
+        definition: scene definition.
+        ledger: the scene's ledger.
         pictures: index of the scene's frame log.
         has_points: whether the scene has an initial point cloud.
         queue_limit: maximum number of queued frames.
@@ -143,7 +143,7 @@ def effects_of(settings: Settings, record: Mapping[str, Any] | None) -> dict[str
     """Returns the status of each effect of a scene.
 
     Args:
-        settings: settings of the scene.
+        settings: scene settings.
         record: newest commit record. If it is None or has no effects, the initial switches are used.
     """
     switches = decode_switches((record or {}).get("effects", {})) or first_switches(settings, 0)
@@ -165,6 +165,6 @@ def camera_of(rig: Rig, name: str) -> Camera:
             f"the rig has no camera {name!r}",
             field="camera",
             value=name,
-            remedy=f"give one of {', '.join(rig.names)}, or a complete camera",
+            remedy=f"use one of {', '.join(rig.names)}, or specify a complete camera",
         )
     return rig[name]

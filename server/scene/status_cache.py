@@ -25,7 +25,7 @@ def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
     A damaged scene gets no cache, so that every startup checks it again.
 
     Args:
-        folder: folder of the scene.
+        folder: scene folder.
         status: status to report while the scene is asleep.
     """
     if status.damage:

@@ -29,7 +29,7 @@ class StoredScene:
     """Scene as stored in its folder.
 
     Attributes:
-        definition: definition of the scene, with the settings of the latest reconstruction.
+        definition: scene definition, with the settings of the latest reconstruction.
         content: contents recovered from the folder.
         points_sha256: SHA-256 of the uploaded initial point cloud, or None.
         warnings: warnings about the rig.
@@ -52,7 +52,7 @@ class StoredScene:
         return waits or bool(self.content.events or self.content.recompute or ledger.open)
 
     def facts(self, queue_limit: int) -> SceneFacts:
-        """Returns the data from which the status of the sleeping scene is computed.
+        """Returns the data used to compute the sleeping scene's status.
 
         `queue_limit` is the service's default maximum number of queued frames.
         """
@@ -96,7 +96,7 @@ def read_stored_scene(
     """Loads a scene from its folder. Blocking.
 
     Args:
-        folder: folder of the scene.
+        folder: scene folder.
         bury: moves a file or folder that is no longer needed to the `deleted` folder under the given name.
         said: messages about damage that was found earlier.
 
@@ -107,7 +107,7 @@ def read_stored_scene(
     used = folder.journal.stat().st_mtime if folder.journal.exists() else 0.0
     definition, damage = read_definition(folder)
     if definition.id != folder.name:
-        raise DefinitionError(f"it belongs to scene {definition.id}; the folder was renamed or copied")
+        raise DefinitionError(f"the folder contains scene {definition.id}; it was renamed or copied")
     if damage is not None:
         write_definition(folder, definition)
     content = recover(folder, definition.id, definition.as_json())

@@ -14,9 +14,9 @@ from scas4d_core.frame_outcome import OTHER_ORDERS
 NEWEST = 64
 """Number of the newest frames whose reports are used."""
 LADDER = (10, 25, 50, 100, 200, 300, 500)
-"""Numbers of iterations to extrapolate if they were not measured."""
+"""Iteration counts to extrapolate if they were not measured."""
 NEAR = 0.1
-"""Relative distance to a measured number of iterations within which no point is extrapolated."""
+"""Relative distance to a measured number of iterations below which no point is extrapolated."""
 
 
 def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:

@@ -35,7 +35,7 @@ class DefinitionError(ValueError):
 
 @dataclass(frozen=True)
 class Definition:
-    """A scene's creation request together with its resolved settings.
+    """A scene's creation request and resolved settings.
 
     `settings` are the preset's values at creation time with the request's overrides applied. If the reconstruction was
     restarted, `settings` are those of the restart and `begun` is its event.
@@ -61,7 +61,7 @@ class Definition:
             raise DefinitionError(f"the settings cannot be read: {message_of(error)}") from None
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the content of `scene.json`, of which the first journal event is a copy."""
+        """Returns the content of `scene.json`; the first journal event contains a copy."""
         return {
             "format": FORMAT,
             "id": self.id,

@@ -14,7 +14,7 @@ from server.problems import Problem
 from server.storage.layout import DataFolder, SceneFolder
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Error numbers that indicate a full disk; such errors disappear once space is available."""
+"""Error numbers that indicate a full disk; these errors disappear once space is available."""
 
 
 def no_room(error: BaseException | None) -> bool:
@@ -34,7 +34,7 @@ def full_disk(error: Exception) -> Problem:
     return Problem(
         507,
         f"the disk is full: {message_of(error)}",
-        remedy="free space in the service's data folder, or shorten the scene's retention, and repeat the request",
+        remedy="free space in the service's data folder or shorten the scene's retention, then repeat the request",
         headers={"Retry-After": "5"},
     )
 
@@ -80,7 +80,7 @@ def lock_data(data: Path) -> FolderLock:
     try:
         return FolderLock(DataFolder(data).lock, wait=False)
     except BlockingIOError:
-        raise RuntimeError(f"another service is using {data}; stop it, or use another folder: --data FOLDER") from None
+        raise RuntimeError(f"another service is using {data}; stop it, or use another folder with --data") from None
 
 
 def lock_states(folder: SceneFolder) -> FolderLock | None:

@@ -1,4 +1,4 @@
-"""Journal events of a scene: the only record of its frames, from which the ledger is built in order.
+"""Journal events of a scene, the only record of its frames. The ledger is built from them in order.
 
 The `type` tag and the fields of each event are stored in `journal.log`, so changing them requires a new format version
 (`server.storage.definition.FORMAT`).
@@ -105,7 +105,7 @@ class StatesDeleted(_Event):
 
 
 class StateFound(_Event):
-    """Discovery of a committed state for which the journal has lost the acknowledgement; `time` is from the state."""
+    """Discovery of a committed state whose acknowledgement is missing from the journal; `time` is from the state."""
 
     type: Literal["state_found"] = "state_found"
     index: int
@@ -152,7 +152,7 @@ class ReconstructionBegun(_Event):
     """Restart of the reconstruction, which replaces the previous one and its states.
 
     Attributes:
-        number: number of the reconstruction; the original one has 0.
+        number: reconstruction number; the original reconstruction has 0.
         index: index of its first frame.
         points: number of the reconstruction whose initial points are used (`SceneFolder.points_of`), or None if there
             are no points.

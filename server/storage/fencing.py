@@ -31,9 +31,9 @@ MARKER_NAME = ".epoch"
 MAX_PASSES = 20
 """Maximum number of attempts to link a folder that keeps changing because its writer is still running."""
 MAX_REMAINING = 5
-"""Number of epoch folders to keep if one worker after another exits before it starts its work."""
+"""Number of epoch folders to keep if successive workers exit before they start their work."""
 LOCK_WAIT_S = 10.0
-"""Seconds to wait for the exit of a local worker after its service was killed."""
+"""Time in seconds to wait for a local worker to exit after its service was killed."""
 
 
 class FencingError(RuntimeError):
@@ -64,7 +64,7 @@ def begin_epoch(states: Path, lock: Path) -> int:
 
     Args:
         states: path of the scene's states.
-        lock: lock file of a worker without an epoch.
+        lock: lock file used by workers without an epoch.
 
     Raises:
         FencingError: the worker that holds `lock` does not exit, the previous folder keeps changing or is missing, or

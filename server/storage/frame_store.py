@@ -46,9 +46,9 @@ class StoredPictures:
     """Encoded image and mask files of a record.
 
     Attributes:
-        index: index of the frame.
+        index: frame index.
         time: time of the frame in seconds, or None if the upload did not include it.
-        part: whether the record is of a single camera.
+        part: whether the record is from a single camera.
         images: image file of each camera, as a view of the record.
         masks: mask file of each camera, as a view of the record.
         hashes: BLAKE3 digest of each file, keyed by camera and kind.
@@ -69,7 +69,7 @@ class Upload:
     time per frame. Direct writes need whole blocks from page-aligned memory; the remainder is kept for the next write.
 
     Args:
-        folder: folder of the frame log.
+        folder: frame log folder.
         head: names and sizes of the files that follow.
         seconds: time of the frame in seconds, or None if it is not known yet.
     """
@@ -180,7 +180,7 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
             record.index, record.head["time"], bool(record.head["single_camera"]), images, masks, hashes
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise FrameDamage(f"{name}: its head does not describe images ({error!r})") from None
+        raise FrameDamage(f"{name}: the head does not describe images ({error!r})") from None
 
 
 def verify_record(folder: Path, name: str) -> Iterator[int]:
@@ -213,7 +213,7 @@ def remove(folder: Path, names: Iterable[str]) -> None:
 
 
 def frame_of(name: str) -> int:
-    """Returns the index of the frame to which a record belongs, parsed from the record name."""
+    """Returns the index of a record's frame, parsed from the record name."""
     return int(name.partition("-")[0])
 
 
@@ -226,7 +226,7 @@ class FrameLogIndex:
     """In-memory index of the frame log of a scene, with the size of each record.
 
     Args:
-        folder: folder of the frame log.
+        folder: frame log folder.
         sizes: size in bytes of each record in the folder, keyed by record name.
 
     Attributes:

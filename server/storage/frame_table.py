@@ -1,4 +1,4 @@
-"""Columnar table of a scene's frames, without disk or clock access; a day at 30 fps is 2.6 million frames.
+"""Columnar table of a scene's frames, without disk or clock access; a day at 30 fps has 2.6 million frames.
 
 Each frame permanently takes 46 bytes. Rare properties (errors, frame log records, worker crashes) are stored in
 dictionaries. Commit records of the newest frames stay in memory; older ones are read from disk.
@@ -34,7 +34,7 @@ exists. UNREADABLE: its state is damaged and is being recomputed.
 """
 IDENTITY = 32  # bytes
 FEW_STATES = 32
-"""Minimum number of deleted states for which the list of committed frames is rebuilt instead of edited."""
+"""Minimum number of deleted states at which the list of committed frames is rebuilt instead of edited."""
 
 
 class FrameTable:
@@ -155,7 +155,7 @@ class FrameTable:
             self.rare_properties(index).error = PICTURES_GONE
 
     def add_committed(self, index: int, time: float | None) -> None:
-        """Adds a committed state for which no journal event exists."""
+        """Adds a committed state that has no journal event."""
         if time is not None:
             self._times[index] = time
             self._flags[index] |= TIME

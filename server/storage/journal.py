@@ -90,16 +90,14 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
                 if record.torn:
                     good = record.start
                 broken |= not record.torn
-                damage.append(f"{path.name}: bytes {record.start} to {record.end} dropped: {record.reason}")
+                damage.append(f"{path.name}: dropped bytes {record.start} to {record.end}: {record.reason}")
                 continue
             try:
                 event = parse_event(record.text)
             except ValidationError as error:
                 fault = event_fault(error)
                 broken = True
-                damage.append(
-                    f"{path.name}: a record of kind {record.kind}, frame {record.frame}, is not an event: {fault}"
-                )
+                damage.append(f"{path.name}: invalid event of kind {record.kind}, frame {record.frame}: {fault}")
                 continue
             begun = isinstance(event, SceneCreated) if begun is None else begun
             take(event)
@@ -240,7 +238,7 @@ class Journal:
         if (there.st_dev, there.st_ino) != (own.st_dev, own.st_ino):
             return f"{self.path.name} was replaced by another file"
         if there.st_size < self._good:
-            return f"{self.path.name} has {there.st_size} of {self._good} bytes"
+            return f"{self.path.name} is truncated to {there.st_size} of {self._good} bytes"
         return None
 
     def _begin(self) -> None:

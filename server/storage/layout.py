@@ -72,8 +72,8 @@ class SceneFolder:
     """Folder of one scene. Files of a reconstruction other than number 0 have its number in their names.
 
     Attributes:
-        path: path of the folder.
-        reconstruction: number of the reconstruction.
+        path: folder path.
+        reconstruction: reconstruction number.
         cloud: number of the reconstruction whose initial points are used.
         epoch: epoch of the worker that commits to the states (`server.storage.fencing`), or None to access the states
             through the `states` path.

@@ -40,7 +40,7 @@ from server.storage.frame_table import CODES, DELETED, FEW_STATES, RECEIPT, Fram
 from server.storage.journal import Journal
 
 RETRY_S = 1.0
-"""Seconds after which writing an event is retried if the disk is full."""
+"""Delay in seconds before writing an event is retried if the disk is full."""
 NO_FIRST_FRAME = "the scene failed at an earlier frame"
 
 
@@ -58,7 +58,7 @@ class Ledger:
         open: frames whose cameras upload separately and that are not closed yet, keyed by index.
         paused: whether the scene is paused.
         fatal: reason why the scene cannot continue, or None.
-        failed_at: frame at which the scene failed, or None.
+        failed_at: index of the frame that made the scene fail, or None.
         states_deleted: number of committed states that no longer exist.
         budgets: (first frame, budget) pairs, in ascending order.
         edited: accumulated changes to name, archive flag and retention since creation.
@@ -168,7 +168,7 @@ class Ledger:
         return next(budget for first, budget in reversed(self.budgets) if first <= index)
 
     def next_to_begin(self) -> int:
-        """Returns the first frame whose update has not started, from which a new budget applies."""
+        """Returns the first frame whose update has not started; a new budget applies from this frame on."""
         return next(iter(self.waiting()), self.next_frame)
 
     def set_state(self, index: int, state: FrameState) -> None:
@@ -271,8 +271,8 @@ class SceneLog:
     """Journal, ledger and frame log of one scene. A change is journalled before it is applied to the ledger.
 
     Args:
-        ledger: ledger of the scene.
-        journal: journal of the scene.
+        ledger: the scene's ledger.
+        journal: the scene's journal.
         pictures: index of the scene's frame log.
         waits: function called with a message each time a journal write waits for disk space.
 
@@ -323,7 +323,7 @@ class SceneLog:
         """Returns the frames whose images can be deleted under the retention rule, in ascending order.
 
         Images of unfinished frames are kept. An interrupted scene may roll back to an earlier commit, so the images of
-        all later frames are kept, too.
+        all later frames are kept too.
         """
         ledger, pictures = self.ledger, self.pictures
         if len(ledger.committed) < NEWEST_KEPT or (rule.last is None and rule.bytes is None):

@@ -91,11 +91,11 @@ class Damage:
     index: int | None = None
     kind: int | None = None
     torn: bool = False
-    """Whether the damage reaches the end of the log, as after an interrupted append."""
+    """Whether the damage extends to the end of the log, as after an interrupted append."""
 
 
 def encode_opening(kind: int, index: int, head: Any, body_length: int, version: int = WHOLE) -> bytes:
-    """Encodes the header and head of a record, after which the body and the checksum are written."""
+    """Encodes the header and head of a record; the body and the checksum are written after them."""
     text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode()
     header = HEADER.pack(MAGIC, version, kind, 0, len(text), index, body_length)
     return header + CRC.pack(zlib.crc32(text, zlib.crc32(header))) + text
@@ -104,7 +104,7 @@ def encode_opening(kind: int, index: int, head: Any, body_length: int, version: 
 def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
     """Returns the truncated BLAKE3 digest of consecutive pieces.
 
-    The pieces are those of a whole record, or its opening followed by the digest of each file.
+    The pieces form a whole record, or its opening followed by the digest of each file.
     """
     digest = blake3()
     for piece in pieces:
@@ -137,7 +137,7 @@ def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
         return _skip(data, at, "the header or head fails its checksum")
     end = head_end + body_length + CHECKSUM
     if end > len(data):
-        damage, after = _skip(data, at, f"ends after {len(data) - at} of {end - at} bytes")
+        damage, after = _skip(data, at, f"the record ends after {len(data) - at} of {end - at} bytes")
         return Damage(at, after, damage.reason, index, kind, damage.torn), after
     start, body, found = data[at:head_end], data[head_end : end - CHECKSUM], data[end - CHECKSUM : end]
     if version == WHOLE and checksum(start, body) != found:
@@ -164,7 +164,7 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
         files.append(body[at : at + file["size"]])
         at += file["size"]
     if at != len(body):
-        raise ValueError(f"its files have {at} bytes, but the body has {len(body)}")
+        raise ValueError(f"the files have {at} bytes, but the body has {len(body)}")
     return tuple(files)
 
 
@@ -237,7 +237,7 @@ def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
     if at == len(data):
         return None, at
     record, after = read_at(memoryview(data), at)
-    return record if isinstance(record, Damage) else Damage(at, after, "of a version that is not allowed here"), after
+    return record if isinstance(record, Damage) else Damage(at, after, "the record version is not allowed here"), after
 
 
 def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:

@@ -34,7 +34,7 @@ from server.storage.ledger import Ledger, frame_identity
 from server.storage.snapshot import events_of
 
 RECONSTRUCTION_EVENTS = (FrameFailed, StateFound, StatesDeleted, WorkerDied)
-"""Event types that belong to one reconstruction only; a restarted one retries the frames and has new states."""
+"""Event types that apply to one reconstruction only; a restarted one retries the frames and has new states."""
 NO_STATE = "the journal was lost, and this frame has no committed state"
 
 
@@ -44,7 +44,7 @@ class Recovered:
 
     Attributes:
         folder: scene folder with the file names of the latest reconstruction.
-        ledger: ledger of the scene with all `events` applied.
+        ledger: the scene's ledger with all `events` applied.
         good: size of the journal in bytes, without a torn tail.
         events: events that the journal lacks and that have been applied to the ledger.
         sizes: size in bytes of each record in the frame log, keyed by record name.
@@ -88,7 +88,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     rediscovered, nothing is removed, and the journal is rewritten from the recovered ledger.
 
     Args:
-        folder: folder of the scene.
+        folder: scene folder.
         scene: scene ID.
         definition: definition as in `SceneCreated`; if None, the journal is not rewritten.
     """

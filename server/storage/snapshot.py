@@ -27,7 +27,7 @@ from server.storage.ledger import Ledger
 FRAMES_PER_EVENT = 10_000
 """Maximum number of frames per event, because the head of a record has a limited size."""
 OWN_ERROR = (FrameState.FAILED, FrameState.MISSING)
-"""States in which the error of a frame explains the state itself.
+"""States whose frame error explains the state itself.
 
 In other states, the error explains why the committed state no longer exists.
 """

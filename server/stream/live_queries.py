@@ -90,8 +90,8 @@ class LiveQuery(ABC):
                 self._changes = 0
                 await self._outbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=problem.document))
             except Exception:
-                log.exception("scene %s, subscription %r", self.scene.id, self.id)
-                fault = Problem(500, "the service failed", remedy=SERVICE_FAULT)
+                log.exception("scene %s: error in subscription %r", self.scene.id, self.id)
+                fault = Problem(500, "internal error", remedy=SERVICE_FAULT)
                 await self._outbox.reply(StreamProblem(id=self.id, tag=self.tag, problem=fault.document))
 
     async def _send_newest(self) -> None:

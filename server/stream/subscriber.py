@@ -47,7 +47,7 @@ A client that needs more can open another stream.
 MESSAGE_KB = 256
 """Maximum size in kB of a message from a subscriber, enough for about 8000 pixels to track."""
 
-FIELD_PREFIX = "docs/stream.md lists the messages"
+FIELD_PREFIX = "see docs/stream.md for all messages"
 
 LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: LiveTracks, Topic.PARTS: LiveParts}
 
@@ -56,7 +56,7 @@ class Subscriber:
     """Subscriber to a scene on behalf of one client; the route that owns the connection drains its outbox.
 
     Attributes:
-        closing: code and reason with which to close the connection after the last message of the outbox.
+        closing: code and reason for closing the connection after the last message in the outbox.
     """
 
     def __init__(self, scene: Scene, channel: Channel) -> None:
@@ -90,7 +90,9 @@ class Subscriber:
         tag: int | None = None
         try:
             if text is None:
-                raise Problem(422, "the message is binary", field="message", remedy="send JSON in text messages")
+                raise Problem(
+                    422, "binary messages are not supported", field="message", remedy="send JSON in text messages"
+                )
             message = _validate(CLIENT_MESSAGE.validate_json, text)
             id = message.id
             if isinstance(message, Unsubscribe):
@@ -141,7 +143,7 @@ class Subscriber:
         if id not in self._topics:
             raise Problem(
                 404,
-                f"there is no subscription {id!r}",
+                f"no such subscription: {id!r}",
                 field="id",
                 value=id,
                 remedy="subscribe first, with an id of your choice",
@@ -154,7 +156,7 @@ class Subscriber:
         if message.id not in self._topics and len(self._topics) >= MAX_SUBSCRIPTIONS:
             raise Problem(
                 429,
-                f"the stream already has {count_noun(len(self._topics), 'subscription')}, the maximum",
+                f"the stream already has the maximum of {count_noun(len(self._topics), 'subscription')}",
                 field="subscriptions",
                 value=MAX_SUBSCRIPTIONS,
                 remedy="unsubscribe from another one, or open a second stream",

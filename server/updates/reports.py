@@ -27,7 +27,7 @@ class FrameReports:
     """Frame reports of one scene; commit records that are not in memory are read from disk.
 
     Args:
-        ledger: ledger of the scene.
+        ledger: the scene's ledger.
         states: folder of the committed states.
         damaged: called with a mapping from the name of each unreadable file to the reason.
     """

@@ -30,7 +30,7 @@ def trouble_in_report(report: FrameReportModel) -> str | None:
     if report.state == FrameState.FAILED:
         return f"frame {report.index} failed: {report.error}"
     if report.outcome is not None and report.outcome.degraded:
-        verb = "" if report.outcome.rejected else "partly committed: "
+        verb = "rejected; " if report.outcome.rejected else "partly committed: "
         return f"frame {report.index} was {verb}{report.degraded}"
     if report.dropped_cameras:
         left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())

@@ -48,20 +48,20 @@ class Updates:
     the outcome.
 
     Args:
-        scene_log: journal, ledger and frame log of the scene.
-        damage: log of damaged files of the scene.
+        scene_log: the scene's journal, ledger and frame log.
+        damage: log of the scene's damaged files.
         worker: supervisor of the worker process.
-        mending: repair queue of the scene.
-        readers: reader processes of the scene.
-        reports: frame reports of the scene.
+        mending: the scene's repair queue.
+        readers: the scene's reader processes.
+        reports: the scene's frame reports.
         trouble: reason why the scene is degraded.
         publisher: publisher of the scene's events.
-        background: background tasks of the scene.
+        background: the scene's background tasks.
         keep_frames: retention rule for images.
         first: initial value of the attribute `first`.
 
     Attributes:
-        clock: predictor of the end of the current update.
+        clock: predicts when the current update ends.
         worker: supervisor of the worker process.
         progress: progress of frame 0 while it is being reconstructed, otherwise None.
         first: facts about the first frame; see `first_frame_facts`.
@@ -327,7 +327,7 @@ class Updates:
             return
         counters.RESTARTS.labels("worker").inc()
         own, delay = self.worker.deaths.note_death(reason)
-        self._trouble.sentence = f"the worker exited: {reason}; restarting it in {delay:g} s"
+        self._trouble.sentence = f"the worker exited unexpectedly ({reason}); restarting it in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self._trouble.sentence)
         self._background.run(self._retry_or_fail(reason, own, delay))
 

@@ -14,7 +14,7 @@ FIRST_GUESS_S = 1.0
 SHORTEST_S = 0.1
 """Minimum prediction in seconds."""
 OVERDUE = 0.25
-"""Predicted remaining time of an overdue update, as a fraction of the time by which it exceeds its prediction.
+"""Predicted remaining time of an overdue update, as a fraction of its delay beyond the prediction.
 
 Between two stages of frame 0, the prediction is this fraction of the elapsed time.
 """

@@ -38,7 +38,7 @@ MAX_WAIT_AFTER_LOSS_S = 8.0
 """Maximum restart delay in seconds after a machine loss, so that the scene recovers within half a minute."""
 
 SWEEP_AFTER_S = 120.0
-"""Seconds for which the states of an abandoned worker are kept, since NFS may cache the old link for up to a minute."""
+"""Time in seconds that an abandoned worker's states are kept, since NFS may cache the old link for up to a minute."""
 
 
 class WorkerDeaths:
@@ -61,7 +61,7 @@ class WorkerDeaths:
         """Records an exit of the worker process; the restart delay is shorter if its machine was lost.
 
         Returns:
-            Whether the worker itself caused the exit, and the seconds to wait before a restart. The worker is the cause
+            Whether the worker itself caused the exit, and the restart delay in seconds. The worker is the cause
             if it exited with an error, crashed (for example with SIGSEGV) or ran out of memory.
         """
         own = why.exit_code is not None and (why.exit_code > 0 or -why.exit_code in OWN_SIGNALS)
@@ -80,9 +80,9 @@ def give_up_event(entry: FrameEntry, death: WorkerDied) -> FrameFailed | None:
     """Returns the event that fails the frame after a crash that `entry` already counts, or None to retry the frame."""
     own, other = entry.rare_properties.own_deaths, entry.rare_properties.other_deaths
     if own >= OWN_DEATHS:
-        reason = f"the worker crashed {own} times while reconstructing this frame: {death.reason}"
+        reason = f"the worker crashed {own} times while reconstructing this frame (last: {death.reason})"
     elif other >= OTHER_DEATHS:
-        reason = f"the worker was killed {other} times while reconstructing this frame: {death.reason}"
+        reason = f"the worker was killed {other} times while reconstructing this frame (last: {death.reason})"
     else:
         return None
     return FrameFailed(index=death.index, reason=reason)
@@ -92,7 +92,7 @@ class WorkerProcess:
     """Supervisor of at most one worker process at a time. All methods run on the event loop.
 
     Args:
-        spec: specification of the scene; a change takes effect at the next start.
+        spec: scene specification; a change takes effect at the next start.
         placement: starts the process.
 
     Attributes:
@@ -148,7 +148,7 @@ class WorkerProcess:
             epoch = await asyncio.to_thread(begin_epoch, folder.states, folder.worker_lock)
             if not self._closed:
                 self._start(replace(self.spec, folder=replace(folder, epoch=epoch)))
-        except Exception as error:  # whatever the error is, the scene must retry
+        except Exception as error:  # any error must be handled, so that the scene retries
             if not isinstance(error, OSError | FencingError):
                 log.exception("scene %s", folder.name)
             self._on_end(ProcessExit(None, f"cannot take over the committed states: {message_of(error)}"))
@@ -167,7 +167,7 @@ class WorkerProcess:
             return
         await asyncio.sleep(SWEEP_AFTER_S)
         if names := await asyncio.to_thread(remove_earlier_epochs, self.spec.folder.states, epoch):
-            log.info("scene %s: removed %s of earlier workers", self.spec.folder.name, ", ".join(names))
+            log.info("scene %s: removed folders of earlier workers: %s", self.spec.folder.name, ", ".join(names))
 
     def start_in(self, seconds: float) -> None:
         """Schedules the start of the next process; call this after every unexpected exit."""

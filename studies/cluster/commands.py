@@ -15,7 +15,7 @@ def cluster(
     frames: Annotated[int, typer.Option(min=3, help="Frames per scene.")] = 12,
     scenes: Annotated[int, typer.Option(min=1, help="Number of concurrent scenes on the three nodes.")] = 6,
     turns: Annotated[int, typer.Option(min=1, help="Repetitions of each placement.")] = 3,
-    views: Annotated[int, typer.Option(min=1, help="Views rendered per turn, of an idle scene.")] = 60,
+    views: Annotated[int, typer.Option(min=1, help="Number of views of an idle scene rendered per turn.")] = 60,
     work: Annotated[Path, typer.Option(help="Folder for the services' data; its contents are deleted.")] = Path(
         "out/cluster"
     ),
@@ -44,7 +44,7 @@ def cluster(
 
 
 def head(
-    times: Annotated[int, typer.Option(min=1, help="How often the head is killed.")] = 20,
+    times: Annotated[int, typer.Option(min=1, help="Number of times the head is killed.")] = 20,
     out: Page = None,
 ) -> None:
     """Measures how long a Ray cluster cannot place work after its head is killed and immediately restarted, with Redis.

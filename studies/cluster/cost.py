@@ -20,7 +20,7 @@ from studies.running.study import FrameSender, Study
 
 PLACEMENTS = ("local", "ray")
 EVERY_S = 0.01
-"""Interval at which the study checks whether a frame is committed."""
+"""Interval in seconds at which the study checks whether a frame is committed."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ def summarize(found: dict[str, CostFigures], scenes: int) -> str:
     low, middle, high = np.percentile(ratios, (25, 50, 75))
     table += [
         "",
-        f"Ratio per frame over {len(ratios)} updates: median {middle:.3f} (half of them {low:.3f} to {high:.3f})",
+        f"Ratio per frame over {len(ratios)} updates: median {middle:.3f} (quartiles {low:.3f} and {high:.3f})",
     ]
     return "\n".join(table)
 

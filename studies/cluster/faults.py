@@ -29,7 +29,7 @@ GOES_ON_S = 30.0
 HEAD_GONE_S = 10.0
 """How long the head stays down."""
 WAITS_S = 5.0
-"""A worker that is not placed after this time is waiting for room; otherwise it starts within a few seconds."""
+"""Time after which an unplaced worker counts as waiting for resources; otherwise, it starts within a few seconds."""
 SWEPT_S = 180.0
 """Time within which the folders of earlier workers must be removed."""
 
@@ -60,7 +60,9 @@ def killed_nodes(
         lost = len(study.frames) - len(sender.receipts)
         longest = max(pauses, default=0.0)
         summary = f"{lost} acknowledged frames lost, {len(expected)} states compared, resumed within {longest:.1f} s"
-        target = f"0 acknowledged frames lost, final state bit-identical, no frame blamed, resumed in {GOES_ON_S:g} s"
+        target = (
+            f"0 acknowledged frames lost, final state bit-identical, no frame blamed, resumed within {GOES_ON_S:g} s"
+        )
         return ScenarioResult(f"a node killed at {count} random moments", target, summary, faults)
 
 
@@ -79,7 +81,7 @@ def stopped_node(
         began, committed = time.monotonic(), service.status(scene).committed
         wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume")
         pause = time.monotonic() - began
-        echo(f"the scene resumed after {pause:.1f} s; the old node now resumes")
+        echo(f"the scene resumed after {pause:.1f} s; resuming the old node")
         folder = epoch_folder(states, stale)
         before = _changed(folder)
         nodes.resume(node)
@@ -91,14 +93,16 @@ def stopped_node(
         service.finish(scene, len(study.frames))
         faults = sender.check() + compare(digests(states), expected)
         if not written:
-            faults.append("the old worker wrote nothing, so nothing was tested: run it again")
+            faults.append("the old worker wrote nothing, so nothing was tested; run the scenario again")
         until = time.monotonic() + SWEPT_S
         while len(epochs(states)) > 1 and time.monotonic() < until:
             time.sleep(AGAIN_S)
         if still := sorted(epochs(states))[:-1]:
             faults.append(f"the folders of epochs {still} still exist")
-        summary = f"resumed after {pause:.1f} s; the old worker wrote {len(written)} files, all unread and removed"
-        target = "none of its files is read; they are found and removed; final state bit-identical"
+        summary = (
+            f"resumed after {pause:.1f} s; the old worker wrote {len(written)} files, all removed without being read"
+        )
+        target = "the old worker's files are removed without being read; final state bit-identical"
         return ScenarioResult("a node stopped, then resumed after its scene has moved", target, summary, faults)
 
 
@@ -116,12 +120,12 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         time.sleep(5 * update_s)
         faults = []
         if service.status(scene).committed > committed:
-            faults.append("the scene continued although no node had room, so nothing was tested")
-        echo(f"{len(others)} scenes fill the nodes; waiting: {said}")
+            faults.append("the scene continued although no node was free, so nothing was tested")
+        echo(f"{len(others)} scenes fill the nodes; reported reason: {said}")
         began = time.monotonic()
         for other in others:
             service.http.delete(f"/v1/scenes/{other}").raise_for_status()
-        wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume once there was room")
+        wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume once a node was free")
         pause = time.monotonic() - began
         nodes.add()
         status = service.finish(scene, len(study.frames))
@@ -129,9 +133,12 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         if status.degraded:
             faults.append(f"the scene is still degraded: {status.error}")
         summary = (
-            f"{len(left)} frames acknowledged while it waited and reported why; next commit {pause:.1f} s after room"
+            f"{len(left)} frames acknowledged while the scene waited and reported why; next commit {pause:.1f} s after "
+            "a node was free"
         )
-        target = "frames are acknowledged, the scene reports why it waits and resumes once there is room; bit-identical"
+        target = (
+            "frames are acknowledged, the scene reports why it waits and resumes once a node is free; bit-identical"
+        )
         return ScenarioResult("a node killed while other scenes fill the rest", target, summary, faults)
 
 
@@ -160,8 +167,8 @@ def restarted_head(
         wait_until(lambda: service.worker_pid(scene) is not None, "the scene was not placed again")
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         summary = (
-            f"{without} frames committed meanwhile, {deaths} workers lost; then a node was killed, and its scene "
-            f"placed on another; {len(expected)} states compared"
+            f"{without} frames committed meanwhile, {deaths} workers lost; then a node was killed and its scene "
+            f"placed on another one; {len(expected)} states compared"
         )
         target = "0 acknowledged frames lost, final state bit-identical, scenes are placed again afterwards"
         return ScenarioResult(f"the head killed, restarted after {HEAD_GONE_S:g} s (Redis)", target, summary, faults)
@@ -183,7 +190,7 @@ def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
         if pid is not None and (node := nodes.of(pid)) is not None:
             return node, pid
         time.sleep(AGAIN_S)
-    raise StudyError("the scene's worker runs on none of the nodes")
+    raise StudyError("the scene's worker is not running on any node")
 
 
 def _changed(folder: Path) -> dict[str, int]:
@@ -259,15 +266,15 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
     outcomes = []
     if set(parts) & {*ON_NODES, OF_THE_HEAD}:
         expected, update_s = undisturbed(study)
-        echo(f"undisturbed, on one machine: {len(expected)} states, {update_s:.2f} s an update")
+        echo(f"undisturbed run on one machine: {len(expected)} states, {update_s:.2f} s per update")
     if OF_THE_HEAD in parts:
         if (redis_server := shutil.which("redis-server")) is not None:
             with Nodes(redis_server=redis_server) as nodes:
                 outcomes.append(restarted_head(_on(study, nodes), nodes, expected, update_s, echo))
         elif len(parts) == 1:
-            raise StudyError("part head needs redis-server: apt-get install redis-server")
+            raise StudyError("part head requires redis-server; install it with: apt-get install redis-server")
         else:
-            echo("part head is skipped: it needs redis-server")
+            echo("skipping part head, which requires redis-server")
     if not set(parts) & {*ON_NODES, *AS_LOCALLY}:
         return outcomes
     with Nodes() as nodes:

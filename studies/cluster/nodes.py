@@ -29,7 +29,7 @@ class Nodes:
         redis_server: path of the redis-server program that stores the head's state; in memory if None.
 
     Attributes:
-        address: address of the head, for `--placement ray=ADDRESS`.
+        address: head address, for `--placement ray=ADDRESS`.
     """
 
     def __init__(self, count: int = 3, cpus: float = 2, redis_server: str | None = None) -> None:

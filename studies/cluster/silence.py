@@ -37,9 +37,9 @@ class SupervisedCluster:
 
     def __init__(self) -> None:
         if os.geteuid() != 0:
-            raise StudyError("this study needs root, to run the head in its own process namespace")
+            raise StudyError("this study requires root privileges to run the head in its own process namespace")
         if (program := shutil.which("redis-server")) is None:
-            raise StudyError("this study needs redis-server: apt-get install redis-server")
+            raise StudyError("this study requires redis-server; install it with: apt-get install redis-server")
         os.environ.update({f"RAY_health_check_{name}": str(value) for name, value in HEALTH.items()})
         self._redis = redis(program)
         self._address_of_redis = os.environ.pop(REDIS)
@@ -128,8 +128,9 @@ def summarize(found: Sequence[float]) -> str:
     """Formats the result as a sentence."""
     ordered = sorted(found)
     return (
-        f"An actor requested right after the head was killed answered after {ordered[len(ordered) // 2]:.1f} s "
-        f"({ordered[0]:.1f} to {ordered[-1]:.1f} s; {len(ordered)} times)"
+        "An actor requested right after the head was killed responded after a median of "
+        f"{ordered[len(ordered) // 2]:.1f} s "
+        f"({ordered[0]:.1f} to {ordered[-1]:.1f} s over {len(ordered)} kills)"
     )
 
 

@@ -11,13 +11,19 @@ from studies.options import Page, write_page
 
 
 def compact(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of the capture.")],
-    states: Annotated[Path, typer.Argument(metavar="STATES", help="Its committed states, from `scas4d reconstruct`.")],
-    frames: Annotated[int, typer.Option(min=2, help="Frames in the file; the states alternate back and forth.")] = 240,
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
+    states: Annotated[
+        Path, typer.Argument(metavar="STATES", help="Committed states of the capture, from `scas4d reconstruct`.")
+    ],
+    frames: Annotated[
+        int, typer.Option(min=2, help="Number of frames in the file; the states are repeated back and forth.")
+    ] = 240,
     key_every: Annotated[int | None, typer.Option(min=1, help="Frames between keyframes.")] = None,
     bounds: Annotated[
         list[str] | None,
-        typer.Option("--bound", metavar="NAME=VALUE", help="Changes an error bound: colour=0.02. May be repeated."),
+        typer.Option(
+            "--bound", metavar="NAME=VALUE", help="Change an error bound, such as colour=0.02. May be repeated."
+        ),
     ] = None,
     page: Page = None,
 ) -> None:

@@ -93,7 +93,7 @@ def measure(
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
     head = FileHeader(world, Bounds(**bounds), background=history.background)
     if frames < len(history):
-        raise InputError(f"frames is {frames}", f"give at least {len(history)}: every state is compared")
+        raise InputError(f"frames is {frames}", f"use at least {len(history)}: every state is compared")
     grows = history.count > len(history.gaussians(history.indices[0]))
     order = history.indices if grows else back_and_forth(history.indices, frames)  # births cannot be played back
     exact = float(np.mean([path.stat().st_size for path in states.glob("frame_*.npz")]))
@@ -145,7 +145,8 @@ def summarize(found: CompactFigures) -> str:
     pictures = "–" if found.psnr is None else f"{found.psnr:+.3f} (worst frame {found.worst:+.3f})"
     return "\n".join(
         [
-            f"**{found.capture}**: {found.gaussians:,} Gaussians, {found.moving:,} move; {found.frames} frames",
+            f"**{found.capture}**: {found.gaussians:,} Gaussians, of which {found.moving:,} move; {found.frames} "
+            "frames",
             "",
             "| kB per frame | exact | test PSNR, dB | tracks, % of the extent | write ms | read ms | open ms |",
             "|---|---|---|---|---|---|---|",

@@ -29,7 +29,7 @@ class DeviceRow:
     """Comparison of one frame.
 
     Attributes:
-        capture: name of the capture.
+        capture: capture name.
         index: frame index.
         psnr: mean PSNR on the test cameras in dB, keyed by device.
         seconds: duration of the update in seconds, keyed by device.
@@ -64,7 +64,7 @@ def use_cpu_without_gpu() -> str:
         return "a GPU"
     os.environ[WARP_DEVICE] = "cpu"
     if (fault := gpu_fault()) is not None:
-        raise SystemExit(f"scripts/bench devices: {fault}; in the checkout: scripts/setup dev")
+        raise SystemExit(f"scripts/bench devices: {fault}; run in the checkout: scripts/setup dev")
     return "the CPU device of NVIDIA Warp"
 
 
@@ -74,7 +74,7 @@ def compare(
     """Returns a row for each updated frame.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         scale: image scale.
         frames: number of updates.
         iterations: iterations per update.

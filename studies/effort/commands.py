@@ -14,13 +14,15 @@ PARTS = ("report", "budgets", "adaptive")
 
 def effort(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study, shared with frontier.")] = FRONTIER,
+    out: Annotated[Path, typer.Option(help="Study folder, shared with frontier.")] = FRONTIER,
     milliseconds: Annotated[
         list[float] | None, typer.Option(min=1, help="Time budget; default 500, 1000 and 2000. May be repeated.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=5, help="Frames played back and forth under each budget.")] = 50,
-    updates: Annotated[int, typer.Option(min=1, help="Updates for the adaptive preset; at most the capture.")] = 100,
-    only: Annotated[list[str] | None, typer.Option(help="Only report, budgets or adaptive. May be repeated.")] = None,
+    frames: Annotated[int, typer.Option(min=5, help="Number of frames per budget, played back and forth.")] = 50,
+    updates: Annotated[int, typer.Option(min=1, help="Maximum number of updates for the adaptive preset.")] = 100,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Measure only this part: report, budgets or adaptive. May be repeated.")
+    ] = None,
 ) -> None:
     """Measures the cost of reports, how closely time budgets are met, and how much the adaptive preset saves.
 
@@ -30,7 +32,7 @@ def effort(
     """
     for part in only or ():
         if part not in PARTS:
-            raise typer.BadParameter(f"part {part!r} is unknown; choose from {', '.join(PARTS)}")
+            raise typer.BadParameter(f"unknown part {part!r}; choose from {', '.join(PARTS)}")
     from scas4d_core.warm_up import compile_in_processes
     from studies.effort.effort import measure_adaptive, measure_budgets
     from studies.effort.report import measure_report

@@ -25,7 +25,7 @@ from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TOLERANCE = 0.05
-"""Fraction of the budget by which a frame may be off; one iteration if that is more."""
+"""Fraction of the budget by which a frame may deviate; one iteration if that is more."""
 FRAMES = 50
 """Number of frames of a capture played back and forth."""
 FEW = 8
@@ -35,7 +35,7 @@ SEEDS = 3
 SEEN_DB = 45.0
 """PSNR cap: differences above it are invisible; slowed captures reach 54 dB."""
 COUNTED_FROM = 2
-"""First update that counts: the earlier ones lack a motion to start from and a measured speed."""
+"""First update that counts; earlier ones have no previous motion to start from and no measured speed."""
 
 
 @dataclass
@@ -78,7 +78,7 @@ def measure_budgets(
     The time of a frame runs from before its images are decoded until its commit is synced to disk.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         out: folder of a study that contains the states of frame 0.
         milliseconds: time budgets.
         frames: number of frames played under each budget.
@@ -118,9 +118,9 @@ def measure_adaptive(
     Writes ``out/effort/<capture>-<name>.json``.
 
     Args:
-        folder: folder of a capture with test cameras.
+        folder: capture folder with test cameras.
         out: folder of a study that contains the states of frame 0.
-        name: name of the adaptive preset.
+        name: adaptive preset name.
         updates: number of updates of the capture.
         seeds: number of seeds for the capture as recorded, because results of the first update vary by chance.
         report: prints the progress.

@@ -41,12 +41,11 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Budgets in milliseconds",
         "",
-        "Each capture is played back and forth under each budget (`scripts/bench effort`). Times run from before",
-        "decoding to the end of the commit on disk, without the first two frames. The tolerance is the larger of "
-        f"{100 * TOLERANCE:.0f} % of the budget",
-        f"and one iteration; {100 * KEPT:.0f} % of the frames must stay within it.",
+        "Each capture is played back and forth under each budget (`scripts/bench effort`). Times are measured from",
+        "before decoding to the end of the commit on disk, excluding the first two frames. The tolerance is the larger",
+        f"of {100 * TOLERANCE:.0f} % of the budget and one iteration; {100 * KEPT:.0f} % of frames must meet it.",
         "",
-        "| capture | budget ms | within, both ways | not over | median off ms | worst over ms | iterations, median | |",
+        "| capture | budget, ms | within | not over | median error, ms | worst error, ms | median iterations | |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -64,9 +63,9 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Adaptive effort",
         "",
-        "Preset `adaptive` against `scas4d` with 100 iterations for every frame, in alternation. *Repeats*: time of a",
-        "repeated frame (every frame is shown twice, one four times). *Slowed*: a third of the speed, rendered from",
-        "interpolated states of a reconstruction. Unchanged captures are run with "
+        "The preset `adaptive` is compared with `scas4d` at 100 iterations per frame, in alternation. *Repeats*: time",
+        "of repeated frames (each is shown twice, one four times). *Slowed*: the capture at a third of the speed,",
+        "rendered from interpolated states of a reconstruction. Unchanged captures are run with "
         f"{SEEDS} seeds; ± is their standard deviation.",
         "",
         "| capture | frames | time | dB | repeats | slowed: time | slowed: dB |",
@@ -100,9 +99,9 @@ def _report(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Cost of the report",
         "",
-        "Stage `report` of an update of `scas4d`: stage timers, losses for the curve alone, colour shifts, and",
-        "assembling, writing and publishing the report. *With : without* is the CPU time of the same updates with and",
-        "without the optional work in the iterations, in alternation; median and quartiles.",
+        "The stage `report` of a `scas4d` update comprises stage timers, losses that only the curve requires, colour",
+        "shifts, and assembling, writing and publishing the report. *With : without* is the CPU time ratio of the same",
+        "updates with and without the optional work in the iterations, run in alternation; median and quartiles.",
         "",
         "| capture | updates | report ms | report: % of an update | worst update | with : without | |",
         "|---|---|---|---|---|---|---|",
@@ -114,7 +113,7 @@ def _report(rows: Sequence[Row]) -> list[str]:
             f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f} % "
             f"| {100 * row['share_worst']:.2f} % | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
         )
-    return [*lines, "", f"The target: at most {100 * TARGET:.0f} % of an update.", ""]
+    return [*lines, "", f"Target: at most {100 * TARGET:.0f} % of an update.", ""]
 
 
 def _gain(one: Row) -> float:

@@ -33,7 +33,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     """Runs updates of ``scas4d`` with and without a full report; writes ``out/effort/<capture>-report.json``.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         out: folder of a study that contains the states of frame 0.
         updates: number of updates of the capture; the first ones are not counted.
         report: prints the progress.

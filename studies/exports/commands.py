@@ -11,8 +11,10 @@ from studies.options import Page, write_page
 
 
 def exports(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of the capture.")],
-    states: Annotated[Path, typer.Argument(metavar="STATES", help="Its committed states, from `scas4d reconstruct`.")],
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")],
+    states: Annotated[
+        Path, typer.Argument(metavar="STATES", help="Committed states of the capture, from `scas4d reconstruct`.")
+    ],
     sheet: Annotated[
         Path | None, typer.Option(help="Contact sheet to write: state | export | difference per format.")
     ] = None,

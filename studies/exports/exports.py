@@ -67,10 +67,10 @@ class ExportFigures:
     """Measurements of one format.
 
     Attributes:
-        format: name of the format.
-        size: size of the file in bytes.
+        format: format name.
+        size: file size in bytes.
         psnr: PSNR of its render against the render of the state, averaged over cameras, in dB.
-        reader: name of the reader.
+        reader: reader name.
         picture: state | export | difference in the first camera.
     """
 
@@ -125,7 +125,7 @@ def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
     pen, font = ImageDraw.Draw(made), ImageFont.load_default(TITLE - 8)
     for number, one in enumerate(figures):
         x, y = number % columns * (wide + GAP), number // columns * (high + TITLE)
-        pen.text((x + 4, y + 2), f"{one.format}: state | read by {one.reader} | difference, 4 times", "black", font)
+        pen.text((x + 4, y + 2), f"{one.format}: state | read by {one.reader} | difference x4", "black", font)
         made.paste(Image.fromarray(one.picture), (x, y + TITLE))
     return made
 

@@ -47,7 +47,7 @@ class PartFigures:
     """Errors of one part of the ground truth.
 
     Attributes:
-        part: name of the part.
+        part: part name.
         static: whether the part is static in the ground truth.
         points: number of its points.
         node: name of the matching node of the asset, or "none".
@@ -95,7 +95,7 @@ def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
     """Exports the asset of a whole capture, with the number of parts chosen by rule and then as in the ground truth.
 
     Args:
-        folder: folder of a capture. Without ground truth of moving rigid parts, the result is empty.
+        folder: capture folder. Without ground truth of moving rigid parts, the result is empty.
         states: folder of its committed states.
     """
     capture = open_source(folder)

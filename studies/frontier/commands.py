@@ -15,16 +15,19 @@ STEPS = ("rows", "times", "convergence", "page")
 
 def frontier(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study. A second run continues it.")] = FRONTIER,
-    axes: Annotated[list[str] | None, typer.Option(help="Only this axis, for example layers. May be repeated.")] = None,
+    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = FRONTIER,
+    axes: Annotated[
+        list[str] | None, typer.Option(help="Measure only this axis, such as layers. May be repeated.")
+    ] = None,
     updates: Annotated[int, typer.Option(min=1, help="Updates per row.")] = 5,
     most_iterations: Annotated[int | None, typer.Option(min=1, help="Skip settings with more iterations.")] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Only this step: rows, times, convergence or page. May be repeated.")
+        list[str] | None, typer.Option(help="Run only this step: rows, times, convergence or page. May be repeated.")
     ] = None,
     rounds: Annotated[int, typer.Option(min=1, help="Timing rounds; each times every setting once.")] = 5,
     page: Annotated[
-        Path | None, typer.Option(help="Markdown page; its plots go into a folder of that name. [OUT/frontier.md]")
+        Path | None,
+        typer.Option(help="Markdown page to write; its plots go into a folder with the same name. [OUT/frontier.md]"),
     ] = None,
 ) -> None:
     """Measures accuracy against time: iterations of each method, and one setting at a time around the default.
@@ -36,7 +39,7 @@ def frontier(
     """
     for step in only or ():
         if step not in STEPS:
-            raise typer.BadParameter(f"step {step!r} is unknown; choose from {', '.join(STEPS)}")
+            raise typer.BadParameter(f"unknown step {step!r}; choose from {', '.join(STEPS)}")
     steps = only or STEPS
     if "page" in steps:
         import_module("matplotlib")  # if missing, fail now and not after hours of measuring

@@ -32,7 +32,7 @@ WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100
 """Pairs of preset and number of iterations."""
 
 Look = Callable[[int, UpdateEngine], None]
-"""Called with the number of completed iterations and the engine after them."""
+"""Callback that receives the number of completed iterations and the engine in that state."""
 
 
 class WatchedEngine:
@@ -58,8 +58,8 @@ def measure_convergence(
     """Observes the first updates of a capture and writes the curves to ``out/convergence/<capture>.json``.
 
     Args:
-        folder: folder of a capture with test cameras.
-        out: folder of the study, which contains the states of frame 0.
+        folder: capture folder with test cameras.
+        out: study folder, which contains the states of frame 0.
         updates: number of updates over which the curves are averaged.
         variants: settings to measure; ``WATCHED`` if empty.
         report: prints the progress.

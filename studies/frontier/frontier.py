@@ -41,7 +41,7 @@ class Variant:
 
     Attributes:
         label: short description for plots and tables.
-        preset: name of the preset.
+        preset: preset name.
         iterations: iterations per update.
         changes: further settings, such as ``"update.clusters=[64]"``.
         seed: seed of the updates; frame 0 is the same for all seeds.
@@ -130,7 +130,7 @@ def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> li
     """
     for name in axes:
         if name not in AXES:
-            raise ValueError(f"axis {name!r} is unknown; choose from {', '.join(AXES)}")
+            raise ValueError(f"unknown axis {name!r}; choose from {', '.join(AXES)}")
     asked = [variant for name in axes or AXES for variant in AXES[name]]
     return list(
         dict.fromkeys([DEFAULT, *(v for v in asked if most_iterations is None or v.iterations <= most_iterations)])
@@ -150,7 +150,7 @@ def measure_frontier(
 
     Args:
         captures: folders of captures with test cameras.
-        out: folder of the study.
+        out: study folder.
         axes: names from ``AXES``; all axes if empty.
         updates: updates per row, except on the axis "drift", which covers whole captures.
         most_iterations: settings with more iterations are left out.
@@ -177,7 +177,7 @@ def measure_variants(
         for variant, capture in sorted(wanted, key=lambda pair: pair[0].iterations * (5 if pair[0].whole else 1))
         if row_of(known, variant, capture.resolve().name, updates) is None
     ]
-    report(f"{len(wanted)} rows, {len(wanted) - len(jobs)} of them measured already")
+    report(f"{len(wanted)} rows, {len(wanted) - len(jobs)} of them already measured")
     return run_jobs(jobs, out, report=report) if jobs else []
 
 

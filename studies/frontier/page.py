@@ -35,11 +35,11 @@ STAGE_ROWS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 
 """Labels of the settings whose stages are plotted."""
 AXIS_WORDS: Mapping[str, str] = {
     "adaptive": "Other presets",
-    "layers": "Layers",
-    "clusters": "Clusters of the first layer",
+    "layers": "Layers (K is their number)",
+    "clusters": "First-layer clusters",
     "views": "Views per iteration",
-    "gaussians": "Budget of Gaussians",
-    "max-scale": "Largest scale",
+    "gaussians": "Gaussian budget",
+    "max-scale": "Maximum scale",
     "covariance": "Covariance",
 }
 COLUMNS = (
@@ -62,7 +62,7 @@ def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UP
     """Draws the plots into a folder named after the page and writes the page.
 
     Args:
-        out: folder of the study.
+        out: study folder.
         captures: names of captures; those without rows are left out.
         page: Markdown file to write.
         updates: number of updates that the rows cover.
@@ -141,7 +141,7 @@ def equal_words(compared: Sequence[EqualSeconds]) -> str:
         return "Not measured at a common time."
     ahead = sum(lead > 0 for lead in leads)
     words = f"`scas4d` is ahead at {ahead} of {len(leads)} budgets; the smallest lead is {min(leads):+.2f} dB."
-    return words + (f" {missing} lie outside its curve." if missing else "")
+    return words + (f" Budgets outside the measured range: {missing}." if missing else "")
 
 
 def _draw(
@@ -200,25 +200,28 @@ def _text(
 
 {_provenance(out, captures)}
 
-An iteration is one forward and backward render of one training view, or of several if a row says so. Each row
-covers the first {updates} updates of a capture, from the same frame 0; accuracy is the mean over these updates and the
-test cameras. Definitions: [quality.md](quality.md), `scas4d_core/metrics/evaluation.py`. Seconds are medians of
-one update, decoding and commit included. A setting is dominated if another one is at least as fast and more accurate.
+An iteration is a forward and backward pass over one training view, or over several where noted. Each row covers a
+capture's first {updates} updates from the same frame 0; accuracy is the mean over these updates and the test cameras.
+Definitions are in [quality.md](quality.md) and `scas4d_core/metrics/evaluation.py`. Times are medians per update,
+including decoding and commit; other pages have times of other days on this shared machine. A setting is dominated if
+another is at least as fast and more accurate.
 
 ## Recommended settings
 
 {_choice(means, default)}
 
-Rules: a preview takes the fastest setting that loses at most {PREVIEW_LOSS_DB:g} dB against the default; a live show
-takes slower ones while each doubling of the time gains {LIVE_GAIN_DB:g} dB; an archive takes the fastest within
-{ARCHIVE_GAIN_DB:g} dB of the best.
+Selection rules:
 
-## At equal seconds
+- preview: the fastest setting within {PREVIEW_LOSS_DB:g} dB of the default;
+- live show: slower settings while each doubling of the time gains at least {LIVE_GAIN_DB:g} dB;
+- archive: the fastest setting within {ARCHIVE_GAIN_DB:g} dB of the best.
 
-The budget is the time that the baseline `dynamic3dgs` needs for a number of iterations; the PSNR of `scas4d` in that
-time is interpolated between its measured iterations, linearly over the logarithm of time; a number of iterations that
-takes longer than a better one is left out. Cells: lead of `scas4d` in dB
-(its PSNR : the baseline's). {equal_words(compared)}
+## Comparison at equal time
+
+Each budget is the time that the baseline, `dynamic3dgs`, needs for a number of iterations. The PSNR of `scas4d` at that
+time is interpolated between measured iteration counts, linearly in log time. Counts that are slower than a more
+accurate one are omitted. Cells show the lead of `scas4d` in dB and both PSNR values (`scas4d` : baseline).
+{equal_words(compared)}
 
 {equal_table(compared)}
 
@@ -229,28 +232,31 @@ takes longer than a better one is left out. Cells: lead of `scas4d` in dB
 
 {score_table(iterations, default)}
 
+With 10 iterations, updates miss motion. Examining and fitting it as new objects takes longer than the iterations saved
+(stage *presence*; repeated on *robot*, 2026-11-27).
+
 {_spreads(points, captures)}
 
 ## One setting at a time
 
-Around the default, 100 iterations of `scas4d`.
+These rows vary the default (`scas4d`, 100 iterations).
 
 {others}
 
-## Within an update, over frames, by stage
+## Convergence, drift and stages
 
 {
         _picture(
             images,
             "convergence",
-            "The test cameras' PSNR within an update. Rates and layers follow shares of the iterations, so a curve "
-            "does not pass through the ends of shorter ones.",
+            "PSNR on the test cameras within an update. Learning rates and layers are scheduled as shares of the "
+            "iterations, so a curve does not pass through the end points of shorter updates.",
         )
     }
 
-{_picture(images, "drift", "PSNR over a whole capture: errors of an update remain in the next.")}
+{_picture(images, "drift", "PSNR over a whole capture. Errors carry over from one update to the next.")}
 
-{_picture(images, "stages", "Time of a frame by stage.")}
+{_picture(images, "stages", "Time per frame, by stage.")}
 
 ## How it was measured
 
@@ -258,15 +264,14 @@ Around the default, 100 iterations of `scas4d`.
 scripts/bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page docs/{stem}.md
 ```
 
-Seconds come from a separate pass in which all settings take turns (`--only times`), or else are CPU seconds of rows on
-one thread. Each budget of Gaussians has its own frame 0, and only the plot over a whole capture covers more than the
-first updates.
+Times come from a separate pass that alternates between all settings (`--only times`); without it, they are CPU seconds
+of single-threaded rows.
 """
 
 
 def _choice(means: Sequence[Point], default: Point) -> str:
     lines = [
-        "| for a | setting | s/frame | PSNR dB | against the default | 3D % | parts ARI |",
+        "| use | setting | s/frame | PSNR dB | vs. default | 3D % | parts ARI |",
         "|---|---|---|---|---|---|---|",
     ]
     for purpose, point in chosen(means).items():
@@ -276,7 +281,7 @@ def _choice(means: Sequence[Point], default: Point) -> str:
             point.variant.label,
             f"{point.seconds:.2f}",
             f"{point.psnr:.2f}",
-            f"{point.psnr - default.psnr:+.2f} dB, {point.seconds / default.seconds:.2f} × the time",
+            f"{point.psnr - default.psnr:+.2f} dB, {point.seconds / default.seconds:.2f}× the time",
             "–" if track is None else f"{track:.2f}",
             "–" if parts is None else f"{parts:.3f}",
         ]
@@ -319,7 +324,7 @@ def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
             count = max(seeds for _, seeds in present.values())
             words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in present.items())
             spreads.append(f"`{method}` {words} ({count} seeds)")
-    return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(spreads)}." if spreads else ""
+    return f"Standard deviation of PSNR across update seeds, in dB: {'; '.join(spreads)}." if spreads else ""
 
 
 def _provenance(out: Path, captures: Sequence[str]) -> str:
@@ -330,12 +335,12 @@ def _provenance(out: Path, captures: Sequence[str]) -> str:
     cores = sorted({str(row["core"]) for row in [*rows, *times]})
     where = (
         "; ".join(sorted({in_words(row["machine"]) for row in times}))
-        or "not in alternation, but CPU seconds of rows on one thread"
+        or "not timed separately; CPU seconds of single-threaded rows"
     )
     accuracy = "; ".join(sorted({in_words(row["machine"]) for row in rows}))
     return (
-        f"Measured {when}. Seconds: {where}. Accuracy: {accuracy}. "
-        f"Code: {len(cores)} state(s) of the core's sources ({', '.join(cores)})."
+        f"- Measured: {when}.\n- Machine for times: {where}.\n- Machine for accuracy: {accuracy}.\n"
+        f"- Source versions of the core: {', '.join(cores)}."
     )
 
 

@@ -24,10 +24,10 @@ COLOURS = dict(zip(METHODS, OKABE_ITO, strict=False))
 MARKERS = dict(zip(METHODS, "os", strict=False))
 OTHER_AXES = {
     "layers": ("layers K", "s", OKABE_ITO[2]),
-    "clusters": ("clusters of the first layer N", "D", OKABE_ITO[3]),
+    "clusters": ("first-layer clusters N", "D", OKABE_ITO[3]),
     "views": ("views per iteration", "X", "#882255"),
     "covariance": ("covariance", "P", "#661100"),
-    "gaussians": ("budget of Gaussians", "v", OKABE_ITO[4]),
+    "gaussians": ("Gaussian budget", "v", OKABE_ITO[4]),
     "adaptive": ("other presets", "*", OKABE_ITO[7]),
 }
 """Name, marker and colour of each axis."""
@@ -79,7 +79,7 @@ PSNR = "PSNR on the test cameras (dB)"
 DASHES = {25: ":", 100: "-", 300: "--"}
 """Line style of each number of iterations."""
 SMALL_STAGES = 0.02
-"""Share of the longest bar: stages that are shorter in every bar are combined, except the report."""
+"""Share of the longest bar; stages that stay below it in every bar are combined, except the report."""
 DEVIATION = "± 1 standard deviation over seeds"
 SIDES = (
     *((5, 0, "left", "center"), (-5, 0, "right", "center"), (0, 4, "center", "bottom"), (0, -4, "center", "top")),
@@ -134,7 +134,7 @@ def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: M
     _log_seconds(axes)
     axes.margins(y=0.07)
     axes.set_ylabel(PSNR)
-    axes.set_title("a  by iterations of an update (figures)", loc="left")
+    axes.set_title("a  by iterations per update (numbers)", loc="left")
     axes.legend(handles=shown, loc="lower right", handletextpad=0.5, borderaxespad=0.2)
     _name(axes, [(p.seconds, p.psnr, p.variant.label, c) for p, _, c in far], [one.get_data() for one in axes.lines])
     if others:

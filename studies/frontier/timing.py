@@ -30,7 +30,7 @@ from studies.machine import core_version, machine
 ROUNDS = 5
 """Number of counted rounds."""
 MANY_ITERATIONS = 500
-"""Settings with more are counted once: their times vary little, and a round of them takes a minute."""
+"""Settings with more iterations are timed once, because their times vary little and a round takes a minute."""
 
 
 @dataclass
@@ -64,9 +64,9 @@ def measure_times(
     Settings that only an earlier run measured are kept. Their times are scaled like that of the first setting.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         variants: settings to time; the first is the baseline. A missing frame 0 is fitted.
-        out: folder of the study.
+        out: study folder.
         rounds: number of counted rounds.
         report: prints the progress.
 
@@ -74,9 +74,9 @@ def measure_times(
         ValueError: there is no setting, fewer than 1 round, or a capture of fewer than 3 frames.
     """
     if not variants:
-        raise ValueError("variants is empty; give at least one setting to time")
+        raise ValueError("variants is empty; pass at least one setting to time")
     if rounds < 1:
-        raise ValueError(f"rounds is {rounds}; give at least 1")
+        raise ValueError(f"rounds must be at least 1; got {rounds}")
     compile_in_processes()
     # These imports load the kernels.
     from scas4d_core.kernels.jit import threads
@@ -85,7 +85,7 @@ def measure_times(
     capture = open_source(folder)
     turns = min(rounds + 1, capture.frame_count - 1)
     if turns < 2:
-        raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing needs at least 3")
+        raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing requires at least 3")
     timed = []
     for variant in _distinct(variants):
         with all_varied(variant.constants):

@@ -32,7 +32,7 @@ SCORES = (
 )
 """Names of the scores in a row."""
 BUDGETS = (25, 50, 100, 200, 300)
-"""Numbers of baseline iterations at whose times the methods are compared."""
+"""Baseline iteration counts; the methods are compared at the times that these take."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Point:
 
     Attributes:
         variant: the setting.
-        capture: name of the capture, or a list of the averaged captures.
+        capture: capture name, or a list of the averaged captures.
         updates: number of updates that the scores cover.
         seconds: seconds per update, see the module docstring.
         cpu_seconds: CPU seconds per update over all threads; None if not measured.
@@ -136,7 +136,7 @@ class EqualSeconds:
     """Both methods at the time that the baseline takes for a number of iterations.
 
     Attributes:
-        capture: name of the capture.
+        capture: capture name.
         iterations: number of baseline iterations.
         seconds: seconds per update at which the methods are compared.
         psnr: interpolated PSNR of ``scas4d`` in dB; None if its curve does not cover this time.

@@ -70,7 +70,7 @@ def whole_capture(folder: Path, device: str, frames: int | None = None, **change
     """Reconstructs a capture with the default settings; returns times and PSNR on the test cameras.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         device: "cpu" or "gpu".
         frames: number of frames; None for all.
         changes: further settings.
@@ -182,7 +182,7 @@ def page(found: Row) -> str:
     card = found["card"]
     lines = ["# GPU check", "", ", ".join(f"{name}: {value}" for name, value in card.items()), ""]
     if "tests" in found:
-        lines += [f"Tests of the engine on the device: {found['tests']['last']}", *found["tests"].get("failed", []), ""]
+        lines += [f"Engine tests on the device: {found['tests']['last']}", *found["tests"].get("failed", []), ""]
     if found.get("captures"):
         lines += _captures(found["captures"])
     if found.get("sizes"):
@@ -196,8 +196,11 @@ def page(found: Row) -> str:
         lines.append("")
     if "spread" in found:
         row = found["spread"]
-        same = "the same bits" if row["same_bits"] else "different bits"
-        lines.append(f"{row['runs']} equal runs: PSNR of the last frame varies by {row['range']:.3f} dB; {same}.")
+        same = "bit-identical" if row["same_bits"] else "not bit-identical"
+        lines.append(
+            f"{row['runs']} identical runs: the PSNR of the last frame varies by {row['range']:.3f} dB; the states are "
+            f"{same}."
+        )
     return "\n".join(lines)
 
 
@@ -222,7 +225,7 @@ def _sizes(rows: Sequence[Row]) -> list[str]:
         )
     names = list(dict.fromkeys(name for row in rows for name in row["kernels"]))
     titles = [f"{row['gaussians']:,}, {row['views']} views" for row in rows]
-    lines += ["", f"| microseconds of a launch | {' | '.join(titles)} |", "|---" * (1 + len(rows)) + "|"]
+    lines += ["", f"| microseconds per launch | {' | '.join(titles)} |", "|---" * (1 + len(rows)) + "|"]
     for name in names:
         cells = [f"{row['kernels'][name]['microseconds']:.0f}" if name in row["kernels"] else "–" for row in rows]
         lines.append(f"| `{name}` | {' | '.join(cells)} |")

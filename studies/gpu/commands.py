@@ -14,13 +14,20 @@ ROOT = Path(__file__).parents[2]
 
 def gpu_check(
     captures: Annotated[
-        list[Path] | None, typer.Argument(metavar="CAPTURE...", help="Captures to reconstruct, besides the sample.")
+        list[Path] | None,
+        typer.Argument(metavar="CAPTURE...", help="Captures to reconstruct in addition to the sample."),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of gpu-check.json and gpu-check.md.")] = Path("out/gpu-check"),
-    seconds: Annotated[float, typer.Option(min=10, help="Parts that have not begun by then are skipped.")] = 360,
-    quick: Annotated[bool, typer.Option(help="Small sizes and few frames, to try the check without a GPU.")] = False,
+    out: Annotated[Path, typer.Option(help="Output folder for gpu-check.json and gpu-check.md.")] = Path(
+        "out/gpu-check"
+    ),
+    seconds: Annotated[
+        float, typer.Option(min=10, help="Time limit in seconds; parts that have not started by then are skipped.")
+    ] = 360,
+    quick: Annotated[
+        bool, typer.Option(help="Use small sizes and few frames, to try the check without a GPU.")
+    ] = False,
 ) -> None:
-    """Checks the GPU engine on this machine: tests, accuracy, times by kernel and frame, and the spread of equal runs.
+    """Checks the GPU engine on this machine: tests, accuracy, times per kernel and frame, spread of identical runs.
 
     Needs no network. Each part is written as soon as it is measured. Without a GPU, the kernels run on the CPU.
     """
@@ -59,12 +66,12 @@ def gpu_check(
                 found["sizes"].append(check.one_size(size, views, 5 if quick else 100))
         if write(f"{size.gaussians} Gaussians"):
             found["views"].append(check.view_time(size))
-    if write("sizes are done"):
+    if write("sizes done"):
         found["spread"] = check.spread(sample, 2 if quick else 10, 3, **changes)
     for folder in captures or []:
-        if write("spread is done"):
+        if write("spread done"):
             found["captures"].append(check.whole_capture(folder, "gpu", frames, **changes))
-    if write("captures are done") and not quick:
+    if write("captures done") and not quick:
         found["tests"] = check.run_tests(ROOT, max(30.0, seconds - (perf_counter() - began)))
     write("done")
     typer.echo(check.page(found))

@@ -50,7 +50,7 @@ class HardCase:
     """One entry of the catalogue.
 
     Attributes:
-        name: name of the case.
+        name: case name.
         what: what makes it hard, what its size means, and what must hold besides the shared checks.
         source: its origin: the literature, users' reports (repository#thread), or the equations.
         sizes: sizes at which it is run.
@@ -72,7 +72,7 @@ def not_finite(outcome: BackendResult, backend: str) -> list[str]:
     """Returns a line for each array that contains NaN or infinity."""
     arrays = [*outcome.values.items(), *((f"gradient of {name}", a) for name, a in outcome.gradients.items())]
     return [
-        f"{backend}: {name} contains {np.count_nonzero(~np.isfinite(array))} values that are not finite"
+        f"{backend}: {name} contains {np.count_nonzero(~np.isfinite(array))} non-finite values"
         for name, array in arrays
         if not np.isfinite(array).all()
     ]
@@ -81,7 +81,7 @@ def not_finite(outcome: BackendResult, backend: str) -> list[str]:
 def beyond(outcome: BackendResult, backend: str, bound: float) -> list[str]:
     """Returns a line for each gradient that exceeds a bound."""
     return [
-        f"{backend}: gradient of {name} reaches {np.abs(array).max():.3g}, beyond {bound:.3g}"
+        f"{backend}: gradient of {name} reaches {np.abs(array).max():.3g}; the bound is {bound:.3g}"
         for name, array in outcome.gradients.items()
         if array.size and float(np.abs(array).max()) > bound
     ]
@@ -101,4 +101,4 @@ def unexpected_counts(
         return []
     counts = {name: count for name, count in outcome.guards.items() if count and name not in silent}
     wanted = {name: count for name, count in expected.items() if count}
-    return [] if counts == wanted else [f"guards acted: {counts}, expected: {wanted}"]
+    return [] if counts == wanted else [f"guard counts are {counts}; expected {wanted}"]

@@ -82,7 +82,7 @@ def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]
     before, after = problem.factors.astype(np.float64), outcomes[REFERENCE].values["factors"]
     folded = int(np.count_nonzero(np.linalg.det(before) * np.linalg.det(after) < 0))
     counted = outcomes[CPU].guards["folded"]
-    return [] if abs(counted - folded) <= 1 else [f"{counted} folds were counted, {folded} determinants are negative"]
+    return [] if abs(counted - folded) <= 1 else [f"counted {counted} folds, but {folded} determinants are negative"]
 
 
 def _straight_back(steepness: float) -> Deforming:
@@ -142,7 +142,7 @@ def _same_bits(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> lis
     changed = np.abs(outcomes[CPU].values["factors"] - problem.factors).max()
     turned = np.abs(outcomes[CPU].values["turns"] - (1, 0, 0, 0)).max()
     return [] if moved == changed == turned == 0 else [
-        f"the identity moves means by {moved:.2g} m, factors by {changed:.2g}, turns by {turned:.2g}"
+        f"the identity changes means by {moved:.2g} m, factors by {changed:.2g}, rotations by {turned:.2g}"
     ]  # fmt: skip
 
 
@@ -205,7 +205,7 @@ def _not_finite(value: float, what: str = "means", count: int = 3) -> Deforming:
 def _apart(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     """Checks that rows held back get no gradient of their own."""
     own = outcomes[CPU].gradients["own"][problem.bad]
-    return [] if np.all(own == 0) else ["cpu: a row that is held back has a gradient of its own"]
+    return [] if np.all(own == 0) else ["cpu: a row that is held back has a nonzero gradient"]
 
 
 def _empty(count: int) -> Deforming:
@@ -243,13 +243,13 @@ def _published(s: float) -> Deforming:
 
 def _still(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
     worst = max(float(np.abs(o.values["terms"]).max()) for o in outcomes.values())
-    return [] if worst < 1e-6 else [f"where nothing moves, a neighbour term is {worst:.2g}"]
+    return [] if worst < 1e-6 else [f"a neighbour term is {worst:.2g} although nothing moves"]
 
 
 CASES = (
     HardCase(
         "identity",
-        "all parameters 0, for this many Gaussians: no bit changes, no rotation, neighbour terms 0",
+        "number of Gaussians, with all parameters 0; no bit changes, rotations are the identity, neighbour terms are 0",
         "equation (6)",
         (1, 16, 17, 200),
         _identity,
@@ -257,7 +257,7 @@ CASES = (
     ),
     HardCase(
         "factor near 0",
-        "s of a cluster: tanh(s) + 1 is 0 in float32 from −9 on, ours is not; clamped from −43.5",
+        "s of a cluster; tanh(s) + 1 is 0 in float32 below −9, but our formula is not; clamped below −43.5",
         "equation (6) in float32",
         (-5.0, -9.0, -20.0, -40.0, -44.0, -1e4),
         _saturated,
@@ -266,7 +266,7 @@ CASES = (
     HardCase("factor near 2", "s of a cluster", "equation (6) in float32", (5.0, 9.0, 20.0, 44.0, 1e4), _saturated),
     HardCase(
         "fold",
-        "c·y up to this value within a cluster; from 1 on, det J changes sign: finite, and counted",
+        "maximum of c·y within a cluster; from 1 on, det J changes sign, which must stay finite and be counted",
         "det J = f³ (1 + (2 − f) cᵀ(x − p))",
         (0.5, 0.99, 1.5, 3.0, 10.0),
         _fold,
@@ -274,7 +274,7 @@ CASES = (
     ),
     HardCase(
         "straight back",
-        "c·y is minus this value along c: a half turn in no plane; at 2 the cosine is also 0",
+        "negative of c·y along c; a half turn without a defined plane; at 2, the cosine is also 0",
         "polar rotation of a fold",
         (2.0, 3.0, 30.0),
         _straight_back,
@@ -282,44 +282,56 @@ CASES = (
     ),
     HardCase(
         "large c",
-        "c per metre",
+        "c, per metre",
         "equation (6)",
         (10.0, 100.0, 1000.0),
         lambda c: first_cluster(C, (c, -c, c), guards=None, turn=None, gradient=None, bound=1e8),
     ),
     HardCase(
-        "rotation by 180°", "r = tan of half the angle", "rotation parameter (1, r)", (1e2, 1e4, 1e8, 1e15), _turned
+        "rotation by 180°",
+        "r, the tangent of half the angle",
+        "rotation parameter (1, r)",
+        (1e2, 1e4, 1e8, 1e15),
+        _turned,
     ),
-    HardCase("own rotation by 180°", "as for r", "rotation parameter (1, r)", (1e2, 1e4, 1e8, 1e15), _own_turn),
+    HardCase(
+        "own rotation by 180°",
+        "r of one Gaussian, the tangent of half the angle",
+        "rotation parameter (1, r)",
+        (1e2, 1e4, 1e8, 1e15),
+        _own_turn,
+    ),
     HardCase(
         "beyond a half turn",
-        "two layers of 100° each, in either direction: q and −q",
+        "two layers that rotate by 100° each, in either direction (q and −q)",
         "quaternion sign",
         (1.0, -1.0),
         _through_a_half_turn,
     ),
     HardCase(
         "stretch",
-        "Δs of a tenth of the Gaussians: clamped beyond 87, limited only by the commit below",
+        "Δs of a tenth of the Gaussians; clamped beyond ±87, otherwise limited only at commit",
         "gsplat#613",
         (-100.0, -60.0, 20.0, 60.0, 100.0),
         _stretch,
     ),
     HardCase(
         "cluster of one",
-        "clusters per layer, with one Gaussian in each cluster of the finest",
+        "clusters per layer; each cluster of the finest layer contains one Gaussian",
         "small clusters",
         ((5,), (2, 40)),
         _of_one,
     ),
     HardCase(
         "unbalanced clusters",
-        "this many Gaussians, nearly all in one cluster and ten alone",
+        "number of Gaussians, nearly all in one cluster and ten in clusters of their own",
         "K-means on real scenes",
         (100, 5000),
         _unbalanced,
     ),
-    HardCase("empty cluster", "clusters with only NaN Gaussians", "after losses", (1, 4), _empty, _apart),
+    HardCase(
+        "empty cluster", "number of clusters that contain only NaN Gaussians", "after losses", (1, 4), _empty, _apart
+    ),
     HardCase("every Gaussian NaN", "number of Gaussians", "gsplat#248", (4, 40), _all_bad),
     HardCase(
         "NaN in a cluster",
@@ -329,10 +341,12 @@ CASES = (
         lambda n: _not_finite(np.nan, count=n),
         _apart,
     ),
-    HardCase("infinity in a cluster", "means with this value", "gsplat#248", (np.inf, -np.inf), _not_finite, _apart),
+    HardCase(
+        "infinity in a cluster", "value of the infinite means", "gsplat#248", (np.inf, -np.inf), _not_finite, _apart
+    ),
     HardCase(
         "NaN factor in a cluster",
-        "factors with this value",
+        "value of the non-finite factors",
         "graphdeco-inria/gaussian-splatting#781",
         (np.nan, np.inf),
         lambda v: _not_finite(v, "factors"),
@@ -342,24 +356,24 @@ CASES = (
     HardCase("all on one line", "number of Gaussians", "collinear points", (8, 100), _collinear),
     HardCase(
         "far from the origin",
-        "metres from the origin: agreement to the float32 spacing there",
+        "distance from the origin in metres; agreement within the float32 spacing at that distance",
         "users' coordinates",
         (10.0, 1e3, 1e4),
         _place,
     ),
-    HardCase("cloud of another size", "scale of all lengths", "users' units", (1e-6, 1e-3, 1e3), _size),
+    HardCase("scaled cloud", "scale factor of all lengths", "users' units", (1e-6, 1e-3, 1e3), _size),
     HardCase(
-        "cluster thrown far",
-        "t in metres",
+        "cluster moved far away",
+        "translation t in metres",
         "teleport",
         (10.0, 1e4),
         lambda t: first_cluster(T, t, value=1e-6 * max(t, 10), gradient=1e-2),
     ),
-    HardCase("mirrored factors", "Gaussians with det F < 0", "reflections", (1, 60), _mirrored),
+    HardCase("mirrored factors", "number of Gaussians with det F < 0", "reflections", (1, 60), _mirrored),
     HardCase("flat Gaussians", "scale of the third axis", "2D Gaussian Splatting", (1e-3, 1e-12, 0.0), _flat),
     HardCase(
         "published map",
-        "s of a cluster, scaling about the world's origin",
+        "s of a cluster, which is scaled about the world's origin",
         "equation (6) as printed",
         (-9.0, 0.0, 5.0),
         _published,

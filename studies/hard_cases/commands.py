@@ -13,14 +13,15 @@ from studies.options import QUALITY, Again, Captures, Changes, write_part
 
 def stability(
     cases: Annotated[
-        list[str] | None, typer.Option(help="Only cases whose name contains this. May be repeated.", show_default=False)
+        list[str] | None,
+        typer.Option(help="Run only cases whose name contains this text. May be repeated.", show_default=False),
     ] = None,
-    fast: Annotated[bool, typer.Option("--fast", help="Skip slow cases, such as a million points to cluster.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Skip slow cases, such as clustering a million points.")] = False,
     mutate: Annotated[
         bool, typer.Option("--mutate", help="Remove each guard in turn; continues an interrupted run.")
     ] = False,
-    store: Annotated[Path, typer.Option(help="Folder for the results of the mutations.")] = Path("out/stability"),
-    out: Annotated[Path | None, typer.Option(help="Page whose tables to replace, between their markers.")] = None,
+    store: Annotated[Path, typer.Option(help="Folder for the mutation results.")] = Path("out/stability"),
+    out: Annotated[Path | None, typer.Option(help="Page in which to replace the tables between the markers.")] = None,
     frames: Annotated[
         bool,
         typer.Option("--frames", help="Run the frame cases instead, and measure the cost of the checks."),
@@ -30,7 +31,8 @@ def stability(
     ] = None,
     service: Annotated[bool, typer.Option("--service", help="Run the frame cases through a service instead.")] = False,
     soak: Annotated[
-        int | None, typer.Option(min=1, help="Process this many frames of a small scene instead; continues a run.")
+        int | None,
+        typer.Option(min=1, help="Process this many frames of a small scene instead; continues an interrupted run."),
     ] = None,
 ) -> None:
     """Runs the catalogue of hard cases on every available backend and counts how often the guards acted.
@@ -48,7 +50,7 @@ def stability(
     failing = mutations.study(store, typer.echo) if mutate else mutations.known(store)
     if out is not None:
         if cases or fast:
-            raise typer.BadParameter("a page contains all cases; leave out --cases and --fast, or --out")
+            raise typer.BadParameter("the page must contain all cases; omit --cases and --fast, or omit --out")
         write_part(out, run.page(lines, failing, *run.here()))
     if any(line.violations for line in lines) or (mutate and not all((failing or {}).values())):
         raise typer.Exit(1)
@@ -56,9 +58,11 @@ def stability(
 
 def timing(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the quality study: rows and frames 0.")] = QUALITY,
+    out: Annotated[
+        Path, typer.Option(help="Folder of the quality study, with its rows and stored frames 0.")
+    ] = QUALITY,
     updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 24,
-    masks: Annotated[bool, typer.Option(help="Use the masks of the captures.")] = True,
+    masks: Annotated[bool, typer.Option(help="Use the captures' masks.")] = True,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -78,8 +82,8 @@ def _frame_studies(
 
     Args:
         captures: folders of captures for the frame cases; synthetic footage if empty.
-        store: folder of the results. The soak test continues in it; everything else starts from scratch.
-        cases: parts of the names of the cases to run; all if empty.
+        store: results folder. The soak test continues in it; everything else starts from scratch.
+        cases: substrings of the names of the cases to run; all if empty.
         service: whether to run the frame cases through a service.
         soak: number of frames of the soak test, or None.
     """
@@ -120,6 +124,6 @@ def _frame_studies(
 
 def _end(failed: Sequence[str]) -> None:
     for each in failed:
-        typer.echo(f"does not hold: {each}")
+        typer.echo(f"failed: {each}")
     if failed:
         raise typer.Exit(1)

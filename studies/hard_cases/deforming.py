@@ -167,11 +167,11 @@ class Deforming:
             faults += not_finite(BackendResult(rows, outcome.gradients), backend) + beyond(outcome, backend, self.bound)
             norms = np.linalg.norm(rows["turns"], axis=1)
             if norms.size and np.abs(norms - 1).max() > 1e-4:
-                faults.append(f"{backend}: a turn has length {norms[np.abs(norms - 1).argmax()]:.4g}")
+                faults.append(f"{backend}: a rotation quaternion has length {norms[np.abs(norms - 1).argmax()]:.4g}")
             if self.bad.any():
                 held = all(np.array_equal(outcome.values[n][self.bad], getattr(self, n)[self.bad], equal_nan=True)
                            for n in ("means", "factors"))  # fmt: skip
-                faults += [] if held else [f"{backend}: a row that is not finite was changed"]
+                faults += [] if held else [f"{backend}: a non-finite row was changed"]
         if CPU in outcomes:
             faults += unexpected_counts(outcomes[CPU], self.guards)
         for backend in set(outcomes) - {REFERENCE}:
@@ -184,18 +184,20 @@ class Deforming:
         faults = []
         if self.value is not None and sound.any():
             off = np.abs(outcome.values["means"][sound] - truth.values["means"][sound]).max()
-            faults += [] if off <= self.value else [f"{backend}: means are {off:.2g} m off"]
+            faults += [] if off <= self.value else [f"{backend}: means differ by {off:.2g} m"]
             distance = apart(outcome.values["factors"][sound], truth.values["factors"][sound])
-            faults += [] if distance <= 100 * self.value else [f"{backend}: factors are {distance:.2g} off"]
+            faults += [] if distance <= 100 * self.value else [f"{backend}: factors differ by {distance:.2g}"]
         if self.turn is not None and sound.any():
             # q and −q are the same rotation.
             dots = (outcome.values["turns"] * truth.values["turns"]).sum(axis=1)[sound]
             angle = 2 * np.arccos(np.clip(np.abs(dots.astype(np.float64)), 0, 1)).max()
-            faults += [] if angle <= max(self.turn, 2e-3) else [f"{backend}: a turn is {angle:.2g} rad off"]
+            faults += [] if angle <= max(self.turn, 2e-3) else [f"{backend}: a rotation differs by {angle:.2g} rad"]
         if self.gradient is not None:
             for name, expected in truth.gradients.items():
                 distance = apart(outcome.gradients[name], expected, least=1e-9)
-                faults += [] if distance <= self.gradient else [f"{backend}: gradient of {name} is {distance:.2g} off"]
+                faults += (
+                    [] if distance <= self.gradient else [f"{backend}: gradient of {name} differs by {distance:.2g}"]
+                )
         return faults
 
 

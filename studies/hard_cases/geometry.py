@@ -231,7 +231,7 @@ def _as_unmirrored(problem: Rendering, outcomes: Mapping[str, BackendResult]) ->
     other = replace(plain, factors=factors).run(CPU)
     assert other is not None
     off = np.abs(other.values["features"] - outcomes[CPU].values["features"]).max()
-    return [] if off < 1e-6 else [f"a mirrored factor changes the picture by {off:.2g}"]
+    return [] if off < 1e-6 else [f"a mirrored factor changes the image by {off:.2g}"]
 
 
 def _nothing_seen(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
@@ -267,7 +267,7 @@ def _counted_steep(problem: Rendering, outcomes: Mapping[str, BackendResult]) ->
     acted = outcomes[CPU].guards["gradient_not_finite"]
     if problem.weight >= 1e35 and acted == 0:
         return ["no gradient was dropped, although the weights are at the limit of float32"]
-    return [] if problem.weight >= 1e20 or acted == 0 else [f"{acted} gradients in range were dropped"]
+    return [] if problem.weight >= 1e20 or acted == 0 else [f"{acted} gradients within range were dropped"]
 
 
 def _small_picture(size: tuple[int, int]) -> Rendering:
@@ -302,123 +302,130 @@ def _as_unscaled(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> l
 CASES = (
     HardCase(
         "camera centre",
-        "number of Gaussians at the camera centre: not drawn",
+        "number of Gaussians at the camera centre, which are not drawn",
         "graphdeco-inria/gaussian-splatting#41",
         (1, 16, 200),
         _culled_as_behind,
     ),
     HardCase(
         "near plane",
-        "one in front of it, one on it, one behind it; near in metres",
+        "distance of the near plane in metres; one Gaussian in front of it, one on it, one behind it",
         "JonathonLuiten/Dynamic3DGaussians#3, playcanvas/engine#7186",
         (0.01, 0.3, 2.0),
         _near_plane,
     ),
     HardCase(
         "behind",
-        "metres behind the camera: not drawn",
+        "distance behind the camera in metres; the Gaussians are not drawn",
         "3D Gaussian Splatting, culling",
         (1e-6, 1e-3, 1.0, 1e6),
         lambda d: among(5, means=(0.1, 0, -d), bad=True),
     ),
     HardCase(
-        "off the axis",
-        "eight Gaussians of 0.3 m at 2 m, at this angle from the axis",
+        "off-axis",
+        "angle from the axis in degrees; eight Gaussians of 0.3 m at a distance of 2 m",
         "gsplat#977, aras-p/UnityGaussianSplatting#196",
         (60.0, 80.0, 89.0, 89.9),
         _off_axis,
     ),
-    HardCase("needle", "1:1000, of this length in metres", "gsplat#613", (0.01, 0.1, 1.0), _needle),
+    HardCase("needle", "length in metres, with an aspect ratio of 1:1000", "gsplat#613", (0.01, 0.1, 1.0), _needle),
     HardCase(
         "needle along the ray",
-        "1 mm thick, of this length in metres; the longest extend behind the camera",
+        "length in metres; 1 mm thick, and the longest extend behind the camera",
         "JonathonLuiten/Dynamic3DGaussians#3",
         (0.1, 3.0, 100.0),
         _along_the_ray,
     ),
     HardCase(
         "pancake",
-        "1:1000, tilted by this many degrees from face-on to edge-on",
+        "tilt in degrees, from face-on to edge-on; aspect ratio 1:1000",
         "2D Gaussian Splatting",
         (0.0, 45.0, 89.0, 90.0),
         _pancake,
     ),
     HardCase(
-        "below a pixel",
-        "axes of this length in metres",
+        "smaller than a pixel",
+        "length of the axes in metres",
         "playcanvas/engine#8437",
         (1e-3, 1e-5, 1e-8),
         lambda s: among(12, factors=s * np.eye(3)),
     ),
     HardCase(
-        "larger than the picture",
-        "axes of this length in metres",
+        "larger than the image",
+        "length of the axes in metres",
         "playcanvas/engine#7696, gsplat#613",
         (2.0, 20.0, 200.0),
         lambda s: among(4, factors=s * np.eye(3), value=1e-3, gradient=1e-2),
     ),
     HardCase(
         "equal depth",
-        "this many at exactly one depth: in row order, with the same bits twice",
+        "number of Gaussians at exactly the same depth; drawn in row order, and bit-identical when repeated",
         "gsplat#99, NVlabs/nvdiffrast#168",
         (2, 17, 300),
         _equal_depths,
         _by_row,
     ),
-    HardCase("stacked on a pixel", "Gaussians over one pixel", "r4dl/StopThePop#5", (100, 1000, 5000), _at_one_pixel),
+    HardCase(
+        "stacked on a pixel",
+        "number of Gaussians over one pixel",
+        "r4dl/StopThePop#5",
+        (100, 1000, 5000),
+        _at_one_pixel,
+    ),
     HardCase(
         "fainter than the floor",
-        "opacity in units of 1/255: not drawn, no logarithm below 0",
+        "opacity in units of 1/255; not drawn, and no logarithm below 0 is used",
         "fastgs/FastGS#58",
         (0.0, 0.5, 0.999),
         lambda o: among(9, opacities=o / 255, bad=True),
     ),
     HardCase(
         "opacity at the floor",
-        "exactly 1/255 times this value",
+        "opacity as an exact multiple of 1/255",
         "fastgs/FastGS#58",
         (1.0, 1.001),
         lambda o: among(9, opacities=np.float32(1 / 255) * np.float32(o)),
     ),
     HardCase(
         "support that ends on a pixel",
-        "seed of 2000 Gaussians: culling by blocks and tiles changes no bit",
+        "random seed of 2000 Gaussians; culling by blocks and tiles changes no bit",
         "exact culling",
         (37, 56, 65),
         _on_a_pixel,
     ),
     HardCase(
         "opacity at one",
-        "capped, no gradient through the cap; after two capped ones exactly the stop is reached; either is right",
+        "opacity; no gradient passes through the cap; two capped ones reach exactly the stop, and either result is "
+        "correct",
         "gsplat, alpha cap",
         (0.98, 0.99, 1.0, 2.0),
         lambda o: among(9, opacities=o, value=1.1e-2),
         _opaque,
     ),
     HardCase(
-        "axes of length 0",
-        "this many with a zero factor: a dot of one pixel",
+        "zero-length axes",
+        "number of Gaussians with a zero factor, which are drawn as dots of one pixel",
         "gsplat 3DGUT, zero scales",
         (1, 17),
         lambda n: among(n, factors=0),
     ),
     HardCase(
         "axes of 1e-12",
-        "in metres, times this value",
+        "multiple of 1e-12 m",
         "edge of float32",
         (1.0, 1e-20),
         lambda s: among(9, factors=1e-12 * s * np.eye(3)),
     ),
     HardCase(
         "axes of 1 km",
-        "in metres, times this value: a haze over the picture",
+        "multiple of 1 km; a haze over the whole image",
         "gsplat#613, inuex35/360-gaussian-splatting#18",
         (1.0, 10.0),
         lambda s: among(4, factors=1e3 * s * np.eye(3), value=5e-3, gradient=2e-2),
     ),
     HardCase(
         "footprint beyond float32",
-        "axes in metres: left out and counted",
+        "length of the axes in metres; the Gaussians are skipped and counted",
         "graphdeco-inria/gaussian-splatting#781",
         (1e8, 1e12, 1e14),
         lambda s: left_out(
@@ -427,7 +434,7 @@ CASES = (
     ),
     HardCase(
         "infinite axes",
-        "this many: left out and counted",
+        "number of Gaussians, which are skipped and counted",
         "graphdeco-inria/gaussian-splatting#781",
         (1, 16),
         lambda n: left_out(n, factors=np.inf),
@@ -453,34 +460,42 @@ CASES = (
         (0, 1, 2),
         lambda k: left_out(3, means=np.where(np.arange(3) == k, -np.inf, [0, 0, 2.0])),
     ),
-    HardCase("NaN opacity", "their number", "openvdb/fvdb-core#410", (1, 17), lambda n: left_out(n, opacities=np.nan)),
+    HardCase(
+        "NaN opacity", "number of Gaussians", "openvdb/fvdb-core#410", (1, 17), lambda n: left_out(n, opacities=np.nan)
+    ),
     HardCase(
         "NaN colour",
-        "one channel, which would spoil all pixels that it reaches",
+        "index of the NaN channel, which would spoil every pixel that the Gaussian covers",
         "openvdb/fvdb-core#410",
         (0, 1, 3),
         lambda k: left_out(3, features=np.where(np.arange(4) == k, np.nan, 0.5)),
     ),
     HardCase(
         "infinite colour",
-        "a colour of this value",
+        "value of the colour",
         "the fourth powers in SSIM",
         (1e10, 1e38, np.inf),
         lambda v: left_out(3, features=v),
     ),
     HardCase(
-        "nothing but NaN",
-        "this many Gaussians, none of them finite: only the background",
+        "only NaN",
+        "number of Gaussians, none of which is finite; only the background is drawn",
         "gsplat#248",
         (1, 40),
         lambda n: left_out(n, count=0, means=np.nan),
         _nothing_seen,
     ),
-    HardCase("none at all", "no Gaussian", "edge of the arrays", (0,), lambda n: ordinary(n), _nothing_seen),
-    HardCase("last group not full", "Gaussians, the last one NaN", "sixteen at a time", (1, 2, 15, 16, 17, 33), _few),
+    HardCase("no Gaussians", "number of Gaussians", "edge of the arrays", (0,), lambda n: ordinary(n), _nothing_seen),
+    HardCase(
+        "incomplete last group",
+        "number of Gaussians, the last of which is NaN",
+        "sixteen at a time",
+        (1, 2, 15, 16, 17, 33),
+        _few,
+    ),
     HardCase(
         "mirrored factor",
-        "this many with det F < 0: Σ and the picture are unchanged",
+        "number of Gaussians with det F < 0; Σ and the image are unchanged",
         "reflections",
         (1, 9),
         _mirrored,
@@ -488,39 +503,37 @@ CASES = (
     ),
     HardCase(
         "far and near at once",
-        "four at this depth in metres, four at 3 cm: the order is kept",
+        "depth in metres of four Gaussians, with four more at 3 cm; the order is kept",
         "playcanvas/supersplat#396",
         (1e3, 1e6, 1e9),
         _far_and_near,
     ),
     HardCase(
         "gradients beyond float32",
-        "pixel weights of this size: gradients dropped per Gaussian and counted",
+        "pixel weights; overflowing gradients are dropped per Gaussian and counted",
         "gsplat#248",
         (1e15, 1e28, 1e36),
         _steep,
         _counted_steep,
     ),
-    HardCase(
-        "picture of a pixel", "width and height", "edge of the tiles", ((1, 1), (1, 40), (33, 32)), _small_picture
-    ),
+    HardCase("tiny images", "width and height", "edge of the tiles", ((1, 1), (1, 40), (33, 32)), _small_picture),
     HardCase(
         "principal point outside",
-        "position in picture widths from the left edge",
+        "position in image widths from the left edge",
         "cropped rigs",
         (-1.0, 2.0, 10.0),
         _principal_point,
     ),
     HardCase(
         "focal length",
-        "in pixels, for a picture 48 wide: fisheye-wide to telescope",
+        "focal length in pixels for an image 48 pixels wide, from fisheye to telescope",
         "rigs of mixed lenses",
         (5.0, 500.0, 50_000.0),
         _focal,
     ),
     HardCase(
         "scene and near plane scaled",
-        "scaled by this value: the same picture",
+        "scale factor; the image stays the same",
         "users' units",
         (1e-3, 1e-2, 1e2, 1e3),
         _scaled,

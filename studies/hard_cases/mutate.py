@@ -62,7 +62,7 @@ SECTIONS = (
     (("cascade", "deformation", "neighbour_terms", "lanes"), "cluster_map"),
     (("adam", "activation", "image_loss", "hierarchy", "losses", "jit"), "steps"),
 )
-"""Modules whose cases exercise a guard, by names of the files that contain the guard."""
+"""Pairs of file names that contain guards, and the module whose cases exercise these guards."""
 
 PROGRAM = """
 import json, sys
@@ -102,14 +102,15 @@ def take_away(guard: Guard, core: Path) -> None:
         values = re.findall(rf'^    "{guard.name}", [^,]+, ([^,]+),$', text, re.MULTILINE)
         old = re.findall(rf'^    "{guard.name}", [^,]+, [^,]+,$', text, re.MULTILINE)
         if len(old) != 1:
-            raise MutationError(f"guard {guard.name!r} has {len(old)} rows in guards.py; exactly one is expected")
+            raise MutationError(f"expected one row for guard {guard.name!r} in guards.py, got {len(old)}")
         edits = (("guards.py", old[0], f'    "{guard.name}", {values[0]}, {values[0]},'),)
     for name, old_text, new_text in edits:
         path = core / name
         text = path.read_text()
         if text.count(old_text) != 1:
             raise MutationError(
-                f"{name} contains {old_text!r} {text.count(old_text)} times; fix the patch of {guard.name}"
+                f"expected {old_text!r} once in {name}, found it {text.count(old_text)} times; fix the patch of "
+                f"{guard.name}"
             )
         path.write_text(text.replace(old_text, new_text))
 
@@ -175,7 +176,7 @@ def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[st
     """Disables each guard in turn; returns the failing cases of each guard.
 
     Args:
-        store: folder of the results; results for the same sources are reused.
+        store: results folder; results for the same sources are reused.
         echo: prints the progress.
 
     Raises:

@@ -19,7 +19,7 @@ Array = NDArray[np.float32]
 LEAST_LIGHT = 9e-5
 """Lower bound on the transmittance of the densest pixel, far above denormal numbers."""
 KINK_SHARE = 0.005
-"""Largest share of the pixels that may fall on the other side of the alpha floor or of the stop in float32."""
+"""Maximum share of pixels that may fall on the other side of the alpha floor or the transmittance stop in float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Rendering:
         gradient: tolerance of each gradient against float64, relative to its norm. No check if None.
         bound: largest allowed gradient, for weights of 1.
         weight: standard deviation of the pixel weights.
-        limits: limits of the rasterizer.
+        limits: rasterizer limits.
         why: reason if agreement is not checked.
     """
 
@@ -149,19 +149,20 @@ class Rendering:
         faults = []
         if picture.min() < low - slack or picture.max() > high + slack:
             faults.append(
-                f"{backend}: picture in {picture.min():.4g}…{picture.max():.4g}, colours {low:.4g}…{high:.4g}"
+                f"{backend}: image values are {picture.min():.4g}…{picture.max():.4g}, but colours are "
+                f"{low:.4g}…{high:.4g}"
             )
         if alpha.min() < -1e-5 or alpha.max() > 1 + 1e-5:
-            faults.append(f"{backend}: alpha in {alpha.min():.4g}…{alpha.max():.4g}")
+            faults.append(f"{backend}: alpha is in {alpha.min():.4g}…{alpha.max():.4g}")
         if alpha.size and 1 - alpha.max() < LEAST_LIGHT:
-            faults.append(f"{backend}: the transmittance falls to {1 - alpha.max():.2g}, less than {LEAST_LIGHT:g}")
+            faults.append(f"{backend}: the transmittance falls to {1 - alpha.max():.2g}, below {LEAST_LIGHT:g}")
         return faults
 
     def _touched(self, outcome: BackendResult, backend: str) -> list[str]:
         if not self.bad.any() or (backend == REFERENCE and self.value is None):
             return []
         return [
-            f"{backend}: bad rows have a gradient of {name}"
+            f"{backend}: invalid rows have a nonzero gradient of {name}"
             for name, gradient in outcome.gradients.items()
             if np.any(gradient[self.bad] != 0)
         ]
@@ -171,7 +172,7 @@ class Rendering:
         same = all(np.array_equal(outcome.values[name], alone.values[name]) for name in alone.values) and all(
             np.array_equal(outcome.gradients[name][~self.bad], alone.gradients[name]) for name in alone.gradients
         )
-        return [] if same else ["cpu: the picture or the gradients of the other rows depend on the bad rows"]
+        return [] if same else ["cpu: the image or the gradients of the other rows depend on the invalid rows"]
 
     def _disagreement(self, outcome: BackendResult, truth: BackendResult, backend: str) -> list[str]:
         faults = []
@@ -180,12 +181,12 @@ class Rendering:
             off = np.abs(outcome.values["features"] - truth.values["features"]).max(axis=0) / max(high - low, 1e-3)
             share = float(np.mean(~(off <= self.value)))
             if share > KINK_SHARE and np.count_nonzero(off > self.value) > 1:
-                faults.append(f"{backend}: {100 * share:.2g} % of the pixels are up to {off.max():.2g} off")
+                faults.append(f"{backend}: {100 * share:.2g} % of the pixels differ by up to {off.max():.2g}")
         if self.gradient is not None:
             for name, expected in truth.gradients.items():
                 distance = apart(outcome.gradients[name], expected, least=1e-9 * self.weight)
                 if not distance <= self.gradient:
-                    faults.append(f"{backend}: gradient of {name} is {distance:.2g} off")
+                    faults.append(f"{backend}: gradient of {name} differs by {distance:.2g}")
         return faults
 
 

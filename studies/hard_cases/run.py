@@ -54,7 +54,7 @@ def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
     """
     for name in names or ():
         if not any(name in case.name for case in CASES):
-            raise ValueError(f"no case is named {name!r}; known cases: {', '.join(case.name for case in CASES)}")
+            raise ValueError(f"no case name contains {name!r}; known cases: {', '.join(case.name for case in CASES)}")
     if names:
         return [case for case in CASES if any(name in case.name for name in names)]
     return [case for case in CASES if slow or not case.slow]
@@ -86,11 +86,11 @@ def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = p
         for size in case.sizes:
             line = run_case(case, size, on)
             lines.append(line)
-            echo(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {line.size}  {in_words(line.guards)}")
+            echo(f"{'passed' if not line.violations else 'FAILED'}  {case.name}, {line.size}  {in_words(line.guards)}")
             for violation in line.violations:
                 echo(f"       {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    echo(f"{len({line.case for line in lines})} cases, {len(lines)} with sizes, {failed} fail")
+    echo(f"{len({line.case for line in lines})} cases ({len(lines)} counting each size separately), {failed} failures")
     return lines
 
 
@@ -101,7 +101,7 @@ def in_words(guards: dict[str, int]) -> str:
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
     """Returns a table with one row per section: number of cases, without and with sizes, and the failing ones."""
-    text = ["| section | cases | with sizes | do not hold |", "|" + "---|" * 4]
+    text = ["| section | cases | counting sizes | failures |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
         names = {case.name for case in cases}
         ran = [line for line in lines if line.case in names]
@@ -130,20 +130,20 @@ def page(lines: Sequence[CaseResult], failing: dict[str, list[str]] | None, on: 
     conventions = ", ".join(f"`{guard.name}`" for guard in CONVENTIONS.values())
     return f"""{BEGIN}
 
-`scripts/bench stability --out docs/stability.md` on {date} ({on}): {count} cases, {len(lines)} with their sizes;
-{failed} do not hold.{tried}
+`scripts/bench stability --out docs/stability.md` on {date} ({on}): {count} cases ({len(lines)} counting each size
+separately), {failed} failures.{tried}
 
 {catalogue_table(lines)}
 
-The report of a frame counts how often each guard acted (`guards`):
+Each frame's report counts how often each guard acted (`guards`):
 
 {guards_table(GUARDS.values())}
 
-Also counted, without a change of the result:
+Also counted, although they do not change the result:
 
 {observed}
 
-Conventions act all the time and are not counted: {conventions}.
+Conventions always apply and are not counted: {conventions}.
 
 {END}"""
 

@@ -78,9 +78,9 @@ class HardScene:
         faults += [] if np.abs(lengths - 1).max() < 1e-4 else [f"a rotation has length {lengths.max():.4g}"]
         faults += [] if values["standing"].max() == 0 else ["a static Gaussian has moved"]
         far = float(values["error"].max())
-        faults += [] if far < 1 else [f"a Gaussian is {far:.2g} extents off"]
+        faults += [] if far < 1 else [f"a Gaussian is off by {far:.2g} times the extent"]
         psnr = float(values["psnr"][0])
-        faults += [] if psnr >= self.least else [f"{psnr:.1f} dB, less than {self.least:.1f}"]
+        faults += [] if psnr >= self.least else [f"{psnr:.1f} dB; at least {self.least:.1f} dB expected"]
         return faults
 
 
@@ -136,45 +136,49 @@ def _cameras(names: tuple[int, ...]) -> HardScene:
 CASES = (
     HardCase(
         "six cameras",
-        "the same ball over a floor as in the cases below",
+        "unit; the same ball over a floor as in the cases below",
         "reference for the other cases",
         ("metres",),
         lambda s: HardScene(_six(), least=39.5),
     ),
     HardCase(
-        "other units, said", "scale of lengths, metres_per_unit auto", "users' units", (1e-3, 1e-2, 1e2, 1e3), _scaled
+        "declared units",
+        "scale factor of all lengths, with metres_per_unit auto",
+        "users' units",
+        (1e-3, 1e-2, 1e2, 1e3),
+        _scaled,
     ),
     HardCase(
-        "other units, not said",
-        "scale of lengths, metres_per_unit 1: finite and bounded",
+        "undeclared units",
+        "scale factor of all lengths, with metres_per_unit 1; the result stays finite and bounded",
         "users' units",
         (1e-3, 1e-1, 10.0, 1e3),
         _unsaid,
     ),
     HardCase(
-        "origin far away",
-        "metres from the rig: recentred in float64 on entry",
+        "distant origin",
+        "distance of the origin from the rig in metres; inputs are recentred in float64",
         "survey coordinates; float32",
         (1e3, 1e4, 1e6),
         _shifted,
     ),
     HardCase(
         "few cameras",
-        "cameras of the six that are used: one, two that face each other, three",
+        "indices of the cameras used: one, two that face each other, or three",
         "rigs of one or two",
         ((0,), (0, 3), (0, 2, 4)),
         _cameras,
     ),
     HardCase(
         "mixed focal lengths",
-        "two of the six cameras have half and this many times the focal length",
+        "factor on the focal length of one of the six cameras; another has half the focal length",
         "rigs of mixed lenses",
         (2.0, 8.0),
         lambda k: HardScene(_with({1: _lens(20.0), 2: _lens(40.0 * k)}), least=39.5),
     ),
     HardCase(
         "principal points outside",
-        "of two of the six cameras, in picture sizes from the centre",
+        "offset from the centre in image sizes, for two of the six cameras",
         "cropped rigs",
         (0.6, 2.0),
         lambda k: HardScene(

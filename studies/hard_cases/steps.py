@@ -64,7 +64,7 @@ class HardStep:
             mine = {**outcomes[CPU].values, **outcomes[CPU].gradients}
             for name in set(truth) & set(mine):
                 distance = apart(mine[name], truth[name], least=1e-9)
-                faults += [] if distance <= self.agreement else [f"{name} is {distance:.2g} off"]
+                faults += [] if distance <= self.agreement else [f"{name} differs by {distance:.2g}"]
         return faults
 
 
@@ -274,7 +274,14 @@ def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: t
         return BackendResult({"laws": laws}, {}, {"left_out_of_hierarchy": hierarchy.left_out})
 
     def lawful(outcomes: Mapping[str, BackendResult]) -> list[str]:
-        names = ("every finite row once", "reproducible", "nested", "no empty one", "as few as requested", "counted")
+        names = (
+            "each finite row occurs once",
+            "reproducible",
+            "nested",
+            "no cluster is empty",
+            "no more clusters than requested",
+            "rows left out are counted",
+        )
         laws = outcomes[CPU].values["laws"]
         return [f"clustering violates: {name}" for name, law in zip(names, laws, strict=True) if not law]
 
@@ -303,7 +310,7 @@ def _million(count: int) -> HardStep:
 
     def bounded(outcomes: Mapping[str, BackendResult]) -> list[str]:
         took = float(outcomes[CPU].values["MB"][0])
-        return [] if took <= MILLION_MB else [f"clustering {count:,} took {took:.0f} MB, more than {MILLION_MB}"]
+        return [] if took <= MILLION_MB else [f"clustering {count:,} took {took:.0f} MB; the limit is {MILLION_MB} MB"]
 
     return HardStep({CPU: on_cpu}, more=bounded)
 
@@ -339,7 +346,7 @@ def _split(lengths: tuple[float, float, float]) -> HardStep:
 
     def same(outcomes: Mapping[str, BackendResult]) -> list[str]:
         off, hands = float(outcomes[CPU].values["off"][0]), outcomes[CPU].values["hands"]
-        return ([] if off < 1e-6 else [f"Σ is {off:.2g} off after the split"]) + (
+        return ([] if off < 1e-6 else [f"Σ differs by {off:.2g} after the split"]) + (
             [] if np.abs(hands - 1).max() < 1e-6 else ["the axes of a split are not a rotation"]
         )
 
@@ -351,21 +358,21 @@ QUATERNION, SCALE, OPACITY = slice(3, 7), slice(7, 10), slice(10, 11)
 CASES = (
     HardCase(
         "NaN gradient",
-        "of one number, once or in every step: it counts as 0 and affects no other",
+        "whether one entry is NaN once or in every step; it counts as 0 and affects no other entry",
         "gsplat#248",
         (True, False),
         lambda once: _adam(_spoil(np.nan, once), 1 if once else STEPS),
     ),
     HardCase(
         "huge gradient",
-        "of one number, once: the parameter continues as after 1e18",
+        "value of one entry, once; the parameter continues as after 1e18",
         "gsplat#248",
         (1e20, 1e30, np.inf, -np.inf),
         lambda v: _adam(_spoil(v, True), 1),
     ),
     HardCase(
         "tiny gradients",
-        "of all parameters: no denormal numbers in the moments",
+        "value of all gradients; the moments contain no denormal numbers",
         "denormals",
         (1e-18, 1e-25, 1e-40),
         lambda v: _adam(
@@ -373,8 +380,8 @@ CASES = (
         ),
     ),
     HardCase(
-        "moments that fade",
-        "one gradient, then none: the first moment does not become denormal",
+        "decaying moments",
+        "value of a single gradient, followed by zeros; the first moment does not become denormal",
         "denormals",
         (1e-19, 1.5e-19),
         lambda v: _adam(
@@ -387,49 +394,49 @@ CASES = (
     ),
     HardCase(
         "no gradient",
-        "of any parameter in twenty steps: nothing moves, no 0/0",
+        "value of all gradients in twenty steps; nothing moves, and 0/0 does not occur",
         "Adam's epsilon",
         (0.0,),
         lambda v: _adam(_tiny(v), 0),
     ),
     HardCase(
         "zero quaternion",
-        "entries of this value: no rotation, no gradient, counted",
+        "value of all entries; no rotation and no gradient, and the guard is counted",
         "oppo-us-research/SpacetimeGaussians#96",
         (0.0, 1e-20, 1e-16),
         lambda v: _activation(QUATERNION, v, {"quaternion_floor": 30}),
     ),
     HardCase(
         "short and long quaternions",
-        "entries of this value",
+        "value of all entries",
         "oppo-us-research/SpacetimeGaussians#96",
         (1e-14, 1e-6, 1e6, 1e15),
         lambda v: _activation(QUATERNION, v, {}, 1e-3),
     ),
     HardCase(
         "q against −q",
-        "quaternions of this length: the same Gaussian",
+        "length of the quaternions; both represent the same Gaussian",
         "double cover of rotations",
         (1e-6, 1.0, 1e6),
         _opposite,
     ),
     HardCase(
         "log scales",
-        "clamped beyond 87",
+        "value; clamped beyond ±87",
         "gsplat#613, graphdeco-inria/gaussian-splatting#41",
         (-200.0, -80.0, 20.0),
         lambda v: _activation(SCALE, v, {"exponent": 30} if abs(v) > 87 else {}, None if v < -87 else 1e-4),
     ),
     HardCase(
         "log scale beyond e^87",
-        "of one axis in every tenth Gaussian: clamped, finite",
+        "value for one axis of every tenth Gaussian; clamped, and the result is finite",
         "gsplat#613",
         (88.0, 200.0),
         lambda v: _activation(slice(7, 8), v, {"exponent": 30}, 1e-3, 1e-3),
     ),
     HardCase(
         "opacity logits",
-        "saturated at either end",
+        "value; saturated at either end",
         "fastgs/FastGS#58",
         (-200.0, -30.0, 30.0, 200.0),
         lambda v: _activation(OPACITY, v, {"exponent": 30} if abs(v) > 87 else {}),
@@ -442,38 +449,50 @@ CASES = (
         lambda size: _pictures(0, 0, size),
     ),
     HardCase(
-        "flat pictures",
-        "a grey of this value against itself",
+        "flat images",
+        "value of a uniform grey image compared with itself",
         "SSIM without contrast",
         (1e-6, 0.5, 1.0),
         lambda v: _pictures(v, v, agreement=None),
     ),
-    HardCase("white on black", "this render on black", "lights off and on", (1.0, 100.0), lambda v: _pictures(v, 0)),
-    HardCase("black on white", "black on this value", "lights off and on", (1.0, 0.004), lambda v: _pictures(0, v)),
+    HardCase(
+        "white on black",
+        "value of the render; the target is black",
+        "lights off and on",
+        (1.0, 100.0),
+        lambda v: _pictures(v, 0),
+    ),
+    HardCase(
+        "black on white",
+        "value of the target; the render is black",
+        "lights off and on",
+        (1.0, 0.004),
+        lambda v: _pictures(0, v),
+    ),
     HardCase(
         "saturated noise",
-        "0 and 1 at random, different in both pictures",
+        "random seed; pixels are 0 or 1, and differ between the two images",
         "sensor faults",
         (1, 2),
         lambda seed: _pictures(_noise(seed), _noise(seed + 100)),
     ),
     HardCase(
-        "colours without bounds",
-        "a render with this factor against noise",
+        "unbounded colours",
+        "factor on the render, which is compared with noise",
         "colours are not clamped",
         (1e3, 1e6, 1e9),
         lambda v: _pictures(v * _noise(3), _noise(4), agreement=2e-2),
     ),
     HardCase(
         "fewer Gaussians than clusters",
-        "this many, for layers of 64, 320 and 1280",
+        "number of Gaussians for layers of 64, 320 and 1280 clusters",
         "edge of K-means",
         (1, 2, 9, 63),
         lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)), (64, 320, 1280)),
     ),
     HardCase(
         "clustering coincident points",
-        "number of points in one place",
+        "number of coincident points",
         "coincident points",
         (20, 2000),
         lambda n: _clustering(lambda rng: np.ones((n, 3)), (2, 16, 64)),
@@ -487,14 +506,14 @@ CASES = (
     ),
     HardCase(
         "clustering two places",
-        "this many points, half of them 1 km away",
+        "number of points, half of them 1 km away",
         "outliers",
         (200,),
         lambda n: _clustering(lambda rng: rng.normal(size=(n, 3)) + 1e3 * (np.arange(n) % 2)[:, None], (2, 8)),
     ),
     HardCase(
         "clustering NaN",
-        "this many of 300 not finite: left in place and counted",
+        "number of non-finite points out of 300; they stay in place and are counted",
         "gsplat#248",
         (1, 299, 300),
         lambda n: _clustering(
@@ -502,8 +521,8 @@ CASES = (
         ),
     ),
     HardCase(
-        "a million to cluster",
-        f"this many, in layers of 64, 320 and 1280, within {MILLION_MB} MB",
+        "clustering a million points",
+        f"number of points, in layers of 64, 320 and 1280 clusters, within {MILLION_MB} MB",
         "uynitsuj/POGS#3",
         (1_000_000,),
         _million,
@@ -518,7 +537,7 @@ CASES = (
     ),
     HardCase(
         "neighbours far apart",
-        "metres between them: weights become 0",
+        "distance between neighbours in metres; weights become 0",
         "users' units",
         (1.0, 1e6, 1e18),
         lambda d: _graph(d * np.arange(60)[:, None] * np.ones(3)),
@@ -532,12 +551,16 @@ CASES = (
     ),
     HardCase(
         "nearly equal axes",
-        "relative difference of the lengths: the same Σ after the split, and a proper rotation",
+        "relative difference of the lengths; the split keeps Σ and yields a proper rotation",
         "re-splitting Σ",
         (0.0, 1e-7, 1e-4),
         lambda d: _split((1.0, 1.0 + d, 1.0 - d)),
     ),
     HardCase(
-        "axes far from equal", "shortest over longest", "re-splitting Σ", (1e-3, 1e-6), lambda d: _split((1.0, 0.5, d))
+        "very unequal axes",
+        "shortest axis over longest",
+        "re-splitting Σ",
+        (1e-3, 1e-6),
+        lambda d: _split((1.0, 0.5, d)),
     ),
 )

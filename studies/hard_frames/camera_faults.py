@@ -16,15 +16,15 @@ from scas4d_core.captures.frame import Frame
 from studies.hard_frames.frames import Footage, FrameCase, FrameStep, Holds, Picture, Sent, near, replaced, two_cameras
 
 FRAMES = 3
-"""Number of faulty frames in a row."""
+"""Number of consecutive faulty frames."""
 SOON = 2
-"""Number of them within which the alarm must be raised; a frozen image is recognized by its third frame."""
+"""Number of faulty frames within which the alarm must be raised; a frozen image is recognized by its third frame."""
 SMEARED = 0.02
 """Blur caused by dirt on a lens, as a fraction of the image width."""
 FIELD = "operators of rigs: lenses, gains and frame grabbers"
 
 Fault = Callable[[Picture, Any], Picture]
-"""Returns the faulty image for a size of the fault."""
+"""Applies a fault of the given size to an image."""
 
 
 def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
@@ -42,16 +42,20 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
         )
 
     return (
-        case("a camera out of focus", "blurred by this many pixels", (1.5, 3.0), blurred),
-        case("a camera's gain jumps", "its pixels multiplied by the size", (0.7, 0.3), scaled),
+        case("a camera out of focus", "blur in pixels", (1.5, 3.0), blurred),
+        case("a camera's gain jumps", "factor on all its pixels", (0.7, 0.3), scaled),
         case(
-            "a camera's white balance jumps", "its red multiplied by the size", (1.1, 1.25),
+            "a camera's white balance jumps", "factor on its red channel", (1.1, 1.25),
             lambda picture, size: scaled(picture, (size, 1.0, 1.0)),
         ),
-        case("a camera is noisy", "noise of this many levels of 255", (10, 25), noisy),
-        case("a lens is dirty", "middle ninth blurred, and this much white added", (0.2, 0.35), dirty),
+        case("a camera is noisy", "standard deviation of the noise, in levels of 255", (10, 25), noisy),
+        case(
+            "a lens is dirty", "amount of white added to the middle ninth of the image, which is also blurred",
+            (0.2, 0.35), dirty,
+        ),
         FrameCase(
-            "a camera's picture freezes", "the previous one, while the others continue; size: frames", FIELD, (FRAMES,),
+            "a camera's image freezes",
+            "number of frames in which it repeats its previous image while the others continue", FIELD, (FRAMES,),
             lambda shown, at, size: _standing(shown, at, name, size), reports_alarm(name, FRAMES),
         ),
     )  # fmt: skip
@@ -61,11 +65,14 @@ def reports_alarm(name: str, soon: int) -> Holds:
     """Checks that only this camera raises an alarm, by frame ``soon`` of the fault, and that no damage is done."""
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
-        faults = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm for it within {soon} frames"]
+        faults = (
+            [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm for {name} within {soon} frames"]
+        )
         for step in steps:
             others = {alarm.camera for alarm in step.report.alarms} - {name}
             faults += [
-                f"frame {step.report.index}: an alarm for {other or 'the frame'}" for other in sorted(others, key=str)
+                f"frame {step.report.index}: unexpected alarm for {other or 'the frame'}"
+                for other in sorted(others, key=str)
             ]
         return faults + near(steps, size)
 

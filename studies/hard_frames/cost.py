@@ -46,5 +46,5 @@ def in_words(footage: AnyFootage, found: Share) -> str:
     verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"
     return (
         f"{footage.name}: the checks take {100 * checks:.1f} % of an update of {seconds:.2f} s ({verdict}), "
-        f"comparing its start and end {100 * probes:.1f} %"
+        f"comparing its start and end takes {100 * probes:.1f} %"
     )

@@ -38,9 +38,9 @@ class SyntheticFootage:
     """A ball that circles over a floor next to a resting ball; frame 0 is known up to a few millimetres.
 
     Attributes:
-        name: name of the footage.
+        name: footage name.
         count: number of frames.
-        settings: settings of the reconstruction.
+        settings: reconstruction settings.
         rig: training cameras.
     """
 
@@ -115,7 +115,7 @@ class CapturedFootage:
 
     Args:
         capture: the capture.
-        settings: settings of the reconstruction.
+        settings: reconstruction settings.
         study: folder of a study that stores frame 0, such as that of ``scripts/bench quality``.
     """
 

@@ -27,7 +27,7 @@ WITHIN_DB = 0.5
 NEAR_DB = 1.0
 """Largest PSNR loss, against the undisturbed run, of a faulty frame that can still be tracked."""
 JUMPED_DB = 3.0
-"""Largest PSNR loss three frames after an object jumped: it is seen from other sides, and its shading turned too."""
+"""Largest PSNR loss three frames after an object jumped; other sides of it are visible, and its shading changes."""
 
 
 class Footage(Protocol):
@@ -66,7 +66,7 @@ class FrameStep:
 
     Attributes:
         sent: the frame that was sent.
-        report: report of the frame.
+        report: the frame's report.
         kept: whether the state has the same bits as before the frame.
         sound: whether the state is finite and its rotations have unit norm.
         psnr: PSNR of the held-out cameras in dB.
@@ -90,8 +90,8 @@ class FrameCase:
     """One entry of the catalogue.
 
     Attributes:
-        name: name of the case.
-        what: description of the case.
+        name: case name.
+        what: meaning of the size, and other details of the case.
         source: its origin in the literature or in users' reports.
         sizes: sizes at which it is run.
         make: creates the frames to send, for a start frame and a size; None if the footage cannot show the case.
@@ -111,16 +111,22 @@ class FrameCase:
 
 def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Returns the violated checks, one sentence each."""
-    faults = [f"frame {step.report.index}: not finite, or a rotation is not unit" for step in steps if not step.sound]
+    faults = [
+        f"frame {step.report.index}: the state is not finite, or a rotation does not have unit norm"
+        for step in steps
+        if not step.sound
+    ]
     faulty = [step for step in steps if not step.sent.good]
     faults += case.holds(faulty, size)
     if case.alarms(size) and not any(step.report.alarms for step in faulty):
         faults.append("no alarm")
     last = steps[-1]
     if last.sent.good:
-        faults += [f"an alarm {AFTER} good frames later: {alarm.evidence}" for alarm in last.report.alarms]
+        faults += [f"alarm {AFTER} good frames later: {alarm.evidence}" for alarm in last.report.alarms]
         if not last.psnr >= last.usual - WITHIN_DB:
-            faults.append(f"{last.psnr - last.usual:+.2f} dB against the undisturbed run, {AFTER} good frames later")
+            faults.append(
+                f"{last.psnr - last.usual:+.2f} dB relative to the undisturbed run, {AFTER} good frames later"
+            )
         if last.report.degraded is not None:
             faults.append(f"still degraded {AFTER} good frames later: {last.report.degraded}")
     return faults
@@ -136,12 +142,12 @@ def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:
-    """Checks that these cameras are left out, no others except those that ``may`` be, and that no damage is done.
+    """Checks that only these cameras, and possibly those in ``may``, are excluded, and that no damage is done.
 
     Args:
-        names: cameras that must be left out, for a size of the case.
-        first: number of the first faulty frame in which they must be left out.
-        may: cameras that may be left out as well.
+        names: function that returns the cameras that must be excluded, given the size of the case.
+        first: number of the first faulty frame in which they must be excluded.
+        may: other cameras that may be excluded.
     """
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
@@ -150,9 +156,9 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
             wanted, dropped = set(names(size)), set(step.report.dropped)
             missing, others = wanted - dropped, dropped - wanted - set(may)
             if missing and number >= first:
-                faults.append(f"frame {step.report.index}: {', '.join(sorted(missing))} is not left out")
+                faults.append(f"frame {step.report.index}: {', '.join(sorted(missing))} not excluded")
             if others:
-                faults.append(f"frame {step.report.index}: {', '.join(sorted(others))} is left out as well")
+                faults.append(f"frame {step.report.index}: {', '.join(sorted(others))} also excluded")
         return faults + near(steps, size)
 
     return holds
@@ -161,7 +167,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
 def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Checks that the frames are tracked almost as well as usual."""
     return [
-        f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB against the undisturbed run"
+        f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB relative to the undisturbed run"
         for step in steps
         if not step.psnr >= step.usual - NEAR_DB
     ]
@@ -183,8 +189,12 @@ def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def explained(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that each frame is degraded or leaves out cameras, with an explanation."""
-    return [f"frame {s.report.index}: not explained" for s in steps if not (s.report.degraded or s.report.dropped)]
+    """Checks that each frame's report marks it as degraded or lists excluded cameras."""
+    return [
+        f"frame {s.report.index}: no explanation in the report"
+        for s in steps
+        if not (s.report.degraded or s.report.dropped)
+    ]
 
 
 # Frames that are sent
@@ -351,17 +361,17 @@ def two_cameras(footage: Footage) -> tuple[str, str]:
 FIELD = "users' reports of capture systems: caps, triggers, cables and light"
 CASES = (
     FrameCase(
-        "all black", "lens caps or a lost trigger; learning them would paint the scene black; size: frames",
+        "all black", "number of frames with lens caps or a lost trigger; learning them would paint the scene black",
         FIELD, (1, 3, 5), filled(0), held,
     ),
-    FrameCase("all white", "overexposed; size: frames", FIELD, (1, 3), filled(255), held),
-    FrameCase("saturated noise", "pixels of 0 and 255 at random; size: frames", FIELD, (1, 3), noise, held),
+    FrameCase("all white", "number of overexposed frames", FIELD, (1, 3), filled(255), held),
+    FrameCase("saturated noise", "number of frames whose pixels are randomly 0 or 255", FIELD, (1, 3), noise, held),
     FrameCase(
-        "lights off and on", "2 % of the light for this many frames, then all of it", FIELD, (1, 5),
+        "lights off and on", "number of frames with 2 % of the light, followed by full light", FIELD, (1, 5),
         brighter(lambda size, number: 0.02, lambda size: int(size)), held,
     ),
     FrameCase(
-        "exposure flickers", "all images times the size and its inverse in alternation, four frames", FIELD,
+        "exposure flickers", "factor; images are multiplied alternately by it and its inverse for four frames", FIELD,
         (1.1, 1.3, 1.6),
         brighter(lambda size, number: size if number % 2 == 0 else 1 / size, lambda size: 4), near,
     ),
@@ -374,34 +384,38 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
     return (
         *CASES,
         FrameCase(
-            "two cameras swapped", "cables swapped, for this many frames", FIELD, (1, 3), swapped,
+            "two cameras swapped", "number of frames with swapped cables", FIELD, (1, 3), swapped,
             left_out(lambda size: (one, two)),
         ),
         FrameCase(
-            "a camera is bumped", "permanently shifted by this many pixels; a shift of one may go unnoticed", FIELD,
+            "a camera is bumped", "permanent shift in pixels; a shift of one may go unnoticed", FIELD,
             (1, 2, 4, 8), bumped,
             left_out(lambda size: (one,) if size > 1 else (), first=1, may=(one,)), lambda size: bool(size > 1),
         ),
         FrameCase(
-            "cameras show nothing", "this many are black, for two frames", FIELD, (1, 3), capped,
+            "cameras go black", "number of cameras that are black for two frames", FIELD, (1, 3), capped,
             left_out(lambda size: capped_names(footage, size)),
         ),
-        FrameCase("everything stands", "the same images this many times", FIELD, (1, 5), still, unchanged),
-        FrameCase("a frame again", "repeated images while the scene continues", FIELD, (1, 2), stuck, unchanged),
+        FrameCase("nothing moves", "number of times the same images are repeated", FIELD, (1, 5), still, unchanged),
         FrameCase(
-            "a frame again, with noise", "the last images twice more, with noise of this many levels of 255", FIELD,
+            "repeated frame", "number of frames with repeated images while the scene continues", FIELD, (1, 2), stuck,
+            unchanged,
+        ),
+        FrameCase(
+            "repeated frame with noise",
+            "standard deviation of the noise in levels of 255; the last images are sent twice more", FIELD,
             (1, 3), still_noisy, near, lambda size: False,
         ),
         FrameCase(
-            "cameras drop out one by one", "until this many are left, then all return", FIELD, (4, 2), dropping,
+            "cameras drop out one by one", "number of cameras that remain before all return", FIELD, (4, 2), dropping,
             lambda steps, size: [],
         ),
         FrameCase(
-            "a frame of another time", "one frame shows the scene this many frames later", FIELD, (2, 4), elsewhen,
+            "frame from another time", "number of frames by which one frame is ahead", FIELD, (2, 4), elsewhen,
             lambda steps, size: [], lambda size: False,
         ),
         FrameCase(
-            "the object jumps", "by this multiple of its size, and continues from there", FIELD, (1.0, 2.0), teleported,
-            jumped,
+            "the object jumps", "length of the jump as a multiple of the object's size; it continues from there", FIELD,
+            (1.0, 2.0), teleported, jumped,
         ),
     )  # fmt: skip

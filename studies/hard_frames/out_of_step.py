@@ -77,8 +77,8 @@ def run(
     """Runs every case on each capture, prints the table and writes it to ``out/timing.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the study, which stores each finished run; a second call continues.
+        captures: capture folders.
+        out: study folder, which stores each finished run; a second call continues.
         updates: updates per capture.
         masks: whether the masks are used.
         changes: changes to the settings.
@@ -120,7 +120,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
 
     Args:
         capture: the capture.
-        index: index of the frame in the stream.
+        index: frame index in the stream.
         step: frames of the capture per frame of the stream.
         shifts: delay of each camera against the others, in frames of the capture, keyed by camera name.
     """

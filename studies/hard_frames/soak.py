@@ -60,7 +60,7 @@ UNIT = 1e-5
 GROWTH = 10.5
 """Target: largest ratio between the lengths of an axis now and in frame 0: ``checks.SHRUNK``, plus rounding."""
 HALF = 10
-"""Number of rows in each half that this comparison needs."""
+"""Minimum number of rows in each half for this comparison."""
 MEMORY = 1.1
 """Target: largest ratio of the memory in the last tenth to that in the first tenth."""
 
@@ -70,7 +70,7 @@ class Row:
     """The state of the scene after a frame.
 
     Attributes:
-        frame: index of the frame.
+        frame: frame index.
         seconds: mean seconds per update since the previous row.
         psnr: PSNR of the training views of the update, in dB.
         still: whether static Gaussians have the same bits as in frame 0, except for their colours.
@@ -192,11 +192,11 @@ def violations(rows: Sequence[Row]) -> list[str]:
             faults.append(at + "a static Gaussian has moved")
         if not row.resting <= RESTING_M:
             faults.append(
-                at + f"the resting ball is {1000 * row.resting:.1f} mm from its start, the target is {RESTING_M} m"
+                at + f"the resting ball is {1000 * row.resting:.1f} mm from its start; the target is {RESTING_M} m"
             )
         if row.frame % (2 * OUT) == 0 and not row.moving <= RETURN_M:
             faults.append(
-                at + f"the moving ball returned {1000 * row.moving:.1f} mm from its start, the target is {RETURN_M} m"
+                at + f"the moving ball returned {1000 * row.moving:.1f} mm from its start; the target is {RETURN_M} m"
             )
         if not row.unit <= UNIT:
             faults.append(at + f"the norm of a rotation deviates from 1 by {row.unit:.1e}")

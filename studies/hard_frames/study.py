@@ -135,20 +135,26 @@ def study(
         for size in case.sizes:
             line = of.run(case, size)
             if line is None:
-                echo(f"-      {case.name}, {size}: {footage.name} cannot show it")
+                echo(f"-      {case.name}, {size}: not possible with {footage.name}")
                 continue
             lines.append(line)
-            echo(f"{'holds' if not line.violations else 'FAILS'}  {case.name}, {size}  {_decibels(line.against)} dB")
+            echo(f"{'passed' if not line.violations else 'FAILED'}  {case.name}, {size}  {_decibels(line.against)} dB")
             for sentence in [*line.said, *(f"! {violation}" for violation in line.violations)]:
                 echo(f"       {sentence}")
     failed = sum(bool(line.violations) for line in lines)
-    echo(f"{len({line.case.name for line in lines})} frame cases, {len(lines)} with sizes, {failed} fail")
+    echo(
+        f"{len({line.case.name for line in lines})} frame cases ({len(lines)} counting each size separately), {failed} "
+        "failures"
+    )
     return lines
 
 
 def table(lines: Sequence[FrameCaseResult]) -> str:
     """Formats the results as Markdown, with one row per case and size."""
-    rows = ["| case | size | what | the reports say | dB against undisturbed | holds |", "|" + "---|" * 6]
+    rows = [
+        "| case | size | description of the size | reports | dB relative to undisturbed | passes |",
+        "|" + "---|" * 6,
+    ]
     for line in lines:
         verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"
         said = "; ".join(line.said)

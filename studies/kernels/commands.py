@@ -11,11 +11,13 @@ from studies.options import QUALITY, Capture, Changes, Page, write_page, write_p
 
 
 def kernels(
-    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; targets are for robot.")],
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; the targets apply to robot.")],
     out: Page = None,
-    store: Annotated[Path, typer.Option(help="Folder of the study, read by `scripts/bench table`.")] = QUALITY,
-    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
-    frames: Annotated[int, typer.Option(min=3, help="Frames of the timed run; the first update is not counted.")] = 8,
+    store: Annotated[Path, typer.Option(help="Study folder, which `scripts/bench table` reads.")] = QUALITY,
+    preset: Annotated[str, typer.Option(help="Settings preset.")] = "scas4d",
+    frames: Annotated[
+        int, typer.Option(min=3, help="Number of frames in the timed run; the first update is not counted.")
+    ] = 8,
     repeats: Annotated[int, typer.Option(min=1, help="Repetitions of the rasterizer and its arithmetic.")] = 9,
     changes: Changes = None,
 ) -> None:
@@ -38,7 +40,8 @@ def gpu_kernels(
         typer.Option(help="ptxas of CUDA 13.4 or later, from the package nvidia-cuda-nvcc; default: on PATH."),
     ] = None,
     architectures: Annotated[
-        list[int] | None, typer.Option("--arch", help="Compute capability times 10: 90. May be repeated; default: all.")
+        list[int] | None,
+        typer.Option("--arch", help="Compute capability times 10, such as 90. May be repeated; default: all."),
     ] = None,
     out: Page = None,
 ) -> None:
@@ -48,7 +51,7 @@ def gpu_kernels(
 
     assembler = ptxas or study.find_ptxas()
     uses = study.measure(architectures or ARCHITECTURES, assembler)
-    text = study.table(uses) if assembler else "All kernels compile. Their registers are unknown without ptxas."
+    text = study.table(uses) if assembler else "All kernels compile. Register counts are unknown without ptxas."
     typer.echo(text)
     write_page(out, text)
 
@@ -73,7 +76,7 @@ def moving(
 def startup(
     capture: Capture,
     against: Annotated[Path | None, typer.Option(help="Another checkout to compare with; runs alternate.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Starts of each checkout.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of starts per checkout.")] = 3,
     out: Page = None,
 ) -> None:
     """Measures a service from an empty kernel cache to the first committed update, for one checkout or two."""

@@ -22,7 +22,7 @@ class KernelUse:
     """Resources of a kernel on one architecture.
 
     Attributes:
-        name: name of the kernel.
+        name: kernel name.
         architecture: compute capability times 10.
         registers: registers per thread.
         stack: stack frame in bytes.
@@ -48,7 +48,9 @@ def uses_of(ptxas: Path, file: Path, architecture: int) -> list[KernelUse]:
         command = [str(ptxas), "-v", f"-arch=sm_{architecture}", "-o", "/dev/null", clean.name]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RuntimeError(f"ptxas: {done.stderr.strip().splitlines()[0]}; give a newer one (package nvidia-cuda-nvcc)")
+        raise RuntimeError(
+            f"ptxas: {done.stderr.strip().splitlines()[0]}; use a newer version (package nvidia-cuda-nvcc)"
+        )
     return parse(done.stderr, architecture)
 
 

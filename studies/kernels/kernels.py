@@ -53,9 +53,9 @@ def study(
     """Takes all three measurements on a capture, prints them, and writes them to ``store/kernels.json``.
 
     Args:
-        folder: folder of the capture.
+        folder: capture folder.
         settings: settings of frame 0 and the updates.
-        store: folder of the study.
+        store: study folder.
         frames: number of frames, at least 3. The first update compiles or loads kernels and is not counted.
         repeats: repetitions of the rasterizer and the micro-kernel.
         report: prints the progress.
@@ -65,7 +65,7 @@ def study(
         BrokenProcessPool: the process of the run ended early.
     """
     if frames < 3:
-        raise ValueError(f"frames is {frames}; give at least 3: the first update is not counted")
+        raise ValueError(f"frames must be at least 3, because the first update is not counted; got {frames}")
     capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
     report(f"running {min(frames, capture.frame_count)} frames, starting with frame 0, in a separate process")
@@ -108,7 +108,7 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
         gaussians: Gaussians to render.
         cameras: cameras in internal world coordinates.
         repeats: number of measurements.
-        limits: limits of the rasterizer in the scene.
+        limits: rasterizer limits in the scene.
     """
     rasterizer = CpuRasterizer(limits)
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
@@ -224,19 +224,19 @@ def table(row: Row) -> str:
     ):
         ns = on["ns_per_pair"]
         lines += [
-            line(f"rasterizer on {name}, forward", ns["forward"], "ns per pair"),
-            line(f"rasterizer on {name}, backward", ns["backward"], "ns per pair"),
-            line(f"rasterizer on {name}, both", ns["rasterizer"], "ns per pair"),
-            line("arithmetic alone, both", ns["micro"], "ns per pair"),
-            line(f"rasterizer on {name} over arithmetic", on["ratio"], "×", metric),
-            line("the same, by place in a block", on["ratio_places"], "×"),
+            line(f"rasterizer forward, {name}", ns["forward"], "ns per pair"),
+            line(f"rasterizer backward, {name}", ns["backward"], "ns per pair"),
+            line(f"rasterizer total, {name}", ns["rasterizer"], "ns per pair"),
+            line("arithmetic only", ns["micro"], "ns per pair"),
+            line(f"rasterizer-to-arithmetic ratio, {name}", on["ratio"], "×", metric),
+            line("ratio, counting all lanes", on["ratio_places"], "×"),
         ]
     iterations = row["iterations"]
     lines += [
-        line(f"update of {iterations} iterations", row["seconds_update"], "s", digits=3),
-        line(f"its {iterations} rasterizer passes", row["seconds_passes"], "s", digits=3),
-        line("update over passes", row["ratio_update_spread"], "×", "ratio_update"),
-        line("peak memory of the run", {"median": row["peak_mb"]}, "MB", "peak_mb", 0),
+        line(f"update with {iterations} iterations", row["seconds_update"], "s", digits=3),
+        line(f"{iterations} rasterizer passes", row["seconds_passes"], "s", digits=3),
+        line("update-to-rasterizer ratio", row["ratio_update_spread"], "×", "ratio_update"),
+        line("peak memory", {"median": row["peak_mb"]}, "MB", "peak_mb", 0),
     ]
     return "\n".join(["| | median | unit | target | |", "|---|---|---|---|---|", *lines])
 
@@ -251,22 +251,23 @@ def page(row: Row) -> str:
     seconds = "|".join(f" {value:.3f} " for _, value in stages)
     return f"""{BEGIN}
 
-`scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
-({in_words(row["machine"])}; sources of the core {row["core"]}):
+Measured with `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
+({in_words(row["machine"])}; source version of the core: {row["core"]}):
 
 {table(row)}
 
-- A pair is one pixel into which one Gaussian is blended.
+- A pair is one Gaussian blended into one pixel.
 - Frame 0: {_scene_words(row["frame_0"])}.
 - Cloud: {_scene_words(row["cloud"])}.
-- The rasterizer covers projection, depth order, tile lists, blending, and their backward pass. "Arithmetic alone"
-  is the exp and the multiply-adds of as many pairs, in cache, forward and backward with four channels.
-- "By place" compares with the arithmetic of all pixels of the 4×4 blocks that are visited.
-- Times are CPU times with one thread, and wall-clock times with more. Ratios are medians of alternating runs.
-- An update is the whole `Reconstruction.step`, median of {row["updates"]}. Peak memory is that of a process that
-  fits frame 0 and runs {row["frames"] - 1} updates.
+- Rasterizer times cover projection, depth sorting, tile lists, blending, and their backward passes. "Arithmetic only"
+  covers the exp and multiply-add operations for the same number of pairs, in cache, with four channels.
+- "Counting all lanes" treats every pixel of the visited 4×4 blocks as a pair.
+- Times are CPU time with one thread and wall-clock time with more. Ratios are medians of alternating runs.
+  Other pages have times of other days on this shared machine.
+- An update is one call of `Reconstruction.step`; its time is the median of {row["updates"]} updates. Peak memory is
+  that of a process that fits frame 0 and runs {row["frames"] - 1} updates.
 
-Median seconds of an update by stage:
+Median seconds per update, by stage:
 
 |{names}|
 |{"---|" * len(stages)}
@@ -278,8 +279,8 @@ Median seconds of an update by stage:
 def _scene_words(on: Row) -> str:
     width, height = on["picture"]
     return (
-        f"{on['gaussians']:,} Gaussians, {on['views']} pictures of {width}×{height} with "
-        f"{on['pairs_per_view']:,.0f} pairs on average; {100 * on['lanes_filled']:.0f} % of the places are pairs"
+        f"{on['gaussians']:,} Gaussians, {on['views']} images of {width}×{height} with an average of "
+        f"{on['pairs_per_view']:,.0f} pairs; {100 * on['lanes_filled']:.0f} % of the lanes are pairs"
     )
 
 

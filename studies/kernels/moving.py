@@ -17,7 +17,7 @@ from scas4d_core.settings import Settings
 from studies.synthetic.wall import Size, known, rig, shown, wall
 
 SIZE = Size(gaussians=22_500)
-"""As many Gaussians as a captured object has, and images that are as small."""
+"""Number of Gaussians of a typical captured object, with small images."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def measure(shares: Sequence[float], frames: int, settings: Settings | None = No
     Args:
         shares: shares of moving pixels, from 0 to 1.
         frames: updates per share. The first one searches for the motion and is not counted.
-        settings: settings of the reconstruction; defaults in metres if None.
+        settings: reconstruction settings; defaults in metres if None.
     """
     settings = settings or Settings.model_validate({"scene": {"metres_per_unit": 1.0}})
     cameras = rig(SIZE)

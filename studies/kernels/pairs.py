@@ -52,9 +52,9 @@ def blended_pairs(
     Args:
         splats: [N, 16] splats of ``CpuRasterizer`` after ``forward``.
         counts: [N] counts of ``CpuRasterizer`` after ``forward``.
-        width: width of the image in pixels.
-        height: height of the image in pixels.
-        limits: limits of the rasterizer.
+        width: image width in pixels.
+        height: image height in pixels.
+        limits: rasterizer limits.
 
     Returns:
         The number of pairs; the number of pixels in the 4×4 blocks that a support touches, which is the least that a

@@ -41,7 +41,7 @@ class Start:
     """One start of a service.
 
     Attributes:
-        checkout: checkout of the service.
+        checkout: checkout that contains the service.
         ready: seconds from the start of the process until the service was ready.
         first: seconds from the start of the process until frame 0 was committed.
         update: seconds from the start of the process until the first update was committed.
@@ -108,7 +108,7 @@ def table(starts: list[Start]) -> str:
         f"{in_words(machine())}; medians of {sum(one.checkout == starts[0].checkout for one in starts)} starts each, "
         "in alternation.",
         "",
-        "| checkout | ready | frame 0 | first update | processor | first update, ratio | processor, ratio |",
+        "| checkout | ready | frame 0 | first update | CPU time | first update, ratio | CPU time, ratio |",
         "|---|---|---|---|---|---|---|",
     ]
     medians: dict[Path, list[float]] = {}
@@ -126,7 +126,7 @@ def table(starts: list[Start]) -> str:
 def _words(one: Start) -> str:
     return (
         f"ready after {one.ready:.1f} s, frame 0 after {one.first:.1f} s, first update after {one.update:.1f} s, "
-        f"processor {one.processor:.1f} s"
+        f"CPU time {one.processor:.1f} s"
     )
 
 
@@ -160,7 +160,7 @@ def _ready(client: Client) -> bool:
 
 def _check(process: subprocess.Popen[bytes], began: float) -> None:
     if process.poll() is not None:
-        raise RuntimeError(f"the service ended with status {process.returncode}")
+        raise RuntimeError(f"the service exited with status {process.returncode}")
     if time.monotonic() - began > PATIENCE_S:
         raise RuntimeError(f"no update within {PATIENCE_S:.0f} s")
     time.sleep(EVERY_S)
@@ -176,7 +176,9 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         while True:
             if os.waitpid(-1, os.WNOHANG) == (0, 0):
                 if time.monotonic() > until:
-                    raise RuntimeError(f"a process of the service still runs {ENDING_S:.0f} s after its end")
+                    raise RuntimeError(
+                        f"a process of the service is still running {ENDING_S:.0f} s after the service exited"
+                    )
                 time.sleep(EVERY_S)
 
 

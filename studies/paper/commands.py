@@ -13,10 +13,10 @@ from studies.options import FRONTIER, QUALITY, Captures
 def paper(
     captures: Captures,
     out: Annotated[
-        Path, typer.Option(help="Folder of the study, shared with frontier. A second run continues it.")
+        Path, typer.Option(help="Study folder, shared with frontier. A second run continues the study.")
     ] = FRONTIER,
     quality: Annotated[
-        Path | None, typer.Option(help="Folder of the quality study, for captures with rows only there.")
+        Path | None, typer.Option(help="Folder of the quality study, for captures that have rows only there.")
     ] = QUALITY,
     updates: Annotated[int, typer.Option(min=1, help="Updates per row.")] = 5,
     measure: Annotated[

@@ -8,7 +8,7 @@ from pathlib import Path
 from client.cli.scores import Store
 from studies.frontier.frontier import UPDATES, Variant
 from studies.frontier.tradeoff import read_points
-from studies.machine import in_words
+from studies.machine import core_version, in_words
 from studies.paper.figures import SCENES
 from studies.paper.paper import (
     EXPERIMENTS,
@@ -32,8 +32,8 @@ def write_paper_page(
     """Writes the page from the rows of the study; returns the text.
 
     Args:
-        out: folder of the frontier study.
-        captures: names of the captures.
+        out: frontier study folder.
+        captures: capture names.
         page: Markdown file to write.
         updates: number of updates that the rows cover.
         quality: folder of the quality study, for captures without rows in the frontier study.
@@ -48,33 +48,36 @@ def write_paper_page(
     )
     text = f"""# The paper's tables
 
-The paper's experiments on our captures. A cell contains our figure and, in brackets, the paper's. The scenes share
-names and kinds of motion with the paper's, but not images, so only differences can be compared.
+This page repeats the paper's experiments on our captures. Each cell contains our result, with the paper's in
+parentheses. Our captures share names and kinds of motion with the paper's scenes, but not images, so only differences
+between settings are comparable.
 
 ```
 {_commands(captures, there, page)}
 ```
 
-{_provenance(out, captures)} PSNR and the other scores are means over the first {updates} updates of each capture, from
-a frame 0 that all its rows share{_elsewhere(captures, there)}.
+{_provenance(out, captures)}
+Scores are means over the first {updates} updates of each capture, starting from a frame 0 shared by all its
+rows.{_elsewhere(captures, there)}
 
 ## Agreement
 
 {summary([outcome for outcomes_of_variant in outcomes.values() for outcome in outcomes_of_variant], outcomes)}
 
-The gain is the first setting's mean less the second's, over the captures of both. It agrees in size if the two gains
-are within a factor of {FACTOR:g}; gains that are small on both sides
-({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well, and a small gain
-does not agree with one that is not. If the paper shows only a picture, the claim is the sign. The last column
-counts the captures whose own gain has the sign of the claim. SSIM is in this table only.
+The gain is the first setting's mean minus the second's, over the captures that both cover. Two gains agree in size if
+they are within a factor of {FACTOR:g}. Small gains (before rounding, below
+{", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) count as zero:
+they agree with each other, whatever their signs, but not with a larger gain. If the paper shows only an image, its
+claim is the sign of the gain. The last column counts the captures whose own gain agrees with the claim, at least in
+sign. SSIM appears only in this table.
 
 {sections}
 
-## Left out
+## Omissions
 
-- LPIPS: its weights would have to be downloaded.
-- The offline methods of the paper's second table: other programs.
-- Robot-Task and five scenes of Panoptic: no such captures.
+- LPIPS, because its weights would have to be downloaded.
+- The offline methods in the paper's second table, which are separate programs.
+- Robot-Task and five Panoptic scenes, for lack of captures.
 """
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text)
@@ -99,10 +102,10 @@ def section(
         mean = _mean([own[name] for name in shared])
         paper = _mean([side.paper[name] for name in shared]) if side.paper else None
         lines.append("| " + " | ".join([side.name, *cells, _cell(mean, paper, digits)]) + " |")
-    note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times that")
+    note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times")
     parts = [
         f"## {experiment.title}",
-        f"Paper: {experiment.source}." + (f" In{unit}." if unit else ""),
+        f"Source: {experiment.source}." + (f" Score:{unit}." if unit else ""),
         "\n".join(lines),
         note,
     ]
@@ -114,10 +117,10 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
     known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
     counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [
-        f"Of {len(outcomes)} comparisons {counts['sign and size']} agree in sign and size, {counts['sign']} in sign, "
-        f"{counts['no']} do not, and {len(outcomes) - len(known)} are not measured.",
+        f"Of {len(outcomes)} comparisons, {counts['sign and size']} agree in sign and size, {counts['sign']} only in "
+        f"sign, {counts['no']} disagree, and {len(outcomes) - len(known)} are not measured.",
         "",
-        "| experiment | claim | comparison | here | paper | agrees in | same sign |",
+        "| experiment | claim | comparison | ours | paper | agreement | agreeing captures |",
         "|---|---|---|---|---|---|---|",
     ]
     for experiment in EXPERIMENTS:
@@ -126,7 +129,7 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
             own = "–" if outcome.own is None else f"{outcome.own:+.{digits}f}"
             paper = "–" if outcome.paper is None else f"{outcome.paper:+.{digits}f}"
             comparison = f"{outcome.claim.first} – {outcome.claim.second}"
-            word = outcome.agrees if outcome.agrees != "no" else "**nothing**"
+            word = outcome.agrees if outcome.agrees != "no" else "**none**"
             same = "–" if outcome.own is None else f"{outcome.same_sign} of {len(outcome.captures)}"
             cells = [experiment.title, outcome.claim.what, comparison, own, paper, word, same]
             lines.append("| " + " | ".join(cells) + " |")
@@ -148,7 +151,7 @@ def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
     if not others:
         return ""
     names = ", ".join(others)
-    return f"; of {names}, PSNR alone, from the rows of [quality.md](quality.md), over the updates that both have"
+    return f" For {names}, PSNR is taken from [quality.md](quality.md), over the updates that both methods cover."
 
 
 def needed() -> list[Variant]:
@@ -175,5 +178,7 @@ def _provenance(out: Path, captures: Sequence[str]) -> str:
     rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
     days = sorted({str(row["measured"])[:10] for row in rows})
     when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "never"
+    if any(row.get("core") != core_version() for row in rows):
+        when += ", with earlier versions of the method ([accuracy-and-time.md](accuracy-and-time.md) has newer figures)"
     machines = "; ".join(sorted({in_words(row["machine"]) for row in rows})) or "–"
-    return f"Measured {when} on: {machines}."
+    return f"Measured: {when}. Machine: {machines}."

@@ -82,15 +82,15 @@ SINGLE = ("K=1: 64", "K=1: 320", "K=1: 1280")
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
-        "Online comparison, PSNR", "table 1", "psnr", "dB",
+        "Online comparison, PSNR", "table 1", "psnr", "PSNR in dB",
         (
             OURS,
             ClaimSetting("Dynamic3DGS, 100", BASE_100, figures.PSNR_BASELINE_100),
             ClaimSetting("Dynamic3DGS, 2000", BASE_2000, figures.PSNR_BASELINE_2000),
         ),
         (
-            Claim("ahead at the same iterations", "Ours, 100", "Dynamic3DGS, 100"),
-            Claim("close to the baseline at 20 times the iterations", "Ours, 100", "Dynamic3DGS, 2000"),
+            Claim("ahead with equal iterations", "Ours, 100", "Dynamic3DGS, 100"),
+            Claim("close to the baseline with 20× the iterations", "Ours, 100", "Dynamic3DGS, 2000"),
         ),
     ),
     Experiment(
@@ -101,36 +101,37 @@ EXPERIMENTS: tuple[Experiment, ...] = (
             ClaimSetting("Dynamic3DGS, 2000", BASE_2000, figures.SSIM_BASELINE_2000),
         ),
         (
-            Claim("ahead at the same iterations", "Ours, 100", "Dynamic3DGS, 100"),
-            Claim("close to the baseline at 20 times the iterations", "Ours, 100", "Dynamic3DGS, 2000"),
+            Claim("ahead with equal iterations", "Ours, 100", "Dynamic3DGS, 100"),
+            Claim("close to the baseline with 20× the iterations", "Ours, 100", "Dynamic3DGS, 2000"),
         ),
     ),
     Experiment(
-        "Same wall clock, PSNR", "appendix", "psnr", "dB",
+        "Equal wall-clock time, PSNR", "appendix", "psnr", "PSNR in dB",
         (OURS, ClaimSetting("Dynamic3DGS, 300", BASE_300, figures.PSNR_BASELINE_300)),
-        (Claim("ahead of three times the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
-        "In the paper, 300 iterations of the baseline take as long as 100 of its own. Here an iteration of the "
-        "baseline costs {ratio} of one of `scas4d`; accuracy-and-time.md compares them at equal seconds.",
+        (Claim("ahead of the baseline with 3× the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
+        "In the paper, 300 baseline iterations take as long as 100 of the paper's method. In these runs, a baseline "
+        "iteration takes {ratio} as long as a `scas4d` iteration; [accuracy-and-time.md](accuracy-and-time.md) "
+        "compares newer runs at equal time.",
     ),
     Experiment(
-        "Same wall clock, SSIM", "appendix", "ssim", "",
+        "Equal wall-clock time, SSIM", "appendix", "ssim", "",
         (
             ClaimSetting("Ours, 100", DEFAULT, figures.SSIM_100),
             ClaimSetting("Dynamic3DGS, 300", BASE_300, figures.SSIM_BASELINE_300),
         ),
-        (Claim("ahead of three times the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
+        (Claim("ahead of the baseline with 3× the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
     ),
     Experiment(
-        "Convergence: 2000 iterations of both", "figure", "psnr", "dB",
+        "Convergence: 2000 iterations each", "figure", "psnr", "PSNR in dB",
         (ClaimSetting("Ours, 2000", OURS_2000, {}), OURS,
          ClaimSetting("Dynamic3DGS, 2000", BASE_2000, figures.PSNR_BASELINE_2000)),
         (
-            Claim("both end at the same point", "Ours, 2000", "Dynamic3DGS, 2000", 0),
+            Claim("both converge to the same quality", "Ours, 2000", "Dynamic3DGS, 2000", 0),
             Claim("100 iterations are close to convergence", "Ours, 2000", "Ours, 100", 0),
         ),
     ),
     Experiment(
-        "Number of layers", "table and appendix", "psnr", "dB",
+        "Number of layers", "table and appendix", "psnr", "PSNR in dB",
         (
             *(ClaimSetting(label, variant(label), figures.PSNR_LAYERS[1]) for label in SINGLE),
             ClaimSetting("K=2", variant("K=2"), figures.PSNR_LAYERS[2]),
@@ -139,52 +140,53 @@ EXPERIMENTS: tuple[Experiment, ...] = (
             ClaimSetting("K=5", variant("K=5"), figures.PSNR_LAYERS[5]),
         ),
         (
-            *(Claim(f"three layers over one of {label.split()[-1]}", "K=3", label) for label in SINGLE),
-            Claim("three over two", "K=3", "K=2"),
-            Claim("three over four", "K=3", "K=4"),
-            Claim("three over five", "K=3", "K=5"),
+            *(Claim(f"three layers vs. one of {label.split()[-1]}", "K=3", label) for label in SINGLE),
+            Claim("three layers vs. two", "K=3", "K=2"),
+            Claim("three layers vs. four", "K=3", "K=4"),
+            Claim("three layers vs. five", "K=3", "K=5"),
         ),
-        "The paper does not state the number of clusters of its single layer, nor for K = 2, 4, 5. Here they are 64 "
-        "(or 320, or 1280), and 64 to 1280, evenly spaced in log scale.",
+        "The paper does not state the number of clusters for K = 1, 2, 4 and 5. Here, single layers have 64, 320 or "
+        "1280 clusters; for the other K, the numbers range from 64 to 1280, evenly spaced on a log scale.",
     ),
     Experiment(
-        "Clusters of the first layer", "appendix", "psnr", "dB",
+        "Number of first-layer clusters", "appendix", "psnr", "PSNR in dB",
         (
             *(ClaimSetting(f"N={n}", variant(f"N={n}"), figures.PSNR_FIRST_LAYER[n]) for n in (16, 32, 48)),
             ClaimSetting("N=64", DEFAULT, figures.PSNR_FIRST_LAYER[64]),
         ),
-        tuple(Claim(f"64 clusters over {n}", "N=64", f"N={n}") for n in (16, 32, 48)),
+        tuple(Claim(f"64 clusters vs. {n}", "N=64", f"N={n}") for n in (16, 32, 48)),
     ),
     Experiment(
-        "Largest scale", "appendix", "psnr", "dB",
+        "Maximum scale", "appendix", "psnr", "PSNR in dB",
         (
             ClaimSetting("max_scale 0.02", DEFAULT, figures.PSNR_100),
             ClaimSetting("max_scale 2.0", variant("max_scale 2 m"), figures.PSNR_MAX_SCALE_2),
         ),
-        (Claim("the bound is needed", "max_scale 0.02", "max_scale 2.0"),),
+        (Claim("the scale bound is needed", "max_scale 0.02", "max_scale 2.0"),),
     ),
     Experiment(
-        "Entangled against separate covariance", "a figure", "psnr", "dB",
+        "Entangled vs. separate covariance", "figure", "psnr", "PSNR in dB",
         (ClaimSetting("Entangled", DEFAULT, {}), ClaimSetting("Separate", variant("separate covariance"), {})),
-        (Claim("better pictures", "Entangled", "Separate", 1),),
-        "The paper shows a picture of its wheel. Separate (`update.covariance`): the cascade moves only the "
-        "means, and only a Gaussian's own ΔR and Δs change its covariance. They start immediately "
-        "(`update.deltas_start` 0), not after 40 % of the iterations.",
+        (Claim("better images", "Entangled", "Separate", 1),),
+        "The paper shows only an image of its wheel. With separate covariance (`update.covariance`), the cascade moves "
+        "only the means, and only a Gaussian's own ΔR and Δs change its covariance. Both are optimized from the start "
+        "(`update.deltas_start` 0), not only after 40 % of the iterations.",
     ),
     Experiment(
-        "Tracking: 2D MTE, the best candidate taken, as in the paper", "table 3", "mte_2d_oracle", "% of the diagonal",
+        "Tracking: 2D MTE of the best candidate", "table 3", "mte_2d_oracle",
+        "2D MTE in % of the image diagonal",
         (
             ClaimSetting("Ours, 100", DEFAULT, figures.MTE_100),
             ClaimSetting("Dynamic3DGS, 100", BASE_100, figures.MTE_BASELINE_100),
         ),
-        (Claim("smaller error (negative is better)", "Ours, 100", "Dynamic3DGS, 100"),),
+        (Claim("lower error (negative is better)", "Ours, 100", "Dynamic3DGS, 100"),),
     ),
     Experiment(
-        "Segmentation: parts from the cascade's motion against each Gaussian's own", "appendix, a figure", "parts_ari",
+        "Segmentation: parts from cascade vs. per-Gaussian motion", "figure in the appendix", "parts_ari",
         "adjusted Rand index",
         (ClaimSetting("Ours, 100", DEFAULT, {}), ClaimSetting("Dynamic3DGS, 2000", BASE_2000, {})),
         (Claim("better parts", "Ours, 100", "Dynamic3DGS, 2000", 1),),
-        "The paper only shows pictures; the index compares with true labels, over the updates of the row.",
+        "The paper shows only images. Here, parts are compared with true labels over each row's updates.",
     ),
 )  # fmt: skip
 """Experiments in the order of the page."""

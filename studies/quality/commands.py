@@ -11,7 +11,9 @@ from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes, write_page
 
-Study = Annotated[Path, typer.Option(help="Folder of the study: rows, images, frames 0. A second run continues it.")]
+Study = Annotated[
+    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
+]
 
 
 @with_capture_options
@@ -27,11 +29,11 @@ def quality(
         typer.Option(min=1, help="Iterations per update; default: the preset's. May be repeated."),
     ] = None,
     seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates, default 0. May be repeated.")
+        list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates; default: 0. May be repeated.")
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames; 1 measures only frame 0.")] = None,
-    masks: Annotated[bool, typer.Option(help="Give the method the masks; the scores always use them.")] = True,
-    points: Annotated[bool, typer.Option(help="Give the method the initial point cloud.")] = True,
+    masks: Annotated[bool, typer.Option(help="Provide the masks to the method; the scores always use them.")] = True,
+    points: Annotated[bool, typer.Option(help="Provide the initial point cloud to the method.")] = True,
     lpips: Annotated[bool, typer.Option("--lpips", help="Also measure LPIPS, if its weights are installed.")] = False,
     again: Again = False,
     changes: Changes = None,
@@ -70,8 +72,8 @@ def refit(
     options: CaptureOptions,
     out: Study = QUALITY,
     frame: Annotated[int, typer.Option(help="Frame to fit; negative numbers count from the end.")] = -1,
-    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
+    preset: Annotated[str, typer.Option(help="Settings preset.")] = "scas4d",
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
     points: Annotated[bool, typer.Option(help="Start from the point cloud of the capture's first frame.")] = False,
     again: Again = False,
     changes: Changes = None,
@@ -102,15 +104,17 @@ def refit(
 def effects(
     captures: Captures,
     options: CaptureOptions,
-    out: Annotated[Path, typer.Option(help="Folder of the study. A second run continues it.")] = Path("out/effects"),
-    name: Annotated[list[str] | None, typer.Option(help="Only this effect; all by default. May be repeated.")] = None,
+    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/effects"),
+    name: Annotated[
+        list[str] | None, typer.Option(help="Measure only this effect; default: all. May be repeated.")
+    ] = None,
     pin: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=MODE,NAME=MODE", help="Effects to pin together. May be repeated."),
     ] = None,
-    preset: Annotated[str, typer.Option(help="Preset of settings.")] = "scas4d",
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
-    frames: Annotated[int | None, typer.Option(min=2, help="Number of frames; all by default.")] = None,
+    preset: Annotated[str, typer.Option(help="Settings preset.")] = "scas4d",
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="Number of frames; default: all.")] = None,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -143,7 +147,7 @@ def switches(
     captures: Captures,
     out: Study = QUALITY,
     updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 50,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed, default 0. May be repeated.")] = None,
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -161,9 +165,11 @@ def targets(
     out: Study = QUALITY,
     run: Annotated[
         list[str] | None,
-        typer.Option(help="Only this run: scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
+        typer.Option(help="Measure only this run, such as scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
     ] = None,
-    only: Annotated[list[str] | None, typer.Option(help="Only this capture, by name. May be repeated.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Measure only the capture with this name. May be repeated.")
+    ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, shown in the table.")] = None,
     again: Again = False,
 ) -> None:
@@ -179,14 +185,14 @@ def targets(
 
 
 def table(
-    study: Annotated[Path, typer.Argument(help="Folder of the study.")] = QUALITY,
+    study: Annotated[Path, typer.Argument(help="Study folder.")] = QUALITY,
     out: Annotated[
-        Path | None, typer.Option(help="Markdown page to write: commands, machine, targets and rows.")
+        Path | None, typer.Option(help="Markdown page to write, with commands, machine, targets and rows.")
     ] = None,
 ) -> None:
     """Prints which targets the measured rows reach, as a Markdown table.
 
-    A row counts only if its settings equal those of the current presets; of several, the one with the most frames.
+    A row counts only if its settings equal those of the current presets; the one with the most frames is used.
     """
     from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
 
@@ -199,16 +205,16 @@ def table(
     print(target_table(outcomes))
     print(f"\n{count_words(outcomes)}.")
     if others := left_out(study, rows):
-        print(f"{others} rows of the study are not used: their settings differ, or they have fewer frames.")
+        print(f"{others} rows of the study are not used, because their settings differ or they have fewer frames.")
     if out is not None:
         write_page(out, page(rows))
 
 
 def processors(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study. A second run continues it.")] = Path("out/processors"),
+    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/processors"),
     frames: Annotated[int, typer.Option(min=1, help="Updates per run.")] = 5,
-    seeds: Annotated[int, typer.Option(min=1, help="Seeds of the updates, on this processor.")] = 4,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for the updates on this processor.")] = 4,
     changes: Changes = None,
 ) -> None:
     """Compares a capture's result on this processor with that on less capable ones, and with the spread over seeds.

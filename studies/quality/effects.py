@@ -67,9 +67,9 @@ def run(
     """Measures every variant of each capture; prints the table and writes it to ``out/effects.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the study, which stores each finished run; a second call continues.
-        names: names of the effects; all if empty, unless there are ``pins``.
+        captures: capture folders.
+        out: study folder, which stores each finished run; a second call continues.
+        names: effect names; all if empty, unless there are ``pins``.
         pins: further variants, each with effects that are pinned together.
         preset: preset that both reconstructions share.
         seeds: seeds of frame 0 and the updates, each of which is measured.
@@ -83,7 +83,7 @@ def run(
         ValueError: an effect or setting is unknown, the settings contradict a pin, or there are fewer than two frames.
     """
     if frames is not None and frames < 2:
-        raise ValueError("effects are compared in updates: give two frames or more")
+        raise ValueError("frames must be at least 2, because effects are compared in updates")
     compile_in_processes()
     rows = []
     for folder in captures:
@@ -112,7 +112,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
     pins: list[Pins] = []
     for name in names:
         if name not in EFFECTS:
-            raise ValueError(f"effect {name!r} is unknown; docs/effects.md lists all")
+            raise ValueError(f"unknown effect {name!r}; see docs/effects.md for the list")
         one = effect(name)
         modes = ("off",) if not one.auto else ("off", "removed", "on")
         refused = one.refusal(settings) is not None
@@ -166,7 +166,7 @@ def _row(
     capture = open_measured(folder, options)
     count = min(frames or capture.frame_count, capture.frame_count)
     if count < 2:
-        raise ValueError(f"effects are compared in updates: {capture.name} has one frame")
+        raise ValueError(f"{capture.name} has only one frame, but effects are compared in updates")
     words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
     seed = settings.update.seed
     file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])

@@ -27,7 +27,7 @@ VERSION = 5
 """Increase this if frame 0 changes for the same images and settings, so that stored results are fitted again."""
 
 CLOUD_VERSION = 4
-"""The same, for first clouds that are made from the images."""
+"""Increase this if initial point clouds that are computed from the images change."""
 
 ARRAYS = tuple(field.name for field in fields(Gaussians))
 
@@ -112,8 +112,8 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
 
     Args:
         capture: the capture.
-        settings: settings of the reconstruction.
-        out: folder of the study.
+        settings: reconstruction settings.
+        out: study folder.
         states: empty folder to commit to; in memory if None.
     """
     static = first_of(capture, out, settings)

@@ -53,7 +53,7 @@ def run(
 
     Args:
         captures: folders of captures with test cameras.
-        out: folder of the study; a second call with the same folder continues.
+        out: study folder; a second call with the same folder continues.
         frames: updates per run.
         seeds: number of seeds of the updates, starting at 0.
         changes: changes to the settings, such as ``update.iterations=20``.

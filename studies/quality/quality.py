@@ -51,7 +51,7 @@ def run(
     Args:
         captures: folders. Captures without test cameras are measured on their training cameras, and their rows say so.
         out: folder for rows, per-frame lines and images; a second call with the same folder continues.
-        presets: names of the presets.
+        presets: preset names.
         iterations: numbers of iterations per update, each of which is measured; the preset's own if empty.
         seeds: seeds of frame 0 and of the updates, each of which is measured.
         changes: further settings, such as ``"update.clusters=[64]"``, with JSON after the sign.
@@ -106,7 +106,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
                 report(f"    failed: {row['error']}")
         else:
             other = "" if row.get("core") == core_version() else ", with another version of the core"
-            report(f"[{number}/{len(jobs)}] {job.key}: measured already{other}")
+            report(f"[{number}/{len(jobs)}] {job.key}: already measured{other}")
         rows.append(row)
     table = score_tables(with_means(rows), rows)
     (store.folder / "table.md").write_text(table + "\n")
@@ -173,7 +173,7 @@ def _apart(job: Job, folder: Path) -> Row:
     try:
         answer: Row = in_a_process(_measured_or_failed, job, folder)
     except BrokenProcessPool:
-        answer = {"error": "its process ended early (out of memory, or killed)"}
+        answer = {"error": "the process ended unexpectedly (out of memory, or killed)"}
     return failed | answer
 
 

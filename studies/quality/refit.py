@@ -51,10 +51,10 @@ def run(
     """Fits a frame of each capture from scratch; prints the table and writes it to ``out/refit.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the quality study; a second call continues.
+        captures: capture folders.
+        out: quality study folder; a second call continues.
         frame: frame to fit; negative numbers count from the end.
-        preset: preset of settings.
+        preset: settings preset.
         seeds: seeds of frame 0, each of which is fitted.
         points: whether to start from the point cloud of the capture's first frame, instead of the images alone.
         changes: changes to the settings, such as ``"effects.direction=off"``.
@@ -93,7 +93,7 @@ def _refitted(
     capture = open_measured(folder, options, use_points=points)
     index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
     if index is None:
-        raise ValueError(f"{capture.name} has no frame {frame}; give one of 0 to {capture.frame_count - 1}")
+        raise ValueError(f"{capture.name} has no frame {frame}; use 0 to {capture.frame_count - 1}")
     key = f"{capture.name}-{index}-s{seed}-{digest(settings_record(settings, ()), points, *options.changed.items())}"
     return kept_row(
         rows / f"{key}.json", lambda: {"key": key, "seed": seed, **_measured(capture, index, settings)}, again=again
@@ -110,7 +110,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
     return {
         "capture": capture.name,
         "frame": index,
-        "cloud": "given" if capture.points is not None else "from the pictures",
+        "cloud": "given" if capture.points is not None else "from the images",
         "gaussians": len(scene.history.first),
         "seconds": sum(scene.report.seconds.values()),
         **scores,

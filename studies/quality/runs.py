@@ -17,10 +17,10 @@ CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
 """Captures of the targets, by the names of their folders."""
 
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
-"""Settings that a scene itself needs in every run (its Gaussian budget, its floor), never ones that tune a method."""
+"""Settings that a scene needs in every run (Gaussian budget, floor); none of them tunes a method."""
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
-"""The cluster map that is not the default."""
+"""The non-default cluster map."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Run:
 
     Attributes:
         captures: names of the folders.
-        preset: name of the preset.
+        preset: preset name.
         iterations: iterations per update.
         changes: further settings, such as ``"update.clusters=[64]"``.
         masks: whether the method gets the masks.
@@ -90,7 +90,7 @@ def measure_runs(
 
     Args:
         captures: folder that contains the captures.
-        out: folder of the study.
+        out: study folder.
         names: names from ``RUNS``; all runs if empty.
         only: names of captures; all captures of each run if empty.
         frames: number of frames per capture; all if None.
@@ -102,7 +102,7 @@ def measure_runs(
     """
     for name in names:
         if name not in RUNS:
-            raise ValueError(f"run {name!r} is unknown; choose from {', '.join(RUNS)}")
+            raise ValueError(f"unknown run {name!r}; choose from {', '.join(RUNS)}")
     for name in only:
         if name not in CAPTURES:
             raise ValueError(f"capture {name!r} has no targets; choose from {', '.join(CAPTURES)}")
@@ -117,9 +117,9 @@ def measure_runs(
             else:
                 missing[capture] = None
     for capture in missing:
-        report(f"{captures / capture}: no such folder; skipped")
+        report(f"{captures / capture}: no such folder; skipping it")
     if not jobs:
-        raise ValueError(f"{captures} contains none of the requested captures; give their parent folder")
+        raise ValueError(f"{captures} contains none of the requested captures; pass their parent folder")
     return run_jobs(jobs, out, again=again, report=report)
 
 

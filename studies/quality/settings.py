@@ -19,7 +19,7 @@ def settings_of(
     """Returns a preset with changes, without a time limit for frame 0, so that results do not depend on machine load.
 
     Args:
-        name: name of the preset.
+        name: preset name.
         iterations: iterations per update; the preset's if None.
         seed: seed of frame 0 and of the updates.
         changes: changes such as ``"update.clusters=[64]"``, which override everything else.

@@ -46,10 +46,10 @@ def run(
     """Updates each capture for a number of frames, prints the table and writes it to ``out/switches.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the study, which stores each finished run; a second call continues.
+        captures: capture folders.
+        out: study folder, which stores each finished run; a second call continues.
         updates: updates per capture.
-        preset: preset of settings.
+        preset: settings preset.
         seeds: seeds of frame 0 and the updates, each of which is measured.
         changes: changes to the settings.
         again: whether to repeat finished runs.

@@ -18,7 +18,7 @@ from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
 
 KERNELS = "kernels"
 """Name that a target uses in place of a run for the study of ``studies.kernels``."""
-MAPS = f"the {preset('scas4d').update.cluster_map} cluster map over the {OTHER_MAP} one"
+MAPS = f"{preset('scas4d').update.cluster_map} − {OTHER_MAP} cluster map"
 K1 = ("clusters-64", "clusters-320", "clusters-1280")
 
 Rows = Mapping[tuple[str, str], Row]
@@ -54,19 +54,19 @@ class Target:
 
 
 TARGETS: tuple[Target, ...] = (
-    Target("frame 0, test cameras", "scas4d", "psnr_first", ("robot",), "≥", 36.0),
-    Target("frame 0, test cameras", "scas4d", "psnr_first", ("wheel", "pendulums", "spring"), "≥", 34.5),
-    Target("frame 0, test cameras", "scas4d", "psnr_first", ("cloth",), "≥", 30.5),
-    Target("frame 0, test cameras", "scas4d", "psnr_first", ("stage",), "≥", 30.0),
-    Target("frame 0 without points and masks, within 1 dB of 36", "robot-unaided", "psnr_first", ("robot",), "≥", 35.0),
+    Target("frame 0 PSNR", "scas4d", "psnr_first", ("robot",), "≥", 36.0),
+    Target("frame 0 PSNR", "scas4d", "psnr_first", ("wheel", "pendulums", "spring"), "≥", 34.5),
+    Target("frame 0 PSNR", "scas4d", "psnr_first", ("cloth",), "≥", 30.5),
+    Target("frame 0 PSNR", "scas4d", "psnr_first", ("stage",), "≥", 30.0),
+    Target("frame 0 without points and masks", "robot-unaided", "psnr_first", ("robot",), "≥", 35.0),
     Target(
-        "frame 0 without points and masks over that with them",
+        "frame 0 without points and masks − with both",
         "robot-unaided", "psnr_first", ("robot",), "≥", -1.0, over=("scas4d",),
     ),
-    Target("Gaussians", "scas4d", "gaussians", ("robot",), "≤", 25_000, ""),
-    Target("updates", "scas4d", "psnr", ("robot",), "≥", 31.0),
-    Target("updates", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
-    Target("updates (room, shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
+    Target("number of Gaussians", "scas4d", "gaussians", ("robot",), "≤", 25_000, ""),
+    Target("update PSNR", "scas4d", "psnr", ("robot",), "≥", 31.0),
+    Target("update PSNR", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
+    Target("update PSNR (room with shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
     Target("scas4d − dynamic3dgs, 100 iterations", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
     Target(
         "scas4d − dynamic3dgs, 100 iterations",
@@ -74,46 +74,46 @@ TARGETS: tuple[Target, ...] = (
         over=("dynamic3dgs",),
     ),
     Target(
-        "scas4d, 100 iterations − dynamic3dgs, 2000",
+        "scas4d, 100 iterations − dynamic3dgs, 2000 iterations",
         "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
     ),
     Target(
-        "scas4d, 100 iterations − dynamic3dgs, 2000",
+        "scas4d, 100 iterations − dynamic3dgs, 2000 iterations",
         "scas4d", "psnr", OBJECT_CAPTURES, "≥", -0.5, over=("dynamic3dgs-2000",), mean=True,
     ),
     Target("dynamic3dgs, 2000 iterations", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
     Target(
-        "three layers over the best single one (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1,
+        "three layers − best single layer (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1,
     ),
     Target(MAPS, "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=("other-map",), mean=True),
     Target(MAPS, "scas4d", "psnr", CAPTURES, over=("other-map",)),
-    Target("frame 0, from its cloud (the paper has 30.25)", "scas4d", "psnr_first", ("basketball",), "≥", 29.0),
-    Target("mean loss of the updates against frame 0", "scas4d", "loss", ("basketball",), "≤", 0.5),
-    Target("worst loss of an update against frame 0", "scas4d", "loss_worst", ("basketball",), "≤", 1.0),
-    Target("pixels that changed since frame 0", "scas4d", "psnr_changed", ("basketball",)),
-    Target("frame 0 without its cloud", "basketball-cloudless", "psnr_first", ("basketball",), "≥", 24.0),
+    Target("frame 0 from its point cloud (paper: 30.25)", "scas4d", "psnr_first", ("basketball",), "≥", 29.0),
+    Target("mean PSNR loss relative to frame 0", "scas4d", "loss", ("basketball",), "≤", 0.5),
+    Target("worst PSNR loss relative to frame 0", "scas4d", "loss_worst", ("basketball",), "≤", 1.0),
+    Target("PSNR over pixels changed since frame 0", "scas4d", "psnr_changed", ("basketball",)),
+    Target("frame 0 without a point cloud", "basketball-cloudless", "psnr_first", ("basketball",), "≥", 24.0),
     Target(
         "3D tracks, median error", "scas4d", "track_3d_median", ("robot", "pendulums", "cloth", "spring"),
-        "≤", 0.8, "% of the extent",
+        "≤", 0.8, "% of extent",
     ),
-    Target("3D tracks, median error", "scas4d", "track_3d_median", ("wheel",), "≤", 2.0, "% of the extent"),
+    Target("3D tracks, median error", "scas4d", "track_3d_median", ("wheel",), "≤", 2.0, "% of extent"),
     Target(
         "2D tracks without oracle, median error", "scas4d", "mte_2d", ("robot", "pendulums", "cloth", "spring"),
-        "≤", 0.5, "% of the diagonal",
+        "≤", 0.5, "% of diagonal",
     ),
     Target("parts, adjusted Rand index", "scas4d", "parts_ari", ("robot", "pendulums"), "≥", 0.7, ""),
     Target(
-        "parts − those of dynamic3dgs, 100 iterations",
+        "parts, scas4d − dynamic3dgs, 100 iterations",
         "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs",),
     ),
     Target(
-        "parts − those of dynamic3dgs, 2000 iterations",
+        "parts, scas4d − dynamic3dgs, 2000 iterations",
         "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs-2000",),
     ),
-    Target("rasterizer over its arithmetic, on frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
-    Target("rasterizer over its arithmetic, on a cloud", KERNELS, "ratio_rasterizer_cloud", ("robot",), "≤", 2.0, "×"),
-    Target("update over its rasterizer passes", KERNELS, "ratio_update", ("robot",), "≤", 3.0, "×"),
-    Target("peak memory of a run, frame 0 included", KERNELS, "peak_mb", ("robot",), "<", 1500.0, "MB"),
+    Target("rasterizer-to-arithmetic ratio, frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
+    Target("rasterizer-to-arithmetic ratio, cloud", KERNELS, "ratio_rasterizer_cloud", ("robot",), "≤", 2.0, "×"),
+    Target("update-to-rasterizer ratio", KERNELS, "ratio_update", ("robot",), "≤", 3.0, "×"),
+    Target("peak memory, including frame 0", KERNELS, "peak_mb", ("robot",), "<", 1500.0, "MB"),
 )  # fmt: skip
 """Targets in the order of the table."""
 
@@ -124,7 +124,7 @@ class Verdict:
 
     Attributes:
         target: the target.
-        capture: name of the capture, or "mean of …".
+        capture: capture name, or "mean of …".
         value: the figure; None if a part of it is not measured.
         parts: figures of the run and of the run it is compared with, if the target is a difference.
         updates: number of updates that the figure covers, as text; "frame 0" if there are none.
@@ -187,7 +187,7 @@ def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
 
 def target_table(verdicts: Sequence[Verdict]) -> str:
     """Formats the measured verdicts as a Markdown table and lists the others in a sentence."""
-    lines = ["| figure | capture | target | measured | | updates |", "|---|---|---|---|---|---|"]
+    lines = ["| metric | capture | target | measured | result | updates |", "|---|---|---|---|---|---|"]
     for verdict in verdicts:
         if verdict.value is None:
             continue
@@ -197,7 +197,7 @@ def target_table(verdicts: Sequence[Verdict]) -> str:
             must = f"{target.sense} {_number(target, target.threshold)} {target.unit}".strip()
         measured = _number(target, verdict.value)
         if verdict.parts is not None:
-            measured += f" ({_plain(target, verdict.parts[0])} against {_plain(target, verdict.parts[1])})"
+            measured += f" ({_plain(target, verdict.parts[0])} vs. {_plain(target, verdict.parts[1])})"
         cells = [target.what, verdict.capture, must, measured, verdict.word, verdict.updates]
         lines.append("| " + " | ".join(cells) + " |")
     missing: dict[str, list[str]] = {}
@@ -214,7 +214,8 @@ def count_words(verdicts: Sequence[Verdict]) -> str:
     """Counts the targets that are reached, missed, and not measured."""
     compared = [verdict for verdict in verdicts if verdict.target.threshold is not None]
     reached, missed = (sum(verdict.reached is answer for verdict in compared) for answer in (True, False))
-    return f"{reached} reached, {missed} missed, {len(compared) - reached - missed} not measured, of {len(compared)}"
+    unknown = len(compared) - reached - missed
+    return f"Of {len(compared)} targets, {reached} are reached, {missed} missed and {unknown} not measured"
 
 
 def read_study(folder: Path) -> dict[tuple[str, str], Row]:
@@ -244,8 +245,8 @@ def page(rows: Rows) -> str:
     behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
 
-Pictures, tracks and parts on the test cameras and ground truth of the captures, against targets. These commands measure
-the rows and write the page; rows that are already measured are kept (`CAPTURES` is the folder of the captures):
+This page compares rendered images, tracks and parts with targets, using each capture's test cameras and ground truth.
+These commands measure the rows and write the page (`CAPTURES` is the captures folder); existing rows are kept:
 
 ```
 scripts/bench targets CAPTURES
@@ -254,12 +255,12 @@ scripts/bench table out/quality --out docs/quality.md
 ```
 
 - Measured: {" to ".join(dict.fromkeys((days[0], days[-1]))) if days else "nothing yet"}.
-- On: {"; ".join(machines) if machines else "–"}.
-- Code: {f"{len(cores)} state(s) of the core's sources ({', '.join(cores)})" if cores else "–"}.
+- Machine: {"; ".join(machines) if machines else "–"}.
+- Source versions of the core: {", ".join(cores) if cores else "–"}.
 
-An iteration is one forward and backward render of one training view. Figures are means over updates and test cameras;
-"updates" names the measured updates. Differences are computed over common updates. Definitions
-of the metrics: `scas4d_core/metrics/`.
+An iteration is a forward and a backward pass over one training view. Results are means over test cameras and over the
+updates listed under "updates". Differences are computed over updates that both runs cover. The metrics are defined in
+`scas4d_core/metrics/`. Other pages have times of other days on this shared machine.
 
 ## Targets
 
@@ -269,7 +270,8 @@ of the metrics: `scas4d_core/metrics/`.
 
 ## Rows
 
-Runs of the default preset. The store also has those of the baseline and of changed settings, and seconds per stage.
+These are the runs of the default preset. The study folder also contains all other runs and the seconds per stage.
+*MB* is the peak memory of a process that also scores all frames; the target's process only reconstructs a few.
 
 {markdown(behind) if behind else "None yet."}
 """

@@ -40,7 +40,7 @@ MEASURED = (
     Column("others named", "others", "d"),
 )
 RIGS = (("right", 0.0), ("one", 2.0), ("one", 4.0), ("all", 1.0), ("all", 2.0), ("all", 4.0))
-"""Rigs to which frame 0 is fitted: one camera rotated across by these pixels, or all at random by about as many."""
+"""Faulty rigs for fitting frame 0: one camera rotated horizontally by this many pixels, or all cameras randomly."""
 FITTED = (
     Column("capture", "capture"),
     Column("rig", "rig"),
@@ -94,8 +94,8 @@ def run(
     """Measures each capture, prints two tables and writes them to ``out/calibration.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the study, which stores each finished run; a second call continues.
+        captures: capture folders.
+        out: study folder, which stores each finished run; a second call continues.
         fit: whether to also fit frame 0 to faulty rigs.
         changes: changes to the settings.
         again: whether to repeat finished runs.

@@ -11,7 +11,9 @@ from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes
 
-Study = Annotated[Path, typer.Option(help="Folder of the study: rows, images, frames 0. A second run continues it.")]
+Study = Annotated[
+    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
+]
 
 
 @with_capture_options
@@ -39,8 +41,10 @@ def drift(
     captures: Captures,
     out: Study = QUALITY,
     updates: Annotated[int, typer.Option(min=1, help="Updates per capture.")] = 14,
-    pixels: Annotated[float, typer.Option(min=0, help="Drift of a camera per frame, in pixels of the files.")] = 0.3,
-    most: Annotated[float, typer.Option(min=0, help="Largest drift of a camera, in pixels of the files.")] = 4.0,
+    pixels: Annotated[
+        float, typer.Option(min=0, help="Camera drift per frame, in pixels of the original files.")
+    ] = 0.3,
+    most: Annotated[float, typer.Option(min=0, help="Maximum camera drift, in pixels of the original files.")] = 4.0,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -60,7 +64,7 @@ def calibration(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Adds faults to calibrations, and measures what frame 0 reports about each and how much refinement helps.
+    """Adds faults to calibrations, and measures what frame 0 reports about each fault and how much refinement helps.
 
     Writes calibration.md to the study's folder. Fits that were already measured are not repeated.
     """

@@ -25,13 +25,13 @@ Grey = Sequence[NDArray[np.uint8]]
 CORNERS, APART = 400, 4
 """Maximum number of corners per image, and minimum distance between them in pixels."""
 MOVING = 2.0
-"""Pixels that a corner must move from frame 0 to the last frame, because static ones say nothing about tracks."""
+"""Minimum motion of a corner from frame 0 to the last frame, in pixels; static corners reveal nothing about tracks."""
 BACK = 0.5
 """Largest error in pixels when a corner is followed back to the previous frame."""
 SAME = 0.01
 """Largest distance, as a fraction of the depth, between the points that two cameras see if they are the same."""
 FEWEST = 20
-"""Fewest positions, over points and frames, from which a median is computed."""
+"""Minimum number of positions, over points and frames, for computing a median."""
 
 
 def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row:

@@ -43,7 +43,7 @@ COLUMNS = (
     Column("found", "found"),
 )
 WAYS = ("stand", "drift")
-"""Whether the cameras stand or drift."""
+"""Whether the cameras are fixed or drift."""
 MODES = ("off", "auto")
 """Modes of the effect."""
 
@@ -62,8 +62,8 @@ def run(
     """Updates each capture in four ways, prints the table and writes it to ``out/drift.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the study, which stores each finished run; a second call continues.
+        captures: capture folders.
+        out: study folder, which stores each finished run; a second call continues.
         updates: updates per capture.
         pixels: drift of a camera per frame, in pixels of the capture's files.
         most: largest drift, in pixels of the capture's files.

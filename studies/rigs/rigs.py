@@ -33,7 +33,7 @@ from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
 
 ENOUGH_TO_HOLD_OUT = 5
-"""Number of cameras from which one is held out; with fewer, each one sees something that no other sees."""
+"""Minimum number of cameras for holding one out; with fewer, each camera sees content that no other camera sees."""
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -74,8 +74,8 @@ def run(
     """Reconstructs captures; prints the table and writes it to ``out/rigs.md``.
 
     Args:
-        captures: folders of the captures.
-        out: folder of the study; a second call continues.
+        captures: capture folders.
+        out: study folder; a second call continues.
         frames: maximum number of frames.
         longer: largest length of the longer side of the largest image, in pixels.
         changes: changes to the settings, such as ``"static.seconds=60"``.

@@ -46,7 +46,7 @@ class Service:
     """A service on one data folder; `start` and `kill` may be called repeatedly.
 
     Args:
-        data: data folder of the service.
+        data: the service's data folder.
         environment: additional environment variables, such as SCAS4D_TOKEN.
     """
 
@@ -81,7 +81,7 @@ class Service:
                 if self.http.get("/health/ready").status_code == 200:
                     return
             if self._process.poll() is not None or time.monotonic() > until:
-                raise StudyError(f"the service does not start; see {self.data.name}.log next to its folder")
+                raise StudyError(f"the service did not start; see {self.data.name}.log next to its folder")
             time.sleep(EVERY_S)
 
     def kill(self) -> None:

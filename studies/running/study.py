@@ -34,8 +34,8 @@ class Study:
         folder: folder for data folders and logs.
         capture: capture of the frames.
         frames: encoded images and masks of each frame.
-        settings: settings of the scene.
-        environment: environment variables of the service.
+        settings: scene settings.
+        environment: environment variables for the service.
     """
 
     folder: Path
@@ -93,7 +93,7 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
     faults = [f"frames {missing} are not committed"] if missing else []
     others = [index for index in wrong if index in found]
     if others:
-        first = f"{found[others[0]]} in place of {expected[others[0]]}"
+        first = f"got {found[others[0]]}, expected {expected[others[0]]}"
         faults.append(f"states {others} are not bit-identical: {first}")
     return faults
 

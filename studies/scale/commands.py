@@ -13,12 +13,12 @@ from studies.options import Page, write_page
 def scale(
     sweep: Annotated[
         list[str] | None,
-        typer.Option(help="Only this sweep: Gaussians, pixels, cameras, share that moves. May be repeated."),
+        typer.Option(help="Run only this sweep: Gaussians, pixels, cameras, share that moves. May be repeated."),
     ] = None,
     frames: Annotated[
-        list[int] | None, typer.Option(min=0, help="Frames after which memory is measured; 0: never.")
+        list[int] | None, typer.Option(min=0, help="Frames after which memory is measured; 0 to skip.")
     ] = None,
-    work: Annotated[Path, typer.Option(help="Folder of the figures; existing ones are not measured again.")] = Path(
+    work: Annotated[Path, typer.Option(help="Folder for the figures; existing ones are not measured again.")] = Path(
         "out/scale"
     ),
     picture: Annotated[Path | None, typer.Option(help="File of the plot, such as scale.png.")] = None,

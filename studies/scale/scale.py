@@ -39,7 +39,7 @@ SWEEPS: Mapping[str, Sequence[Size]] = {
     "cameras": [Size(cameras=count) for count in (4, 8, 16, 32, 64, 100)],
     "share that moves": [Size(moving=share) for share in (0.05, 0.1, 0.2, 0.4, 0.8)],
 }
-"""Sizes by the quantity that grows; everything else is as in ``Size()``."""
+"""Sizes, keyed by the quantity that grows; everything else is as in ``Size()``."""
 FRAMES = (100, 1_000, 10_000)
 """Numbers of frames of one process after which its memory is measured."""
 TURN = 16

@@ -44,7 +44,7 @@ def attack(port: int, path: str, header: int, halves: int, uploads: int, patienc
     """Opens all connections and waits until the service has closed them.
 
     Args:
-        port: port of the service on the loopback interface.
+        port: service port on the loopback interface.
         path: path of the uploads.
         header: bytes of the endless header; 0 for none.
         halves: number of half-sent headers.

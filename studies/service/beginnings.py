@@ -52,7 +52,7 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
             if sending.ident is not None:
                 sending.join()
             status = service.status(scene)
-            echo(f"killed in beginning {number} of {count}; the scene's reconstruction is {status.reconstruction}")
+            echo(f"killed during restart {number} of {count}; the scene's reconstruction is {status.reconstruction}")
             if status.reconstruction != number:
                 raise StudyError(
                     f"reconstruction {number} was acknowledged, but the scene's is {status.reconstruction}"
@@ -64,9 +64,11 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
         faults = sender.check() + compare(digests(folder.states), expected)
         faults += [f"{path.name} was not deleted" for path in folder.path.glob("states*") if path != folder.states]
         faults += [f"damage was reported: {said}" for said in service.status(scene).damage]
-        summary = f"{ended['before']} ended before, {ended['after']} after; {len(expected)} states compared"
-        target = "each ends wholly before or after; final state bit-identical to a run without any"
-        return ScenarioResult(f"kill -9 in {count} beginnings of a reconstruction", target, summary, faults)
+        summary = (
+            f"{ended['before']} restarts had no effect, {ended['after']} took effect; {len(expected)} states compared"
+        )
+        target = "each restart takes effect fully or not at all; final state bit-identical to a run without restarts"
+        return ScenarioResult(f"kill -9 during {count} restarts of the reconstruction", target, summary, faults)
 
 
 def _begin(service: Service, scene: str, number: int) -> None:

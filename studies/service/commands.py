@@ -13,26 +13,31 @@ from studies.options import Changes, Page, Repeated, write_page
 
 def faults(
     capture: Repeated,
-    frames: Annotated[int, typer.Option(min=4, help="Frames sent in every scenario.")] = 20,
+    frames: Annotated[int, typer.Option(min=4, help="Number of frames sent in each scenario.")] = 20,
     kills: Annotated[
-        int, typer.Option(min=0, help="Kills (kill -9) of the worker or the service, and beginnings.")
+        int,
+        typer.Option(
+            min=0, help="Number of kills (kill -9) of the worker or the service, and of interrupted restarts."
+        ),
     ] = 30,
-    cuts: Annotated[int, typer.Option(min=0, help="Log files to truncate.")] = 20,
-    flips: Annotated[int, typer.Option(min=0, help="Log files in which to flip a bit.")] = 1,
+    cuts: Annotated[int, typer.Option(min=0, help="Number of log files to truncate.")] = 20,
+    flips: Annotated[int, typer.Option(min=0, help="Number of log files in which to flip a bit.")] = 1,
     bits: Annotated[
-        int, typer.Option(min=0, help="Bits to flip one by one in states, checkpoints, journal and frames.")
+        int, typer.Option(min=0, help="Number of bits to flip, one by one, in states, checkpoints, journal and frames.")
     ] = 200,
     turns: Annotated[
-        int, typer.Option(min=1, help="Turns without and with strangers, each with and without a token.")
+        int, typer.Option(min=1, help="Number of turns without and with strangers, each with and without a token.")
     ] = 3,
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster: nodes, stopped, full, "
-            "head (needs redis-server), kills, beginnings, log or bits. May be repeated."
+            help="Run only this part: kills, beginnings, log, disk, bits or strangers; on a cluster: nodes, stopped, "
+            "full, head (requires redis-server), kills, beginnings, log or bits. May be repeated."
         ),
     ] = None,
-    placement: Annotated[str, typer.Option(help="`ray`: on a Ray cluster of three nodes on this machine.")] = "local",
+    placement: Annotated[
+        str, typer.Option(help="`local`, or `ray` for a Ray cluster of three nodes on this machine.")
+    ] = "local",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; its contents are deleted.")] = Path(
         "out/faults"
@@ -56,12 +61,12 @@ def faults(
 
     need_server()
     if placement not in ("local", "ray"):
-        raise typer.BadParameter(f"there is no placement {placement!r}; give local or ray", param_hint="--placement")
+        raise typer.BadParameter(f"unknown placement {placement!r}; choose from local, ray", param_hint="--placement")
     known = (
         of_faults.PARTS if placement == "local" else (*of_nodes.ON_NODES, of_nodes.OF_THE_HEAD, *of_nodes.AS_LOCALLY)
     )
     if unknown := set(part or []) - set(known):
-        raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(known)}")
+        raise typer.BadParameter(f"unknown part {sorted(unknown)[0]!r}; choose from {', '.join(known)}")
     opened = open_source(capture)
     study = Study(
         work.resolve(),
@@ -96,11 +101,11 @@ def faults(
 
 
 def ingest(
-    frames: Annotated[int, typer.Option(min=1, help="Frames per round.")] = 20,
-    cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 27,
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames per round.")] = 20,
+    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras in the rig.")] = 27,
     megabytes: Annotated[float, typer.Option(min=0.01, help="Size of one JPEG.")] = 1.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds; each measures every way of sending.")] = 5,
-    senders: Annotated[int, typer.Option(min=1, help="Connections of the sending process.")] = 2,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of rounds; each measures every transport.")] = 5,
+    senders: Annotated[int, typer.Option(min=1, help="Number of connections of the sending process.")] = 2,
     work: Annotated[Path, typer.Option(help="Folder on the disk to measure.")] = Path("out/ingest"),
     out: Page = None,
 ) -> None:
@@ -122,10 +127,10 @@ def ingest(
 def views(
     capture: Repeated,
     rate: Annotated[
-        list[float] | None, typer.Option(min=0.1, help="Views per second, default 1, 5 and 20. May be repeated.")
+        list[float] | None, typer.Option(min=0.1, help="Views per second; default: 1, 5 and 20. May be repeated.")
     ] = None,
-    updates: Annotated[int, typer.Option(min=1, help="Updates per turn, without and with views.")] = 8,
-    turns: Annotated[int, typer.Option(min=1, help="Turns per rate.")] = 3,
+    updates: Annotated[int, typer.Option(min=1, help="Number of updates per turn, without and with views.")] = 8,
+    turns: Annotated[int, typer.Option(min=1, help="Number of turns per rate.")] = 3,
     width: Annotated[int, typer.Option(min=1, help="Width of a view in pixels.")] = 256,
     work: Annotated[Path, typer.Option(help="Folder for the service's data; its contents are deleted.")] = Path(
         "out/views"
@@ -161,7 +166,7 @@ def views(
 
 def crossing(
     sample: Annotated[
-        Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture with points and test cameras.")
+        Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with points and test cameras.")
     ] = Path("samples/robot"),
 ) -> None:
     """Lists the source files that a frame runs through from PUT to commit, and a render; fails if too many."""
@@ -174,9 +179,9 @@ def crossing(
 
 
 def memory(
-    cameras: Annotated[int, typer.Option(min=1, help="Cameras of the rig.")] = 24,
+    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras in the rig.")] = 24,
     size: Annotated[int, typer.Option(min=16, help="Width and height of the images in pixels.")] = 256,
-    gaussians: Annotated[int, typer.Option(min=100, help="Gaussians of the scene.")] = 10_000,
+    gaussians: Annotated[int, typer.Option(min=100, help="Number of Gaussians in the scene.")] = 10_000,
     scale: Annotated[float, typer.Option(help="Value of the setting scene.image_scale.")] = 1.0,
     masks: Annotated[bool, typer.Option("--masks", help="Send frames with masks.")] = False,
 ) -> None:
@@ -191,7 +196,7 @@ def memory(
 
 
 def sleeping(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene, DATA/scenes/ID.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, DATA/scenes/ID.")],
     count: Annotated[int, typer.Option(min=1, help="Number of sleeping scenes.")] = 500,
     views: Annotated[int, typer.Option(min=1, help="Number of scenes to wake with a view.")] = 5,
     work: Annotated[Path, typer.Option(help="Data folder of the copies; its contents are deleted.")] = Path(

@@ -25,7 +25,7 @@ PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26
 """Limits; the current numbers are 62 and 26. Unfinished work from before a frame would add files of its own."""
 LATER = (3, 4)
-"""Frames that are followed; frame 0 and the first updates do additional work."""
+"""Frames that are traced; frame 0 and the first updates do additional work."""
 SETTINGS = {
     "scene": {"image_scale": 0.25},
     "static": {"iterations": 300, "max_gaussians": 2500},

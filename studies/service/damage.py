@@ -157,11 +157,11 @@ class _Flip:
                 break
             time.sleep(AGAIN_S)
         if not noticed and not harmless:
-            self.faults.append("the flip is neither noticed nor harmless")
+            self.faults.append("the flip was neither noticed nor harmless")
         while service.status(self.scene).error is not None and time.monotonic() < until:
             time.sleep(AGAIN_S)
         if (error := service.status(self.scene).error) is not None:
-            self.faults.append(f"the scene still has the error: {error}")
+            self.faults.append(f"the scene still reports the error: {error}")
         for index in sorted({0, self.index, self.frames // 2, self.frames - 1}):
             self._look(index, found, views)
         self._put_right(bytes(data))
@@ -187,7 +187,7 @@ class _Flip:
         while (answer := _view(self.service, self.study, self.scene, index)).status_code == 503:
             self._no_path(answer)
             if time.monotonic() > until:
-                self.faults.append(f"a view of frame {index} is postponed forever: {answer.text}")
+                self.faults.append(f"a view of frame {index} is still unavailable: {answer.text}")
                 return
             time.sleep(AGAIN_S)
         self._no_path(answer)
@@ -201,7 +201,7 @@ class _Flip:
             truth = self.study.frames[index][0][self.study.capture.full_rig.names[0]]
             loss = _psnr(views[index], truth) - _psnr(answer.content, truth)
             if loss > CLOSE_DB:
-                self.faults.append(f"frame {index}, recomputed, is {loss:.1f} dB worse")
+                self.faults.append(f"the recomputed frame {index} is {loss:.1f} dB worse")
         elif report.iterations is None:
             found.unreported.add(index)
         if answer.status_code == 200 and not report.recomputed and answer.content != views[index]:
@@ -210,7 +210,7 @@ class _Flip:
     def _no_path(self, answer: httpx.Response) -> None:
         texts = [answer.text if answer.status_code != 200 else "", self.service.http.get("/v1/scenes").text]
         if any(str(self.service.data) in text for text in texts):
-            self.faults.append("a response contains a path of the server")
+            self.faults.append("a response contains a path on the server")
 
     def _put_right(self, flipped: bytes) -> None:
         """Repairs the byte if the service could not, so that the next flip is the only one."""

@@ -34,7 +34,7 @@ from studies.service.strangers import Attack, strangers
 TURN_S = 15.0
 """Duration of updates without strangers. With strangers, updates continue until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
-"""Most kills of a worker at one frame. A sixth would fail the frame, as it should; further kills wait for the next."""
+"""Maximum number of worker kills per frame. A sixth kill would rightly fail the frame, so it waits for the next one."""
 
 PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
 """Names of the scenarios."""
@@ -72,7 +72,7 @@ def kills(
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         lost = len(study.frames) - len(sender.receipts)
         summary = (
-            f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
+            f"{done['worker']} kills of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
             f"{len(expected)} states compared"
         )
         target = "0 acknowledged frames lost, final state bit-identical"
@@ -147,8 +147,10 @@ def damaged_log(
         finally:
             victim.stop()
     summary = f"started {cuts + flips} times; {dropped} frames failed with a reason, all others committed"
-    target = "starts, loses nothing acknowledged before the damage, reports what it dropped"
-    return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, summary, faults)
+    target = "the service starts, loses nothing acknowledged before the damage, and reports what it dropped"
+    return ScenarioResult(
+        f"{cuts} truncations and {flips} flipped bytes in journal and frame log", target, summary, faults
+    )
 
 
 def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
@@ -196,7 +198,9 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
         with _no_room(service.pid):
             answers = [service.put(scene, half, *study.frames[half]) for _ in range(3)]
             echo(f"while the disk is full: {[answer.status_code for answer in answers]}")
-            faults += [f"status {answer.status_code} instead of 507" for answer in answers if answer.status_code != 507]
+            faults += [
+                f"expected status 507, got {answer.status_code}" for answer in answers if answer.status_code != 507
+            ]
             if service.status(scene).next_frame != half:
                 faults.append("a frame was accepted but not acknowledged")
         worker = service.worker_pid(scene)
@@ -207,16 +211,16 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
             until = time.monotonic() + PATIENCE_S
             while service.status(scene).error in (None, before) and time.monotonic() < until:
                 time.sleep(AGAIN_S)
-            echo(f"while the worker has no room: {service.status(scene).error}")
+            echo(f"while the worker has no disk space: {service.status(scene).error}")
             if service.frame(scene, half).state != FrameState.UPDATING:
-                faults.append("the worker did not wait for room")
+                faults.append("the worker did not wait for disk space")
         for index in range(half + 1, len(study.frames)):
             sender.send(index)
         service.finish(scene, len(study.frames))
         faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-    target = "starts, loses nothing acknowledged before the damage, reports what it dropped"
+    target = "status 507 while the disk is full; no acknowledged frame lost, all committed once there is space"
     return ScenarioResult(
-        "disk full while ingesting", target, "507 meanwhile; all committed once there was room", faults
+        "disk full during ingest", target, "507 while full; all committed once there was space", faults
     )
 
 
@@ -237,11 +241,14 @@ def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioRes
     counts = Counter(kind.rpartition(" ")[2] for kind in flipped.counts.elements())
     said = (
         f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.recomputed)} states recomputed from "
-        f"images, {len(flipped.lost)} reported as lost, {len(flipped.unreported)} without their report"
+        f"images, {len(flipped.lost)} reported as lost, {len(flipped.unreported)} without a report"
     )
-    target = "each noticed or harmless; no wrong image, no 500, the scene continues"
+    target = "each flip is noticed or harmless; no wrong images, no status 500, and the scene continues"
     return ScenarioResult(
-        f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", target, said, flipped.faults
+        f"{count} flipped bits in {', '.join(damage.KINDS)}, half of them while the service is down",
+        target,
+        said,
+        flipped.faults,
     )
 
 
@@ -275,7 +282,7 @@ def run(
     outcomes = []
     if set(parts) & {"kills", "beginnings", "log", "disk"}:
         expected, update_s = undisturbed(study)
-        echo(f"undisturbed: {len(expected)} states, {update_s:.2f} s per update")
+        echo(f"undisturbed run: {len(expected)} states, {update_s:.2f} s per update")
         if "kills" in parts:
             outcomes.append(kills(study, expected, update_s, moments, seed, echo))
         if "beginnings" in parts:

@@ -38,7 +38,7 @@ from studies.running.process import PATIENCE_S, Service
 FARTHEST = 1.0
 """Largest jump of the object, in multiples of its size; a jump of twice its size would leave the images."""
 BETWEEN = 2
-"""Number of good frames between the last that counts for one case and the first of the next."""
+"""Number of good frames between the last frame that counts for one case and the first frame of the next."""
 AGAIN_S = 0.05
 
 
@@ -122,19 +122,22 @@ def study(
     service.start()
     try:
         usual, faults = _push(service, footage, [good(endless, index) for index in range(sent[-1].like + 1)], echo)
-        echo(f"undisturbed: {usual.count} frames")
+        echo(f"undisturbed run: {usual.count} frames")
         scene, more = _push(service, footage, sent, echo)
         lines = [_result(part, scene, usual, footage) for part in parts]
     finally:
         service.stop()
     faults += more
     for line in lines:
-        echo(f"{'holds' if not line.violations else 'FAILS'}  {line.case.name}, {line.size}  {line.last:+.1f} dB")
+        echo(f"{'passed' if not line.violations else 'FAILED'}  {line.case.name}, {line.size}  {line.last:+.1f} dB")
         echo(f"       {line.said}")
         for violation in line.violations:
             echo(f"       ! {violation}")
     failed = sum(bool(line.violations) for line in lines)
-    echo(f"{len(lines)} cases with sizes in {len(sent)} frames, {failed} fail; faults: {faults or 'none'}")
+    echo(
+        f"{len(lines)} runs (cases and sizes) in {len(sent)} frames, {failed} failures; service faults: "
+        f"{faults or 'none'}"
+    )
     return lines, faults
 
 
@@ -260,7 +263,7 @@ def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -
 
 def table(lines: Sequence[ServiceCaseResult]) -> str:
     """Formats the results as Markdown."""
-    rows = ["| case | size | the reports say | dB, last frame | holds |", "|" + "---|" * 5]
+    rows = ["| case | size | reports | dB, last frame | passes |", "|" + "---|" * 5]
     for line in lines:
         verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"
         rows.append(f"| {line.case.name} | {line.size} | {line.said} | {line.last:+.1f} | {verdict} |")

@@ -58,7 +58,7 @@ def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
         else:
             high = quality - 1
     if not best:
-        raise StudyError(f"a picture of {side}x{side} does not fit in {size_bytes} bytes")
+        raise StudyError(f"an image of {side}x{side} pixels does not fit in {size_bytes} bytes")
     return best
 
 
@@ -198,7 +198,7 @@ def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, s
     )
     verdict = "reached" if measured.share(measured.ingest) >= TARGET else "missed"
     return (
-        f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB per round and way; "
+        f"{frames} frames of {cameras} JPEGs of {size_bytes / 1e6:g} MB per round and transport; "
         f"HTTP over {senders} connections, one WebSocket with {UNANSWERED} messages unanswered\n\n"
         "| round | plain fsynced writes, MB/s | HTTP, MB/s | share | WebSocket, MB/s | share |\n"
         f"|---|---|---|---|---|---|\n{rows}\n\n"

@@ -164,11 +164,11 @@ def compare(
     faults = [
         said
         for missed, said in (
-            (late > P99_MS, f"/health/live p99 {late:+.1f} ms"),
+            (late > P99_MS, f"/health/live p99 rose by {late:.1f} ms"),
             (attacked.lost > 0, f"{attacked.lost} health checks without a response"),
-            (memory > MEMORY_MB, f"memory {memory:+.0f} MB"),
+            (memory > MEMORY_MB, f"memory grew by {memory:.0f} MB"),
             (left > 0 or closed > CLOSED_S, f"{left} connections left, the others closed after {closed:.0f} s"),
-            (slower > SLOWER, f"updates {slower:.2f} times"),
+            (slower > SLOWER, f"updates take {slower:.2f} times as long"),
         )
         if missed
     ]
@@ -181,8 +181,8 @@ def compare(
     return ScenarioResult(
         f"strangers, {'a token' if token else 'no token'}: an endless header of {attack.header / 1e6:.0f} MB, "
         f"{attack.halves} half-sent headers, {attack.uploads} stalled uploads at once",
-        f"/health/live responds, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "
-        f"update ≤ {SLOWER:g} times",
+        f"/health/live responds, p99 rises by at most {P99_MS:.0f} ms, memory by {MEMORY_MB:.0f} MB; all closed within "
+        f"{CLOSED_S:.0f} s; updates take at most {SLOWER:g} times as long",
         summary,
         faults,
     )

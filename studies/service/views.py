@@ -132,8 +132,8 @@ def measure(
         updates: updates per turn, without and with views.
         turns: turns per rate.
         width: width of a view in pixels.
-        settings: settings of the scene.
-        environment: environment variables of the service.
+        settings: scene settings.
+        environment: environment variables for the service.
         echo: prints the progress.
     """
     shutil.rmtree(folder, ignore_errors=True)
@@ -200,7 +200,7 @@ def table(rows: Sequence[ViewTimes]) -> str:
         if row.rate == TARGET_RATE:
             reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0
             text += (
-                f"\n\nTarget at {TARGET_RATE:g} per second: median at most {TARGET_LATENCY:g} times the idle one, "
+                f"\n\nTarget at {TARGET_RATE:g} per second: median latency at most {TARGET_LATENCY:g} times idle, "
                 f"updates at most {100 * TARGET_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
                 f"({row.latency:.2f} times, {100 * row.slower:+.0f} %)."
             )
@@ -212,6 +212,6 @@ def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turn
     day = datetime.now(UTC).date().isoformat()
     return (
         f"Measured {day} on {in_words(machine())}: `{capture}`, views {width} pixels wide as JPEG, every camera of the "
-        f"rig in turn; {turns} turns of {updates} updates alone and {updates} under views. Medians; in brackets the "
-        f"95th percentile.\n\n{table(rows)}\n"
+        f"rig in turn; {turns} turns of {updates} updates alone and {updates} under views. Medians, with the 95th "
+        f"percentile in parentheses.\n\n{table(rows)}\n"
     )

@@ -13,12 +13,14 @@ from studies.simulation.delays import HEAD_S
 def simulate(
     scenes: Annotated[int, typer.Option(min=8, help="Number of scenes, which fill 85 % of the CPUs.")] = 5000,
     nodes: Annotated[int, typer.Option(min=3, help="Number of nodes.")] = 200,
-    failures: Annotated[int, typer.Option(min=20, help="Failures of nodes, workers, service and head.")] = 1000,
+    failures: Annotated[
+        int, typer.Option(min=20, help="Number of failures of nodes, workers, service and head.")
+    ] = 1000,
     frames: Annotated[int, typer.Option(min=2, help="Frames per scene.")] = 40,
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     silent: Annotated[
         tuple[float, float],
-        typer.Option(help="Shortest and longest time without the head of the cluster, in seconds."),
+        typer.Option(help="Shortest and longest time without the cluster's head, in seconds."),
     ] = HEAD_S,
     out: Page = None,
 ) -> None:

@@ -7,11 +7,11 @@ Range = tuple[float, float]
 # Measured on three nodes, docs/cluster.md.
 
 START_S: Range = (2.0, 4.0)
-"""From a worker's placement on a node to its `Ready`."""
+"""Delay from a worker's placement on a node to its `Ready`."""
 NOTICED_S: Range = (3.0, 9.0)
-"""From a node's silence until Ray declares it lost, with checks every 1 s that time out after 2 s and fail 3 times."""
+"""Delay from a node's silence until Ray declares it lost, with checks every 1 s, a 2 s timeout and 3 failures."""
 TOLD_S: Range = (3.0, 6.0)
-"""From then until the service is notified: the rest of the 14 to 18 s until a scene continues."""
+"""Delay from then until the service is notified, which is the rest of the 14 to 18 s until a scene continues."""
 
 HEAD_S: Range = (3.0, 5.5)
 """How long the head does not respond after its end: `scripts/bench head`, with Redis and a supervisor."""
@@ -25,7 +25,7 @@ TOP_SHARE, SPREAD_ABOVE = 0.2, 0.5
 WAIT_S = 3.0
 """`WAIT_S` of server/cluster/ray_placement.py, which cannot be imported without Ray."""
 MESSAGE_S: Range = (0.001, 0.02)
-"""A message between the service and a worker; docs/cluster.md: 2.9 ms more per view."""
+"""Latency of a message between the service and a worker; docs/cluster.md measures 3.9 ms more per view."""
 
 # Assumed, not measured.
 
@@ -34,15 +34,15 @@ STOPPING_S: Range = (0.1, 1.0)
 LATE_S: Range = (0.5, 10.0)
 """How long actors keep running after their service has ended."""
 ADRIFT_S: Range = (1.0, 120.0)
-"""How long a worker that was given up keeps running; a real one ends within 0.5 s of its parent's end."""
+"""How long an abandoned worker keeps running; a real one ends within 0.5 s of its parent's end."""
 ADRIFT_UPDATE_S: Range = (0.5, 5.0)
-"""Its seconds per update: short, so that it writes many files that must not be read."""
+"""Seconds per update of an abandoned worker; short, so that it writes many files that must not be read."""
 PAUSE_S: Range = (1.0, 240.0)
 """How long a node is stopped or cut off, sometimes for less than Ray takes to notice."""
 REPLACED_S: Range = (30.0, 120.0)
 """Delay before a new node joins, after one was killed or came back too late."""
 DOWN_S: Range = (1.0, 20.0)
-"""From the service's end to its next start."""
+"""Delay from the service's end to its next start."""
 RECOVER_S = 5.0
 """Time within which the service recovers all its scenes after its start."""
 JOURNAL_S: Range = (0.001, 0.01)

@@ -51,7 +51,7 @@ class Node:
     """A machine of the cluster.
 
     Attributes:
-        number: number of the node.
+        number: node number.
         cpus: number of CPUs.
         memory: bytes of memory.
         state: actual state of the node.

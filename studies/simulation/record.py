@@ -123,7 +123,7 @@ class FrameRecord:
         """Checks the frames of a scene that are read at the end.
 
         Args:
-            scene: id of the scene.
+            scene: scene id.
             found: the frames that were read, by index.
             chain: contents of the frames in an undisturbed run.
         """

@@ -21,7 +21,7 @@ class ScenePlan:
     """A user's requests for a scene.
 
     Attributes:
-        spec: specification of the scene.
+        spec: scene specification.
         kind: kind of its worker's resource needs.
         frames: times at which its frames are sent, in seconds.
         ends: time from which the scene may end, once all its frames are committed; None if it does not end.

@@ -33,9 +33,11 @@ def rows(outcome: Outcome) -> list[Row]:
     table_rows = [
         _none("acknowledged frames lost", frames.lost, f" of {frames.read + frames.lost:,}"),
         _none("frames run twice", frames.twice),
-        _none("workers started while another of their scene ran", frames.beside, f" of {outcome.workers:,}"),
         _none(
-            "frames read that a worker wrote after it was given up",
+            "workers started while another worker of their scene was running", frames.beside, f" of {outcome.workers:,}"
+        ),
+        _none(
+            "frames read that an abandoned worker wrote",
             frames.foreign,
             f"; such workers wrote {outcome.adrift:,} files",
         ),
@@ -55,7 +57,7 @@ def rows(outcome: Outcome) -> list[Row]:
     longest = max(outcome.waited, default=0.0)
     table_rows += [
         _none(
-            f"workers without a place for {WAIT_S:g} s whose scene was not given a reason",
+            f"workers unplaced for {WAIT_S:g} s whose scene reports no reason",
             outcome.unexplained,
             f" of {len(outcome.waited):,}",
         ),
@@ -104,5 +106,5 @@ def _seconds(times: Sequence[tuple[float, float]]) -> str:
     longest = max(total for total, _ in times)
     return (
         f"median {median(with_room):.1f} s, 99 % {late:.1f} s, maximum {with_room[-1]:.1f} s; "
-        f"with waits for room, maximum {longest:.0f} s"
+        f"including waits for a node, maximum {longest:.0f} s"
     )

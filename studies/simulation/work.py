@@ -98,9 +98,9 @@ class Work:
     Args:
         cluster: the modelled cluster.
         record: record of the frames.
-        scene: id of the scene.
+        scene: scene id.
         folder: folder of the worker's epoch.
-        worker: number of the worker.
+        worker: worker number.
         longest: longest duration of an update, in seconds.
         say: sends a message to the service.
         gone: called when the worker ends on its own.
@@ -134,7 +134,9 @@ class Work:
         if self._ended or self._adrift or self._at is not None:
             return
         if message.index != self._frames:
-            raise RuntimeError(f"scene {self._scene}: frame {message.index} comes after {self._frames} frames")
+            raise RuntimeError(
+                f"scene {self._scene}: received frame {message.index}, but expected frame {self._frames}"
+            )
         low, high = math.log(QUICKEST_S), math.log(max(QUICKEST_S, self._longest))
         self._begin(math.exp(self._cluster.random.uniform(low, high)))
 

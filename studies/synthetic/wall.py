@@ -24,8 +24,8 @@ class Size:
 
     Attributes:
         gaussians: approximate number of Gaussians, which form a square grid.
-        width: width of the images in pixels.
-        height: height of the images in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
         cameras: number of cameras.
         moving: share of the wall that moves.
     """

@@ -20,17 +20,19 @@ def variants(
         list[str],
         typer.Option(
             metavar="'NAME: CHANGE ...'",
-            help="Settings that compete: a preset's name, or a name, a colon and changes: update.iterations=80, "
+            help="Settings to compare: a preset's name, or a name, a colon and changes such as update.iterations=80, "
             "preset=adaptive, or a constant by its dotted name. The first contender is the baseline.",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the study: rows, frames 0. A second run continues it.")] = Path(
-        "out/variants"
-    ),
-    variant: Annotated[list[str] | None, typer.Option(help="Only this variant; all by default.")] = None,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates; may be repeated.")] = None,
+    out: Annotated[
+        Path, typer.Option(help="Study folder, for rows and frames 0. A second run continues the study.")
+    ] = Path("out/variants"),
+    variant: Annotated[list[str] | None, typer.Option(help="Measure only this variant; default: all.")] = None,
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates. May be repeated.")] = None,
     frames: Annotated[int | None, typer.Option(min=2, help="Maximum number of frames per variant.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Quick screening: half the pixels, six updates.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Screen quickly, with half the pixels and six updates.")
+    ] = False,
     again: Again = False,
     page: Page = None,
 ) -> None:
@@ -46,7 +48,9 @@ def variants(
 
     for name in variant or ():
         if name not in VARIANTS:
-            raise typer.BadParameter(f"{name!r} is not one of {', '.join(VARIANTS)}", param_hint="--variant")
+            raise typer.BadParameter(
+                f"unknown variant {name!r}; choose from {', '.join(VARIANTS)}", param_hint="--variant"
+            )
     try:
         contenders = [Contender.read(text) for text in contender]
     except ValueError as error:

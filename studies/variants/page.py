@@ -22,7 +22,7 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
 
     Args:
         rows: rows with ``capture``, ``of``, ``contender`` and ``seed``; failed rows have ``error``.
-        contenders: names of the contenders; the first is the baseline.
+        contenders: contender names; the first is the baseline.
     """
     figures: Figures = {}
     for row in rows:

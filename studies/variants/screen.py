@@ -64,7 +64,7 @@ class Contender:
             return cls(text.strip(), text.strip())
         given = rest.split()
         if not name.strip() or not all("=" in change for change in given):
-            raise ValueError(f"contender {text!r} is invalid; write it as 'longer: update.cold_start_iterations=2'")
+            raise ValueError(f"invalid contender {text!r}; use the form 'longer: update.cold_start_iterations=2'")
         presets = [change.removeprefix("preset=") for change in given if change.startswith("preset=")]
         constants = [change.split("=", 1) for change in given if change.startswith(CONSTANTS)]
         changes = [c for c in given if not c.startswith((CONSTANTS, "preset="))]
@@ -112,7 +112,7 @@ def run(
     """Measures every contender on every variant of every capture; returns the page and writes ``out/variants.md``.
 
     Args:
-        captures: folders of the captures.
+        captures: capture folders.
         contenders: settings to compare; the first is the baseline.
         out: folder for rows and frames 0; a second call with the same folder continues.
         variants: names from ``VARIANTS``; if empty, all of them or those of the quick screening.

@@ -84,7 +84,7 @@ def test_faults_are_told_in_words_and_the_phone_shows_it_all(chromium, service, 
     page.fill("#take-first", "3")
     page.fill("#take-last", "2")
     page.click("#take-make")
-    until(page, "document.getElementById('take-words').innerText.includes('No committed frame from 3 to 2')")
+    until(page, "document.getElementById('take-words').innerText.includes('No committed frames from 3 to 2')")
     monkeypatch.setattr(rules, "free_bytes", lambda path: exporter.RESERVE_BYTES - 1)
     page.fill("#take-first", "")
     page.fill("#take-last", "")

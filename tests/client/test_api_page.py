@@ -131,7 +131,8 @@ def test_the_dump_of_a_frame_is_what_the_client_sends():
     first, *rest = frame_chunks(7, {"a": b"\xff\xd8\xff", "b": b"\x89P"}, {"a": b"M"}, 0.25)
     assert shown == dump(b"".join([first, *rest]))
     assert (
-        f"H = {len(first) - 8}; the head ends at offset 8 + {len(first) - 8} = {len(first)} (`{len(first):x}`)" in PAGE
+        f"H = {len(first) - 8}; the header ends at offset 8 + {len(first) - 8} = {len(first)} (`{len(first):x}`)"
+        in PAGE
     )
 
 

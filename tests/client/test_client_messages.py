@@ -101,7 +101,7 @@ def test_evaluate_says_that_it_measures_on_the_training_cameras(capture_folder, 
         ("update.iterations=x", "setting update.iterations='x': "),
         (
             "update.iteration=4",
-            "there is no setting with this name; did you mean update.iterations?",
+            "no such setting; did you mean update.iterations?",
         ),
     ],
 )

@@ -138,7 +138,7 @@ def test_a_predicted_wait_is_exact_and_a_long_one_is_asked_about_again(answer, l
 
 def test_an_outage_is_waited_for_until_its_limit_and_no_longer(clock):
     client, script = scripted(*[httpx.ConnectError("down")] * 99, outage=0.5)
-    with pytest.raises(errors.ServiceUnreachable, match=r"http://nowhere cannot be reached after \d tries: down"):
+    with pytest.raises(errors.ServiceUnreachable, match=r"http://nowhere cannot be reached after \d attempts: down"):
         client.frame("s", 0)
     assert 2 < len(script.requests) < 10
     client, script = scripted(httpx.ConnectError("down"), outage=0)

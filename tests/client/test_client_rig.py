@@ -61,7 +61,7 @@ def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
     alone = Sequence(capture, start=3, loop=True)
     assert [alone.capture_index(index) for index in range(3)] == [3, 3, 3]
     alone.close()
-    with pytest.raises(ValueError, match=r"start 4 is not one of the frames 0…3"):
+    with pytest.raises(ValueError, match=r"start must be a frame of .*0…3; got 4"):
         Sequence(capture, start=4)
 
 
@@ -69,9 +69,9 @@ def test_the_summary_says_how_far_behind():
     lateness = Lateness(late=[-0.1, -0.1, 0.4], busy=1.5, busy_count=2, outage=3, outage_count=4, began=0, ended=2)
     said = lateness.summary(5)
     assert "sent 3 frames at 1.00 of 5 per second" in said
-    assert "1 acknowledged after the next frame was due, at most 0.40 s" in said
-    assert "1.5 s for a full queue (2 times)" in said
-    assert "3.0 s for the service (4 tries)" in said
+    assert "1 acknowledged after the next frame was due, by at most 0.40 s" in said
+    assert "1.5 s for space in the queue (2 times)" in said
+    assert "3.0 s for the service (4 retries)" in said
     assert Lateness().summary(None) == "sent 0 frames"
     first = Lateness(late=[40.0, -0.1, -0.1, 0.4], began=40, ended=42, before=1)
     assert "sent 4 frames, those after frame 0 at 1.00 of 5 per second; 1 acknowledged after" in first.summary(5)

@@ -8,7 +8,7 @@ import pytest
 
 from scas4d_core.frame_outcome import Candidate, FrameOutcome, degraded_text
 
-FAULT = "7 of 300 Gaussians are not finite, or moved or grew too far"
+FAULT = "7 of 300 Gaussians have non-finite values, or moved or grew too much"
 UNMET = "the pictures are met at 12.0 dB, 21.0 dB less than usual"
 
 

@@ -147,8 +147,8 @@ WRONG: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "time again": (lambda f: replace(f, time=FRAMES[0].time), "is not after"),
     "time is not a number": (lambda f: replace(f, time=float("nan")), "time nan"),
     "time is infinite": (lambda f: replace(f, time=float("inf")), "time inf"),
-    "no picture": (lambda f: replace(f, images={}), "none of the rig's cameras"),
-    "strange cameras": (lambda f: replace(f, images={"x": f.images["c0"]}), "none of the rig's cameras"),
+    "no picture": (lambda f: replace(f, images={}), "no image of any of the rig's cameras"),
+    "strange cameras": (lambda f: replace(f, images={"x": f.images["c0"]}), "no image of any of the rig's cameras"),
     "size": (lambda f: replace(f, images={**f.images, "c3": f.images["c3"][:, :-8]}), r"c3.*40x48.*48x48"),
     "grey": (lambda f: replace(f, images={**f.images, "c3": f.images["c3"][..., 0]}), "c3"),
     "size of a mask": (lambda f: replace(f, masks={**f.masks, "c2": f.masks["c2"][:-1]}), r"c2.*mask"),
@@ -357,7 +357,7 @@ def test_one_camera_moves_what_it_sees_about_three_metres_away() -> None:
     before, after = (scene.history.gaussians(frame.index).means for frame in frames[:2])
     assert np.linalg.norm(after - before, axis=1).max() > 0.01
     automatic = settings.model_copy(update={"scene": SceneSettings(metres_per_unit="auto")})
-    with pytest.raises(ValueError, match="give metres_per_unit as a number"):
+    with pytest.raises(ValueError, match="set metres_per_unit to a number"):
         Reconstruction.start(rig, frames[0], automatic, points=points_seen)
 
 

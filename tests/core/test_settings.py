@@ -72,7 +72,7 @@ def test_what_contradicts_a_preset_is_refused() -> None:
 
 
 def test_an_unknown_preset_names_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"preset='faster': there is no preset with this name; give one of .*scas4d"):
+    with pytest.raises(ValueError, match=r"preset='faster': no such preset; choose from .*scas4d"):
         preset("faster")
 
 
@@ -116,7 +116,7 @@ def test_right_values_are_taken() -> None:
 
 
 def test_a_constant_of_the_method_is_refused_as_an_unknown_setting() -> None:
-    with pytest.raises(SettingError, match=r"update\.max_scale=0\.02: there is no setting with this name"):
+    with pytest.raises(SettingError, match=r"update\.max_scale=0\.02: no such setting"):
         preset("scas4d", {"update": {"max_scale": 0.02}})
 
 
@@ -136,7 +136,7 @@ def test_changes_go_over_the_preset_later_ones_over_earlier_ones() -> None:
         ({"update": {"iteration": 4}}, "update.iteration", 4, "did you mean update.iterations?"),
         ({"update": {"iterations": 0}}, "update.iterations", 0, "greater than or equal to 1"),
         ({"update": {"clusters": [64, 8]}}, "update.clusters", [64, 8], "are not ascending"),
-        ({"upd": {"seed": 1}}, "upd", {"seed": 1}, "no setting with this name"),
+        ({"upd": {"seed": 1}}, "upd", {"seed": 1}, "no such setting"),
         ({"update": 4}, "update", 4, "UpdateSettings"),
         ({"scene": {"background": 2}}, "scene.background", 2, "a valid tupleBackground colour, RGB in 0…1"),
         ({"scene": {"background": 2, "near": 0}}, "scene.background", 2, "(and 1 more)"),

@@ -45,7 +45,7 @@ def test_a_bad_file_is_refused_by_name(tmp_path, text, said):
 
 
 def test_the_value_is_quoted_unless_it_may_be_a_secret():
-    with pytest.raises(SettingsError, match=r"setting port is 'abc', which is invalid: .*integer"):
+    with pytest.raises(SettingsError, match=r"setting port has the invalid value 'abc': .*integer"):
         ServerSettings.from_environment({"SCAS4D_PORT": "abc"})
     with pytest.raises(SettingsError) as refused:
         ServerSettings.from_environment({"SCAS4D_TOKEN": "hush"})

@@ -51,7 +51,8 @@ def test_it_says_what_to_do_where_a_package_is_missing(tmp_path: Path, missing: 
     done = bench("frontier", tmp_path, "--out", tmp_path / "out", "--only", "page", folder=tmp_path, before=tmp_path)
     assert done.returncode == 1, done.stdout + done.stderr
     assert done.stderr == (
-        f"scripts/bench: this needs {missing}, which is not installed; in the checkout: scripts/setup dev\n"
+        f"scripts/bench: this command requires {missing}, which is not installed; run in the checkout: scripts/setup "
+        "dev\n"
     )
 
 

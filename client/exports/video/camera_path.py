@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 CameraPath = Callable[[float], Camera]
-"""Maps a time in seconds since the start of the video to a camera in the user's world, at the size of the video."""
+"""Maps a time in seconds since the start of the video to a camera in the user's world, with the video's image size."""
 
 MAX_ELEVATION = np.radians(88)
 """Maximum elevation of an orbit in radians; at 90 degrees the up direction would be undefined."""
@@ -154,7 +154,7 @@ def _times(given: KeyPoses, seconds_of_frame: Mapping[int, float], file: Path) -
         if place and times[-1] <= times[-2]:
             field = "time" if key.time is not None else "frame"
             raise InputError(
-                f"{file.name}: keys[{place}].{field} {getattr(key, field)} is not later than that of keys[{place - 1}]",
+                f"{file.name}: keys[{place}].{field} {getattr(key, field)} is not later than keys[{place - 1}]",
                 "list the keys in chronological order",
             )
     return np.array(times)

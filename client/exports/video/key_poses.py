@@ -34,14 +34,14 @@ class KeyPose(Model):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (self.time is None) == (self.frame is None):
-            raise ValueError("give either time (seconds in the video) or frame (of the scene)")
+            raise ValueError("set either time (seconds in the video) or frame (of the scene)")
         placed = self.position is not None or self.look_at is not None
         if placed == (self.world_to_camera is not None):
-            raise ValueError("give either position and look_at, or world_to_camera")
+            raise ValueError("set either position and look_at, or world_to_camera")
         if placed and (self.position is None or self.look_at is None):
-            raise ValueError("position and look_at go together; give both")
+            raise ValueError("position and look_at must be set together")
         if placed and self.position == self.look_at:
-            raise ValueError("position and look_at are the same point; give a point in front of the camera")
+            raise ValueError("position and look_at are the same point; set look_at to a point in front of the camera")
         return self
 
 
@@ -59,7 +59,7 @@ class KeyPoses(Model):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.up is not None and not any(self.up):
-            raise ValueError("up is the zero vector; give a direction")
+            raise ValueError("up is the zero vector; set it to a direction")
         return self
 
 
@@ -76,7 +76,7 @@ def read_key_poses(path: Path) -> KeyPoses:
     [0.0, 0.0, -3.0]
     """
     if not path.is_file():
-        raise InputError(f"path {str(path)!r} is not a file", "give orbit, camera, or a JSON file of key poses")
+        raise InputError(f"path {str(path)!r} is not a file", "use orbit, camera, or a JSON file of key poses")
     try:
         return KeyPoses.model_validate_json(path.read_bytes())
     except ValidationError as error:

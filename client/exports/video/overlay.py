@@ -90,7 +90,7 @@ class Trails:
 
         Args:
             picture: rendered image.
-            camera: camera of the image, in the user's world.
+            camera: camera with which the image was rendered, in the user's world.
         """
         height, width = picture.shape[:2]
         uv = np.stack([camera.project(places)[0] for places in self._places]) * SHARPER

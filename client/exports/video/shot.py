@@ -32,13 +32,13 @@ class VideoOptions:
         camera: name of a camera in the rig or the compared capture, used as viewpoint or start of the orbit; None for
             the first one.
         orbit_speed: angular speed of the orbit in degrees per second, towards the camera's right.
-        fps: frame rate of the video; None for the frame rate of the source.
+        fps: video frame rate; None for the source's frame rate.
         speed: seconds of scene time per second of video.
-        seconds: duration of the video in seconds; None for the duration of the frames.
+        seconds: video duration in seconds; None for the duration of the frames.
         size: (width, height) of the rendered image; None for the size of the camera.
         interpolate: whether to interpolate states between frames.
         tracks: number of tracks to draw.
-        trail: length of the tracks in seconds of video.
+        trail: track length in seconds of video.
         parts: whether to colour Gaussians by part.
         background: RGB in 0…1; None for the scene's background.
     """
@@ -65,7 +65,7 @@ class Shot:
         given: source of the states.
         times: time in seconds of each shown frame, keyed by frame index.
         options: requested options.
-        fps: frame rate of the video.
+        fps: video frame rate.
         count: number of images in the video.
         size: (width, height) of the rendered image.
         path: camera path.
@@ -113,7 +113,7 @@ class Shot:
         labels = self.given.parts()
         if labels is None:
             raise InputError(
-                f"parts: {self.given.name} contains no parts", "leave --parts out; a scene without motion has no parts"
+                f"parts: {self.given.name} contains no parts", "omit --parts; a scene without motion has no parts"
             )
         return labels
 
@@ -121,7 +121,7 @@ class Shot:
         rows = moving_rows(self.given.some(list(self.times)), self.options.tracks)
         if not rows.size:
             raise InputError(
-                "tracks: there is no motion in these frames", "leave --tracks out, or choose other frames with --frames"
+                "tracks: these frames contain no motion", "omit --tracks, or choose other frames with --frames"
             )
         return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
 
@@ -165,18 +165,20 @@ def plan_shot(
 def _check(options: VideoOptions, compared: Capture | None) -> None:
     if compared is not None and options.path != "camera":
         raise InputError(
-            f"compare is given for path {options.path!r}", "use --path camera: only cameras have ground-truth images"
+            f"compare cannot be used with path {options.path!r}",
+            "use --path camera: only cameras have ground-truth images",
         )
     if compared is not None and options.interpolate:
         raise InputError(
-            "compare and interpolate are mutually exclusive: there is no ground truth between frames", "leave one out"
+            "compare and interpolate are mutually exclusive: there is no ground truth between frames",
+            "omit one of them",
         )
 
 
 def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera:
     """Returns the camera with a given name, or the first camera if the name is None.
 
-    Refined cameras of the scene take precedence over those of the capture.
+    The scene's refined cameras take precedence over the capture's cameras.
 
     Raises:
         InputError: there are no cameras, or none with this name.
@@ -193,12 +195,12 @@ def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera
     if not cameras:
         raise InputError(
             f"{given.name} has no cameras; they are not read from USD and .glb files",
-            "give the output folder of scas4d reconstruct, its .s4d file, or a capture with --compare",
+            "use the output folder of scas4d reconstruct, its .s4d file, or a capture with --compare",
         )
     if name is None:
         return next(iter(cameras.values()))
     if name not in cameras:
-        raise InputError(f"camera {name!r} does not exist", f"give one of {', '.join(cameras)}")
+        raise InputError(f"camera {name!r} does not exist", f"choose from {', '.join(cameras)}")
     return cameras[name]
 
 
@@ -209,7 +211,8 @@ def _size(asked: tuple[int, int] | None, camera: Camera, even: bool) -> tuple[in
     fits = max(width // 2 * 2, 2), max(height // 2 * 2, 2)
     if asked is not None:
         raise InputError(
-            f"size {width}x{height} is odd, which MP4 does not support", f"give {fits[0]}x{fits[1]}, or a .webp"
+            f"size {width}x{height} has an odd dimension, but MP4 requires even width and height",
+            f"use {fits[0]}x{fits[1]}, or write a .webp file",
         )
     return fits
 
@@ -228,11 +231,11 @@ def _truth(compared: Capture, camera: Camera, size: tuple[int, int], last: int) 
     """Returns a function that maps a frame index to the ground truth image, placed as in ``fit_to_size``."""
     training = camera.name in compared.full_rig.names
     if not training and (compared.full_test_rig is None or camera.name not in compared.full_test_rig.names):
-        raise InputError(f"compare: capture {compared.name} has no camera {camera.name!r}", "give another --camera")
+        raise InputError(f"compare: capture {compared.name} has no camera {camera.name!r}", "choose another --camera")
     if last >= compared.frame_count:
         raise InputError(
             f"compare: capture {compared.name} has {compared.frame_count} frames, but frame {last} is shown",
-            f"give --frames up to {compared.frame_count - 1}, or the capture that was reconstructed",
+            f"set --frames to end at {compared.frame_count - 1}, or compare with the capture that was reconstructed",
         )
     scale = min(size[0] / camera.width, size[1] / camera.height)
     width, height = round(scale * camera.width), round(scale * camera.height)

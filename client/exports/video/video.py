@@ -32,11 +32,11 @@ def make_video(
     Args:
         source: source of the states, see `opened`.
         out: path that ends in `.mp4` or `.webp`; None for an MP4 next to the source, named after it.
-        options: options of the video.
+        options: video options.
         frames: inclusive range `A:B`; None for all frames.
         compared: capture whose ground truth images from the same camera are shown to the right of the rendered images.
-        url: address of the service.
-        token: token of the service.
+        url: service URL.
+        token: access token for the service.
 
     Raises:
         InputError: an option is invalid, or frames, a camera or parts do not exist.
@@ -73,7 +73,8 @@ def picture_size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SMALLEST <= side <= LARGEST for side in size):
         raise InputError(
-            f"size {text!r} is not an image size", f"give WIDTHxHEIGHT, such as 1280x720, {SMALLEST} to {LARGEST} each"
+            f"size {text!r} is not a valid image size",
+            f"use WIDTHxHEIGHT, such as 1280x720, with {SMALLEST} to {LARGEST} pixels per side",
         )
     return size
 
@@ -90,7 +91,7 @@ def background_colour(text: str) -> tuple[float, float, float]:
         red, green, blue = ImageColor.getrgb(text)[:3]
     except ValueError:
         raise InputError(
-            f"background {text!r} is not a colour", "give a name or #rrggbb, such as white or #202020"
+            f"background {text!r} is not a colour", "use a name or #rrggbb, such as white or #202020"
         ) from None
     return red / 255, green / 255, blue / 255
 

@@ -32,12 +32,12 @@ def check_suffix(path: Path) -> str:
     '.mp4'
     >>> check_suffix(Path("a.gif"))
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: out 'a.gif' ends in '.gif'; give a name that ends in .mp4 or .webp
+    scas4d_core.errors.InputError: out 'a.gif' has the unsupported suffix '.gif'; use .mp4 or .webp
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(
-            f"out {str(path)!r} ends in {path.suffix!r}", f"give a name that ends in {' or '.join(SUFFIXES)}"
+            f"out {str(path)!r} has the unsupported suffix {path.suffix!r}", f"use {' or '.join(SUFFIXES)}"
         )
     return suffix
 
@@ -78,7 +78,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
                 raise InputError(f"out {str(path)!r} would contain no images", "choose frames that exist")
             encoder.finish()
         except av.FFmpegError as error:
-            remedy = "give a smaller size, or another --fps"
+            remedy = "use a smaller size, or another --fps"
             raise InputError(f"out {str(path)!r} cannot be encoded at {fps:g} fps ({error})", remedy) from error
         finally:
             if encoder is not None:

@@ -41,7 +41,7 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
             raise CaptureError(f"{path}: {key} is not a camera table; remove it")
         name = table.get("name", key)
         if not isinstance(name, str | int):
-            raise CaptureError(f"{path}: [{key}] has the name {name!r}; give a string")
+            raise CaptureError(f"{path}: [{key}]: name must be a string; got {name!r}")
         inner = INTRINSICS_FOLDER.fullmatch(str(name))
         where = f"{path}: [{key}]"
         cameras.append(

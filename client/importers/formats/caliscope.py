@@ -51,7 +51,7 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
                 fisheye=table.get("fisheye") is True,
             )
         )
-    why = f"{path.name}: left out cameras that are ignored or have no pose"
+    why = f"{path.name}: skipped cameras that are ignored or have no pose"
     return calibration_of_cameras(path, cameras, left_out, why)
 
 

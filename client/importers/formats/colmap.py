@@ -90,22 +90,23 @@ def _lens(files: dict[str, Path], cameras: dict[int, _Camera], image: _Image) ->
     camera = cameras.get(image.camera)
     if camera is None:
         raise CaptureError(
-            f"{files['images']}: image {image.name} has camera {image.camera}, which {files['cameras'].name} lacks"
+            f"{files['images']}: image {image.name} refers to camera {image.camera}, which is not in "
+            f"{files['cameras'].name}"
         )
     q, t = np.array(image.quaternion), np.array(image.translation)
     length = np.linalg.norm(q)
     if not (np.isfinite(length) and abs(length - 1) < 1e-2 and np.isfinite(t).all()):
         listed = " ".join(f"{value:g}" for value in (*image.quaternion, *image.translation))
         raise CaptureError(
-            f"{files['images']}: image {image.name} has an invalid pose ({listed}); q must have length 1"
+            f"{files['images']}: image {image.name} has an invalid pose ({listed}); q must be a unit quaternion"
         )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _rotation(q / length), t
     names = MODELS.get(camera.model, ())
     if names and len(names) != len(camera.parameters):
         raise CaptureError(
-            f"{files['cameras']}: camera {image.camera} has {len(camera.parameters)} parameters; {camera.model} needs "
-            f"{len(names)}: {', '.join(names)}"
+            f"{files['cameras']}: camera {image.camera} has {len(camera.parameters)} parameters, but {camera.model} "
+            f"requires {len(names)}: {', '.join(names)}"
         )
     parameters = dict(zip(names, camera.parameters, strict=False))
     size = (camera.width, camera.height)
@@ -141,7 +142,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 if not line.startswith("#"):
                     yield number, line.strip()
     except (OSError, UnicodeDecodeError) as fault:
-        raise CaptureError(f"{path}: cannot be read as text ({fault})") from fault
+        raise CaptureError(f"{path} cannot be read as text: {fault}") from fault
 
 
 def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
@@ -200,20 +201,24 @@ class _Bytes:
         try:
             self._data = path.read_bytes()
         except OSError as fault:
-            raise CaptureError(f"{path}: cannot be read ({fault.strerror})") from fault
+            raise CaptureError(f"{path} cannot be read: {fault.strerror}") from fault
         self._at = 0
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + form)
         if self._at + size > len(self._data):
-            raise CaptureError(f"{self.path}: ends after {len(self._data)} bytes, within {what}; copy the file again")
+            raise CaptureError(
+                f"{self.path} is truncated after {len(self._data)} bytes, within {what}; copy the file again"
+            )
         values = struct.unpack_from("<" + form, self._data, self._at)
         self._at += size
         return values
 
     def skip(self, size: int, what: str) -> None:
         if self._at + size > len(self._data):
-            raise CaptureError(f"{self.path}: ends after {len(self._data)} bytes, within {what}; copy the file again")
+            raise CaptureError(
+                f"{self.path} is truncated after {len(self._data)} bytes, within {what}; copy the file again"
+            )
         self._at += size
 
     def text(self, what: str) -> str:
@@ -235,7 +240,7 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
         name = MODEL_IDS.get(model)
         if name not in MODELS:  # the parameter count is known only for supported models
             raise CaptureError(
-                f"{path}: camera {id} has the model {name or f'number {model}'}, which is not supported; "
+                f"{path}: camera {id} has the unsupported model {name or f'number {model}'}; "
                 f"calibrate with one of {', '.join(MODELS)}"
             )
         cameras[id] = _Camera(name, width, height, file.take(f"{len(MODELS[name])}d", what))

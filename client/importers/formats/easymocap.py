@@ -47,12 +47,12 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
     intrinsics, extrinsics = read_storage(folder / INTRINSICS), read_storage(folder / EXTRINSICS)
     names = intrinsics.get("names")
     if not isinstance(names, list) or not names:
-        raise CaptureError(f"{folder / INTRINSICS}: has no list `names` of cameras")
+        raise CaptureError(f"{folder / INTRINSICS}: missing `names`, the list of cameras")
     texts = [name if isinstance(name, str) else f"{name:g}" for name in names if isinstance(name, str | float)]
     posed = [name for name in texts if extrinsics.get(f"T_{name}") is not None]
     left_out = [name for name in texts if name not in posed and name != "none"]
     cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in posed]
-    why = f"{INTRINSICS}: left out cameras that have no pose in {EXTRINSICS}"
+    why = f"{INTRINSICS}: skipped cameras that have no pose in {EXTRINSICS}"
     return calibration_of_cameras(folder, cameras, left_out, why)
 
 
@@ -61,14 +61,16 @@ def _camera(
 ) -> LensCamera:
     where = f"{folder / EXTRINSICS}: camera {name!r}"
     if not can_be_named(name):
-        raise CaptureError(f"{where}: {NAMES}; rename the camera and its images")
+        raise CaptureError(f"{where}: invalid name: {NAMES}; rename the camera and its images")
     rotation, vector = extrinsics.get(f"Rot_{name}"), extrinsics.get(f"R_{name}")
     if rotation is None:
         rotation = vector
     elif vector is not None:
         matrix = numbers(where, f"Rot_{name}", rotation, (9,)).reshape(3, 3)
         if np.abs(rodrigues(numbers(where, f"R_{name}", vector, (3,))) - matrix).max() > APART:
-            raise CaptureError(f"{where}: R_{name} and Rot_{name} are different rotations; write the file again")
+            raise CaptureError(
+                f"{where}: R_{name} and Rot_{name} are different rotations; export the calibration again"
+            )
     where = f"{folder / INTRINSICS}: camera {name!r}"
     size = [intrinsics.get(f"{side}_{name}") for side in "WH"]
     return opencv_camera(

@@ -39,17 +39,17 @@ def read_storage(path: Path) -> dict[str, Any]:
     cv2 = load("cv2", needed="reading OpenCV's YAML and XML files")
     try:
         if path.stat().st_size > LARGEST_FILE:
-            raise CaptureError(f"{path}: is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
+            raise CaptureError(f"{path} is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
         if _depth(path.read_bytes()) > DEEPEST:
-            raise CaptureError(f"{path}: is nested more than {DEEPEST} levels deep; this is not a calibration file")
+            raise CaptureError(f"{path} is nested more than {DEEPEST} levels deep; this is not a calibration file")
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         if not storage.isOpened():
-            raise CaptureError(f"{path}: cannot be read as an OpenCV FileStorage file (YAML or XML)")
+            raise CaptureError(f"{path} cannot be read as an OpenCV FileStorage file (YAML or XML)")
         root = storage.root()
         return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - a FileNode is no mapping
     except (OSError, SystemError, cv2.error) as fault:
         first = str(fault).strip().splitlines()[0] if str(fault).strip() else type(fault).__name__
-        raise CaptureError(f"{path}: cannot be read as an OpenCV FileStorage file ({first})") from fault
+        raise CaptureError(f"{path} cannot be read as an OpenCV FileStorage file: {first}") from fault
 
 
 def _depth(data: bytes) -> int:
@@ -84,8 +84,8 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
     """Returns (width, height) of the first image in ``images/<camera>/``, or of ``videos/<camera>.mp4``.
 
     Args:
-        folder: folder of the capture.
-        camera: name of the camera.
+        folder: capture folder.
+        camera: camera name.
         where: position in the calibration at which the size is missing, for messages.
 
     Raises:
@@ -108,8 +108,8 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
                     context = container.streams.video[0].codec_context
                     return int(context.width), int(context.height)
             except (av.FFmpegError, IndexError) as fault:
-                raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
+                raise CaptureError(f"{path} cannot be read as video: {fault}") from fault
     raise CaptureError(
         f"{where} has no image size, and neither {images}/ nor {folder / 'videos' / camera}.mp4 exists "
-        "to read it from; add the images there, or the size to the file"
+        "to read it from; add the images there, or add the size to the file"
     )

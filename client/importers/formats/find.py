@@ -60,7 +60,7 @@ def read_calibration_file(path: Path, capture: Path) -> Calibration:
 
     Args:
         path: calibration file, or folder that contains exactly one calibration.
-        capture: folder of the images, from which image sizes that the file omits are read.
+        capture: capture folder, whose images provide any image sizes that the file omits.
 
     Raises:
         CaptureError: the format is unknown, the folder has several calibrations, or the file cannot be read.
@@ -89,10 +89,11 @@ def single_calibration(found: list[Path], folder: Path) -> Path:
     if len(found) == 1:
         return found[0]
     if not found:
-        raise CaptureError(f"{folder}: contains no calibration; give {READ}")
+        raise CaptureError(f"{folder} contains no calibration; supported files: {READ}")
     listed = ", ".join(str(path.relative_to(folder)) for path in found)
     raise CaptureError(
-        f"{folder}: contains {len(found)} calibrations ({listed}); choose one: --calibration {found[0]}, or keep one"
+        f"{folder} contains {len(found)} calibrations ({listed}); choose one with --calibration {found[0]}, or keep "
+        "only one"
     )
 
 
@@ -101,9 +102,9 @@ def _read_toml(path: Path) -> Calibration:
         with path.open("rb") as file:
             document: dict[str, Any] = tomllib.load(file)
     except (OSError, ValueError, RecursionError) as fault:  # malformed, not UTF-8, or nested too deeply
-        raise CaptureError(f"{path}: cannot be read as TOML ({fault})") from fault
+        raise CaptureError(f"{path} cannot be read as TOML: {fault}") from fault
     if is_caliscope(document):
         return read_caliscope(path, document)
     if is_anipose(document):
         return read_anipose(path, document)
-    raise CaptureError(f"{path}: contains no camera tables with matrix and rotation; give {READ}")
+    raise CaptureError(f"{path} contains no camera tables with matrix and rotation; supported files: {READ}")

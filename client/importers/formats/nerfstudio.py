@@ -41,25 +41,25 @@ def read_transforms(path: Path) -> Calibration:
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise CaptureError(
-            f"{path}: has no frames; give a list of entries with file_path and transform_matrix, one per camera"
+            f"{path} has no frames; `frames` must list entries with file_path and transform_matrix, one per camera"
         )
     undo = _undo_world(path, meta)
     views = []
     for number, frame in enumerate(frames):
         where = f"{path}: frames[{number}]"
         if not isinstance(frame, dict):
-            raise CaptureError(f"{where} must be an object; found {type(frame).__name__}")
+            raise CaptureError(f"{where} must be an object; got {type(frame).__name__}")
         views.append(_view(where, meta, frame, undo, meta.get("applied_scale", 1.0)))
     fps = _number(str(path), meta, "fps") if "fps" in meta else None
     if fps is not None and fps <= 0:
-        raise CaptureError(f"{path}: fps is {fps:g}; give a positive number")
+        raise CaptureError(f"{path}: fps must be positive; got {fps:g}")
     return calibration(path, views, fps=fps)
 
 
 def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: Float, scale: float) -> CalibratedImage:
     file = frame.get("file_path")
     if not isinstance(file, str) or not PurePosixPath(file).name:
-        raise CaptureError(f"{where} has no file_path")
+        raise CaptureError(f"{where}: missing file_path")
     where = f"{where} ({file})"
     file = file.replace("\\", "/")  # paths written on Windows
     to_world = _matrix(where, frame, "transform_matrix")
@@ -68,7 +68,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     size = (_whole(where, given, "w"), _whole(where, given, "h"))
     model = given.get("camera_model") or _default_model(given)
     if not isinstance(model, str):
-        raise CaptureError(f"{where}: camera_model is {model!r}; give one of {', '.join(MODELS)}")
+        raise CaptureError(f"{where}: unknown camera_model {model!r}; choose from {', '.join(MODELS)}")
     fx = _focal(where, given, "x", size[0])
     parameters = {
         "fx": fx,
@@ -80,7 +80,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     try:
         pose = FLIP @ np.linalg.inv(undo @ to_world)
     except np.linalg.LinAlgError as fault:
-        raise CaptureError(f"{where}: transform_matrix cannot be inverted; give a camera-to-world pose") from fault
+        raise CaptureError(f"{where}: transform_matrix cannot be inverted; set it to a camera-to-world pose") from fault
     camera = lens_camera(file, model, parameters, pose, size, source=where)
     path = PurePosixPath(file)
     time = _number(where, frame, "time") if frame.get("time") is not None else None
@@ -96,14 +96,14 @@ def _default_model(given: Mapping[str, Any]) -> str:
 
 def _undo_world(path: Path, meta: Mapping[str, Any]) -> Float:
     if "applied_scale" in meta and _number(str(path), meta, "applied_scale") <= 0:
-        raise CaptureError(f"{path}: applied_scale is {meta['applied_scale']!r}; give a positive number")
+        raise CaptureError(f"{path}: applied_scale must be positive; got {meta['applied_scale']!r}")
     if meta.get("applied_transform") is None:
         return np.eye(4)
     applied = _matrix(str(path), meta, "applied_transform")
     try:
         return np.asarray(np.linalg.inv(applied), np.float64)
     except np.linalg.LinAlgError as fault:
-        raise CaptureError(f"{path}: applied_transform cannot be inverted; leave it out, or give a rotation") from fault
+        raise CaptureError(f"{path}: applied_transform cannot be inverted; omit it, or set it to a rotation") from fault
 
 
 def _focal(where: str, given: Mapping[str, Any], axis: str, pixels: int) -> float:
@@ -112,34 +112,36 @@ def _focal(where: str, given: Mapping[str, Any], axis: str, pixels: int) -> floa
     if given.get(f"camera_angle_{axis}") is not None:
         angle = _number(where, given, f"camera_angle_{axis}")
         if not 0 < angle < math.pi:
-            raise CaptureError(f"{where}: camera_angle_{axis} is {angle:g}; give radians between 0 and pi")
+            raise CaptureError(f"{where}: camera_angle_{axis} must be between 0 and pi radians; got {angle:g}")
         return pixels / 2 / math.tan(angle / 2)
-    raise CaptureError(f"{where} has no fl_{axis}, and neither has the top level; give the focal length in pixels")
+    raise CaptureError(
+        f"{where}: missing fl_{axis} (not set at the top level either); set it to the focal length in pixels"
+    )
 
 
 def _matrix(where: str, given: Mapping[str, Any], key: str) -> Float:
     if key not in given:
-        raise CaptureError(f"{where} has no {key}")
+        raise CaptureError(f"{where}: missing {key}")
     try:
         rows = np.array(given[key], dtype=np.float64)
     except (TypeError, ValueError):
         rows = np.empty(0)
     if rows.shape not in ((3, 4), (4, 4)) or not np.isfinite(rows).all():
-        raise CaptureError(f"{where}: {key} must be 4x4 (or 3x4) finite numbers")
+        raise CaptureError(f"{where}: {key} must be a 4x4 or 3x4 matrix of finite numbers")
     return np.concatenate([rows[:3], [[0.0, 0.0, 0.0, 1.0]]])
 
 
 def _number(where: str, given: Mapping[str, Any], key: str) -> float:
     value = given.get(key)
     if value is None:
-        raise CaptureError(f"{where} has no {key}, and neither has the top level")
+        raise CaptureError(f"{where}: missing {key} (not set at the top level either)")
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise CaptureError(f"{where}: {key} is {value!r}; give a finite number")
+        raise CaptureError(f"{where}: {key} must be a finite number; got {value!r}")
     return float(value)
 
 
 def _whole(where: str, given: Mapping[str, Any], key: str) -> int:
     value = _number(where, given, key)
     if value != round(value) or not 1 <= value <= 1 << 16:
-        raise CaptureError(f"{where}: {key} is {value:g}; give the image size in whole pixels")
+        raise CaptureError(f"{where}: {key} must be a whole number of pixels from 1 to 65536; got {value:g}")
     return int(value)

@@ -42,7 +42,7 @@ def opencv_camera(
 
     Args:
         where: file and position in the file, for messages.
-        name: name of the camera.
+        name: camera name.
         matrix: camera matrix [3, 3].
         distortions: 4, 5 or 8 coefficients (4 for a fisheye), or None. Further coefficients must be 0.
         rotation: world-to-camera rotation, [3, 3] or a Rodrigues vector [3].
@@ -62,7 +62,7 @@ def opencv_camera(
     k = numbers(where, "the camera matrix", matrix, (9,)).reshape(3, 3)
     if np.abs(k[2, :2]).max() > 0 and not k[:2, 2].any():
         raise CaptureError(
-            f"{where}: the camera matrix has cx, cy in its last row: it is transposed, as in MATLAB; give its transpose"
+            f"{where}: the camera matrix has cx, cy in its last row: it is transposed, as in MATLAB; transpose it"
         )
     if not np.allclose([k[1, 0], *k[2]], [0, 0, 0, 1]) or abs(k[0, 1]) > SKEW * abs(k[0, 0]):
         raise CaptureError(
@@ -84,7 +84,7 @@ def _distortion(where: str, given: Any, fisheye: bool) -> tuple[str, dict[str, f
         return "OPENCV_FISHEYE", dict(zip(FISHEYE, values, strict=True))
     if values[8:].any():
         raise CaptureError(
-            f"{where}: has thin prism or tilted sensor distortion ({', '.join(f'{v:g}' for v in values[8:])}), "
+            f"{where} has thin prism or tilted sensor distortion ({', '.join(f'{v:g}' for v in values[8:])}), "
             "which is not supported; calibrate with at most the rational model (8 coefficients)"
         )
     named = dict(zip(PERSPECTIVE, values[:8], strict=False))
@@ -126,7 +126,7 @@ def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
         counts = [count for count in counts if count] or counts
     if values.size not in counts or not np.isfinite(values).all():
         listed = " or ".join(str(count) for count in counts if count or len(counts) == 1)
-        raise CaptureError(f"{where}: {field} is {_short(given)}; give {listed} finite numbers")
+        raise CaptureError(f"{where}: {field} must be {listed} finite numbers; got {_short(given)}")
     return values
 
 
@@ -138,10 +138,10 @@ def picture_size(where: str, given: Any) -> tuple[int, int]:
     """
     values = numbers(where, "size", given, (2,))
     if (values != np.round(values)).any() or values.min() < 1 or values.max() > LARGEST_SIDE:
-        raise CaptureError(f"{where}: size is {_short(given)}; give width and height in whole pixels")
+        raise CaptureError(f"{where}: size must be a width and height in whole pixels; got {_short(given)}")
     return int(values[0]), int(values[1])
 
 
 def _short(given: Any) -> str:
-    text = "missing" if given is None else repr(given)
+    text = "nothing" if given is None else repr(given)
     return text if len(text) <= 80 else f"{text[:79]}…"

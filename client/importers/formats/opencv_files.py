@@ -65,7 +65,7 @@ def _camera(path: Path, capture: Path) -> LensCamera:
     rotation, translation = first_field(stored, ROTATION), first_field(stored, TRANSLATION)
     if rotation is None or translation is None:
         raise CaptureError(
-            f"{path}: has no pose; give R and T, world to camera (extrinsic_parameters in OpenCV's sample are board "
+            f"{path} has no pose; add R and T, world to camera (extrinsic_parameters in OpenCV's sample are board "
             "poses)"
         )
     size = [stored.get("image_width"), stored.get("image_height")]

@@ -61,7 +61,7 @@ def read_qualisys(path: Path) -> Calibration:
     cameras = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
     video = [camera for camera in cameras if _films(camera)] or cameras
     markers = [camera.own.get("serial", "?") for camera in cameras if camera not in video]
-    why = f"{path.name}: left out cameras that record markers instead of video"
+    why = f"{path.name}: skipped cameras that record markers instead of video"
     return calibration_of_cameras(path, [_lens(path, camera) for camera in video], markers, why)
 
 
@@ -81,21 +81,21 @@ def _cameras(path: Path) -> list[_QualisysCamera]:
             cameras[-1].parts[name] = attributes
 
     def declared(*_: Any) -> None:
-        raise CaptureError(f"{path}: declares a document type, which QTM never does; export the calibration again")
+        raise CaptureError(f"{path} declares a document type, which QTM never does; export the calibration again")
 
     parser = expat.ParserCreate()
     parser.StartElementHandler = started
     parser.StartDoctypeDeclHandler = declared
     try:
         if path.stat().st_size > LARGEST_FILE:
-            raise CaptureError(f"{path}: is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
+            raise CaptureError(f"{path} is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
         parser.Parse(path.read_bytes(), True)
     except (OSError, expat.ExpatError, LookupError) as fault:
         raise CaptureError(
-            f"{path}: cannot be read as XML ({fault}); export the calibration from QTM as text (*.qca.txt)"
+            f"{path} cannot be read as XML ({fault}); export the calibration from QTM as text (*.qca.txt)"
         ) from fault
     if not cameras:
-        raise CaptureError(f"{path}: contains no cameras; export the calibration from QTM as text (*.qca.txt)")
+        raise CaptureError(f"{path} contains no cameras; export the calibration from QTM as text (*.qca.txt)")
     return cameras
 
 
@@ -110,7 +110,7 @@ def _lens(path: Path, camera: _QualisysCamera) -> LensCamera:
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise CaptureError(f"{where}: {part} has {key} = {given!r}; give a finite number")
+            raise CaptureError(f"{where}: {key} of {part} must be a finite number; got {given!r}")
         return value
 
     window = "fov_video_max" if "fov_video_max" in camera.parts else "fov_video"
@@ -121,7 +121,7 @@ def _lens(path: Path, camera: _QualisysCamera) -> LensCamera:
         ratio = sensor / pixels if pixels > 0 else 0.0
         if round(ratio) < 2 or abs(ratio - round(ratio)) > WHOLE or round(ratio) != (unit or [round(ratio)])[0]:
             raise CaptureError(
-                f"{where}: sensorMax{axis} is {sensor:g} for the {pixels + 1:g} pixels of {window}: {ratio:.3g} "
+                f"{where}: sensorMax{axis} is {sensor:g} for the {pixels + 1:g} pixels of {window}, i.e. {ratio:.3g} "
                 "subpixels per pixel instead of QTM's 64; export the calibration from QTM"
             )
         unit.append(float(round(ratio)))

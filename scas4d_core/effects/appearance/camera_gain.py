@@ -1,4 +1,4 @@
-"""Camera gains: a brightness factor per camera and channel, fixed or drifting.
+"""Camera gains: a fixed or drifting brightness factor per camera and channel.
 
 A gain is applied to linear light, before the sRGB curve. On the power part of the curve, s = 1.055 L^(1/2.4) − 0.055, a
 gain γ turns a value s into a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. One
@@ -27,9 +27,9 @@ from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, Update
 NAME = "camera_gain"
 POWER = 2.4
 """Exponent of the sRGB curve: a gain in linear light is the gain of s + 0.055 raised to this power."""
-# Measured spreads behind the thresholds: at most 0.011 on the five objects (on cloth) and 0.002 on stage, whose cameras
-# are identical; 0.025 on basketball, whose gains are known from frame 0 and which improves by 0.03 dB with the effect;
-# 0.078 to 0.094 on lamps.
+# Measured spreads on which the thresholds are based: at most 0.011 on the five objects (on cloth) and 0.002 on stage,
+# whose cameras are identical; 0.025 on basketball, whose gains are known from frame 0 and which improves by 0.03 dB
+# with the effect; 0.078 to 0.094 on lamps.
 
 
 def current_exposures(
@@ -38,7 +38,7 @@ def current_exposures(
     """Returns the [3, 2] exposure (gain and offset) of each camera, from the latest gains if there are any.
 
     Args:
-        exposures: exposure of each camera, as found in frame 0.
+        exposures: exposure of each camera, as estimated in frame 0.
         carried: arrays carried over by the effects, keyed by effect name.
         names: camera names of the rig, in rig order.
     """
@@ -70,16 +70,17 @@ class CameraGains(UpdatePart):
 
 
 def _centre(gains: Array) -> Array:
-    """Returns the [3] geometric mean over the cameras [C, 3]."""
+    """Returns the [3] geometric mean of gains [C, 3] over the cameras."""
     centre: Array = np.exp(np.log(gains).mean(axis=0))
     return centre
 
 
 def spread_of(seen: FrameObservation) -> float | None:
-    """Returns the standard deviation of the colour gains over the cameras, in linear light; None with too few cameras.
+    """Returns the standard deviation of colour gains over cameras, in linear light, or None with too few cameras.
 
-    The gains are estimated from the mean colours of images and renderings. The factor common to a camera's channels is
-    removed: an object in front of black that is glossy or rendered slightly too small changes all channels alike.
+    The gains are estimated from the mean colours of images and renderings. The factor common to all channels of a
+    camera is removed. Glossy objects in front of black, and objects that are rendered slightly too small, change all
+    channels alike.
     """
     spreads = []
     for view in seen.views:
@@ -104,11 +105,11 @@ class CameraGain(Effect):
         return (
             None
             if spread is None
-            else Evidence(min(1.0, spread), f"colour gains of the cameras differ by {spread:.1%}")
+            else Evidence(min(1.0, spread), f"colour gains differ by {spread:.1%} between cameras")
         )
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the gains to the plan; they need full images."""
+        """Adds gain estimation, which requires full images, to the plan."""
         builder.plan.full_images = builder.plan.camera_gains = True
         builder.parts.append(CameraGains(builder))
 
@@ -117,9 +118,9 @@ EFFECT = CameraGain(
     name=NAME,
     group=EffectGroup.APPEARANCE,
     description="Each camera has a gain per channel, which may drift.",
-    disambiguation="For each channel, the product over the cameras is 1: a change that all cameras share is lighting "
-    "and goes into the colours.",
-    cost="the median over about 4,000 pixels per iteration, 1 % of an update",
+    disambiguation="For each channel, the gains of all cameras multiply to 1; a change that all cameras share is "
+    "attributed to lighting and changes the colours.",
+    cost="a median over about 4,000 pixels per iteration, 1 % of the update time",
     auto=True,
     on_above=0.04,
     off_below=0.02,

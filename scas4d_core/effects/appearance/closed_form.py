@@ -29,7 +29,7 @@ MOST = 0.2
 """Limit on the residual of a pixel, RGB in 0…1; larger differences are not due to lighting. On `visit`, which a ball
 enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
 FEW = 1.0
-"""Blending weight, in pixels, added to that of each Gaussian, so that barely visible Gaussians keep their colours."""
+"""Number of pixels added to each Gaussian's blending weight, so that barely visible Gaussians keep their colours."""
 
 
 def follow_pictures(

@@ -59,7 +59,7 @@ def neighbourhoods(means: Array) -> NDArray[np.int64]:
 
 
 class DirectionPart(UpdatePart):
-    """Rotates the gloss with the deformation; does nothing if frame 0 has no gloss."""
+    """Rotates the gloss with the deformation, or does nothing if frame 0 has no gloss."""
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._roots = builder.first.means
@@ -77,10 +77,10 @@ class DirectionPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Direction(Effect):
-    """View-dependent colour; off unless frame 0 gives evidence."""
+    """View-dependent colour, which is off unless frame 0 provides evidence."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of the squared image error that the gloss removes, on a few views."""
+        """Returns the share of the squared image error in a few views that the gloss removes."""
         from scas4d_core.update.best_state import spread_cameras
 
         if seen.before.gloss is None:
@@ -94,10 +94,10 @@ class Direction(Effect):
             for which, features in enumerate((state.features(state.colours), None)):
                 left[which] += 10 ** (-seen.renderer.compare(state, view, features).psnr / 10)
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))
-        return Evidence(share, f"explains {100 * share:.0f} % of the residual")
+        return Evidence(share, f"view-dependent colour explains {100 * share:.0f} % of the residual")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part; full images are needed, because static surfaces look different in each frame too."""
+        """Adds the part and requests full images, because static surfaces also look different in each frame."""
         builder.plan.full_images = builder.plan.gloss = True
         builder.parts.append(DirectionPart(builder))
 
@@ -107,10 +107,10 @@ EFFECT = Direction(
     group=EffectGroup.APPEARANCE,
     description="Colour depends on the viewing direction: glossy objects reflect lights and surroundings, which stay "
     "fixed while the objects move.",
-    disambiguation="The environment sums to zero over the sphere: appearance that is the same from all directions is "
-    "colour.",
+    disambiguation="The environment sums to zero over the sphere; appearance that is the same from all directions is "
+    "attributed to colour.",
     cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes 50 % longer if the effect "
-    "is on",
+    "is switched on",
     auto=True,
     on_above=0.1,  # the trial measures 0.25 on `gloss` and at most 0.03 on the five objects
 )

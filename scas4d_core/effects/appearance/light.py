@@ -1,4 +1,4 @@
-"""Lighting that changes over time: colours adapt faster, those of moving Gaussians as fast as those of static ones.
+"""Changing light: colours adapt faster, and those of moving Gaussians as fast as those of static Gaussians.
 
 A lamp that moves or dims changes colours with few degrees of freedom: surfaces with similar orientation and position
 become brighter or darker together. This joint change is the evidence. The colours themselves adapt individually.
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.settings import Settings
 
-# Measured changes per frame behind the thresholds: at most 0.032 on the five objects (on robot, which turns fastest, so
-# that its shading changes under constant light), 0.012 on stage with its moving shadows, 0.023 to 0.061 on lamps while
-# the lamp moves.
+# Measured changes per frame on which the thresholds are based: at most 0.032 on the five objects (on robot, which turns
+# fastest and whose shading therefore changes under constant light), 0.012 on stage with its moving shadows, 0.023 to
+# 0.061 on lamps while the lamp moves.
 SAMPLE = 2000
-"""Number of Gaussians used for the evidence, or up to twice as many; only seven values per channel are estimated."""
+"""Approximate number of Gaussians used for the evidence (up to twice as many), for only seven estimates per channel."""
 OPAQUE = 0.3
-"""Minimum opacity at which a Gaussian's colour counts as that of a surface."""
+"""Minimum opacity at which a Gaussian's colour counts as the colour of a surface."""
 
 
 Double = NDArray[np.float64]
@@ -65,7 +65,7 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
         old = before.colours[rows, channel].astype(np.float64)
         change = after.colours[rows, channel] - old
         weighed = terms * old[:, None]
-        # seven unknowns: the normal equations are accurate enough
+        # with seven unknowns, the normal equations are accurate enough
         light = np.linalg.lstsq(weighed.T @ weighed, weighed.T @ change, rcond=None)[0]
         explained += float(np.square(weighed @ light).sum())
         total += float(np.square(old).sum())
@@ -97,8 +97,10 @@ class Light(Effect):
 EFFECT = Light(
     name="light",
     group=EffectGroup.APPEARANCE,
-    description="While the light changes, all colours adapt faster, those of moving Gaussians as fast as static ones.",
-    disambiguation="Colours include the lighting of their frame; differences between cameras and flicker are gains.",
+    description="While the lighting changes, all colours adapt faster; those of moving Gaussians adapt as fast as "
+    "those of static ones.",
+    disambiguation="Colours include the lighting of their frame; gains account for flicker and differences between "
+    "cameras.",
     cost="no measurable cost",
     auto=True,
     on_above=0.035,

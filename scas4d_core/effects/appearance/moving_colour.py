@@ -1,4 +1,4 @@
-"""Colours of moving Gaussians: their RGB is learnt from the images (Dynamic3DGaussians)."""
+"""RGB colours of moving Gaussians, learnt from the images (Dynamic3DGaussians)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MovingColour(Effect):
-    """Learns the RGB of moving Gaussians at the rate ``rate_colour``."""
+    """Learns the RGB colours of moving Gaussians with the learning rate ``rate_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Returns a refusal if the rate is 0."""
@@ -29,6 +29,6 @@ EFFECT = MovingColour(
     name="moving_colour",
     group=EffectGroup.APPEARANCE,
     description="The colours of moving Gaussians follow the images slowly, because shading changes as objects rotate.",
-    disambiguation="The mean absolute colour change is a loss term, so colours do not absorb motion or gains.",
+    disambiguation="The mean absolute colour change is a loss term, so colours do not compensate for motion or gains.",
     cost="one Adam step over RGB per iteration, shared with the other colours",
 )

@@ -1,8 +1,8 @@
 """Shading of moving Gaussians: their colours follow the images once per frame, in closed form, as objects turn.
 
-Adam at a rate low enough not to absorb motion cannot follow the shading of turning objects: the error carries over to
-the next frame and grows. At the end of an update the motion is known, so the remaining residual is a change of
-appearance (``closed_form``).
+With a learning rate low enough not to absorb motion, Adam cannot follow the shading of turning objects, and the error
+carries over to the next frame and grows. At the end of an update, the motion is known, so the remaining residual is a
+change of appearance (``closed_form``).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Moving shadows and light: the colours of static Gaussians follow the images once per frame, in closed form.
 
-At the end of an update, the colours of static Gaussians take the steps of ``closed_form``. This happens only in frames
-in which the static scene looks different from frame 0. In other frames it would fit noise and disagreement between
+At the end of an update, the colours of static Gaussians take the steps of ``closed_form``. This only happens in frames
+in which the static scene looks different from frame 0. In other frames, it would fit noise and disagreement between
 cameras.
 """
 
@@ -32,10 +32,10 @@ NAME = "shadows"
 CHANGED = 0.02
 """Difference of a mean colour, RGB in 0…1, above which a square looks different from frame 0."""
 HARDLY = 0.005
-"""Share of changed static squares up to which nothing is learnt from a frame. With a tenth of this value, `basketball`
-gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""
+"""Maximum share of changed static squares at which nothing is learnt from a frame. With a tenth of this value,
+`basketball` gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""
 ENOUGH = 0.5
-"""Minimum share of frame 0's cameras for learning from a frame: with few cameras, their noise would be learnt."""
+"""Minimum share of frame 0's cameras that a frame must have to be learnt; with fewer, noise would be learnt."""
 STANDS = 0.05
 """Minimum share of static Gaussians; with fewer, there is no background for shadows."""
 
@@ -70,7 +70,7 @@ class Shadows(Effect):
         return refusal_at_zero(settings, "rate_static_colour")
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns [h, w, 4] float16 per view: the mean colour of each square, and 1 where moving Gaussians reach it."""
+        """Returns a [h, w, 4] float16 array per view: each square's mean colour, and 1 if moving Gaussians reach it."""
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:
@@ -84,11 +84,11 @@ class Shadows(Effect):
         return arrays
 
     def on_at_first(self, seen: FrameObservation) -> bool:
-        """Returns true if enough of the scene is static."""
+        """Returns whether enough of the scene is static."""
         return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of squares, static in frame 0 and now, that have changed since frame 0."""
+        """Returns the share of changed squares among all squares that are static both in frame 0 and now."""
         before: Arrays = seen.result.carried.get(NAME, {})
         if seen.result.gaussians.moving.all():
             return None
@@ -119,7 +119,7 @@ def _means(view: TrainingView) -> Array:
 def _compared(
     before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns [h, w] masks of changed squares, and of squares that moving Gaussians reach neither then nor now."""
+    """Returns [h, w] masks of changed squares, and of squares that moving Gaussians reach in neither frame."""
     changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
     return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
 

@@ -1,4 +1,4 @@
-"""Colours of static Gaussians: their RGB is learnt from the images (Dynamic3DGaussians)."""
+"""RGB colours of static Gaussians, learnt from the images (Dynamic3DGaussians)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StaticColour(Effect):
-    """Learns the RGB of static Gaussians at the rate ``rate_static_colour``."""
+    """Learns the RGB colours of static Gaussians with the learning rate ``rate_static_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Returns a refusal if the rate is 0."""
@@ -29,8 +29,8 @@ class StaticColour(Effect):
 EFFECT = StaticColour(
     name="static_colour",
     group=EffectGroup.APPEARANCE,
-    description="The colours of static Gaussians follow the images in every iteration; on only if pinned.",
-    disambiguation="The mean absolute colour change is a loss term, so colours do not absorb motion or gains.",
+    description="If pinned on, the colours of static Gaussians follow the images in every iteration.",
+    disambiguation="The mean absolute colour change is a loss term, so colours do not compensate for motion or gains.",
     cost="full-image rendering and one Adam step over RGB per iteration",
     auto=True,
 )

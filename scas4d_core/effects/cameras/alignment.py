@@ -21,24 +21,24 @@ LOOKED_AT = 4096
 MOST = 1000
 """Approximate maximum number of informative pixels that are used; more pixels hardly improve the estimate."""
 STEEP = 0.02
-"""Minimum gradient magnitude, in values of 0…1 per pixel, of an informative pixel; flatter pixels show noise."""
+"""Minimum gradient magnitude of an informative pixel, for values in 0…1; flatter pixels mostly show noise."""
 CAUCHY = 2.4
 """Residual, as a multiple of its usual size, at which the Cauchy weight is one half (95 % efficiency for Gaussian
 noise).
 """
 QUIETEST = 1 / 255
-"""Lower bound of the usual residual, 0…1: the quantization of 8-bit images."""
+"""Lower bound on the usual residual, for values in 0…1: the quantization step of 8-bit images."""
 FEW = 50
 """Minimum number of informative pixels for an estimate."""
 TURNED, SHIFTED = 4.0, 0.25
 """Prior standard deviations, in pixels, of a rotation and of a translation (at the depth of the image centre). Tripods
 sag or are knocked, which rotates a camera more than it translates it. The prior decides when the two look alike. With 1
-pixel of translation, and a prior per step instead of for the total, rotations of 0.5° were compensated by translations
-of 1 cm."""
+pixel for translations, and a prior on each step instead of on the total, rotations of 0.5° were compensated by
+translations of 1 cm."""
 SMALLEST = 1e-9
 """Regularization, relative to the trace, of equations that may be singular."""
 RESIDUAL_SCALE = 0.02
-"""Residual, 0…1, at which ``FEW`` pixels with a gradient of 1 weigh as much as the prior."""
+"""Residual, in 0…1, at which ``FEW`` pixels with a gradient of 1 weigh as much as the prior."""
 
 
 class AlignedPixels(NamedTuple):
@@ -76,7 +76,7 @@ class Equations(NamedTuple):
 
 
 def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels | None:
-    """Samples an image and its rendering at informative pixels; returns None if there are too few.
+    """Samples an image and its rendering at informative pixels, or returns None if there are too few such pixels.
 
     Args:
         target: [3, H, W] image.
@@ -139,7 +139,7 @@ def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equatio
     Args:
         seen: image and rendering at the informative pixels.
         moved: [2, K, P] pixel displacements per unit of each of the K unknowns.
-        depth: depth of the image centre, see ``Equations``.
+        depth: depth of the image centre; see ``Equations``.
     """
     residual = (seen.target - seen.shown).astype(np.float64).reshape(-1)
     terms = -np.einsum("cdp,dkp->kcp", seen.slopes.astype(np.float64), moved).reshape(moved.shape[1], -1)
@@ -162,7 +162,7 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
     """Returns the normal equations of a twist, in six unknowns.
 
     Args:
-        lens: camera parameters, see ``flow``.
+        lens: camera parameters; see ``flow``.
         seen: image and rendering at the informative pixels.
         depth: [H, W] depth along z, in metres; NaN (nothing rendered) is replaced by the median depth.
     """
@@ -197,13 +197,13 @@ def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
 
 
 def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
-    """Returns the [6] increment of a twist; a prior keeps the total twist small if the image constrains it weakly.
+    """Returns the [6] increment of a twist. A prior keeps the total twist small if the image constrains it weakly.
 
     Args:
         one: equations of the camera.
-        lens: camera parameters, see ``flow``.
+        lens: camera parameters; see ``flow``.
         twist: [6] current twist of the camera, with its translation in metres.
-        vector: [6] replacement for the vector of the equations, if given.
+        vector: [6] vector to use instead of the equations' own vector, or None.
     """
     focal, units = float(lens[0] + lens[1]) / 2, np.array([one.depth] * 3 + [1.0] * 3)
     before = np.array([(focal / SHIFTED) ** 2] * 3 + [(focal / TURNED) ** 2] * 3)

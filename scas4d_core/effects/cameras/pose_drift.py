@@ -3,12 +3,12 @@
 Once per frame, after the update, renderings of some cameras are compared with their images. The rotation that would
 align them is recorded as the camera's offset from its calibration. A single frame is unreliable, because moving objects
 are tracked with a delay. A camera counts as moved if offsets from earlier frames explain its current residual, and if
-the offset is at least ``LEAST`` pixels. Its pose then follows by half of the difference per frame. The poses of all
-other cameras stay bit-identical.
+the offset is at least ``LEAST`` pixels. Its pose is then corrected by half of the difference per frame. The poses of
+all other cameras stay bit-identical.
 
 Later frames use these poses for their training views: masks move with their camera, and probe views and new Gaussians
 use the current pose. Views requested by users are rendered with the given camera, so "as camera 7" means as calibrated.
-Exclusion of cameras is decided earlier (``robust.outliers``). A misaligned camera is still excluded, but it is
+Exclusion of cameras is decided earlier (``robust.outliers``). A misaligned camera is still excluded, but its offset is
 measured. It is accepted again once its pose is found, and stays excluded if the correction exceeds the limit. Camera
 gains are medians over pixels and are hardly affected by small shifts. ``shadows`` may learn in such frames, but from
 all cameras.
@@ -51,22 +51,23 @@ if TYPE_CHECKING:
 
 NAME = "pose_drift"
 CAMERAS = 4
-"""Minimum number of cameras for detecting a misaligned one; with fewer, moving Gaussians could explain the difference.
+"""Minimum number of cameras to detect a misaligned one; with fewer, moving Gaussians could explain the difference.
 """
 ENOUGH = 0.5
 """Minimum share of the rig's cameras that a frame must contain to be used."""
 LEAST = 0.25
 """Minimum offset of a suspect camera, in pixels. Fixed cameras have at most 0.15 on captures, 0.4 on shaken cloth."""
 TIMES = 4.0
-"""Minimum ratio of its offset to the median over cameras: if many cameras appear to be off, the tracking lags."""
-# Measurements behind the effect's threshold: captures with fixed cameras, at half size, have shares of at most 0.14 on
-# cloth played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
+"""Minimum ratio of a suspect camera's offset to the median offset; if many cameras seem to be off, the tracking
+lags."""
+# Measurements on which the effect's threshold is based: at half size, captures with fixed cameras have shares of at
+# most 0.14 on cloth played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
 SHARE = 0.5
 """Share of the difference by which poses and recorded offsets are updated per frame. A drift is tracked with a lag of
-one frame's change, and a frame in which the tracking lags does half the harm."""
+one frame's change, and a frame in which the tracking lags causes only half of the error."""
 STANDING = 6
-"""Number of fixed cameras, different ones in each frame, that are rendered while the effect is on. They show which part
-of a twist is motion of the scene."""
+"""Number of fixed cameras that are rendered while the effect is on (different cameras in each frame). They show which
+part of a twist is scene motion."""
 LARGEST, TURN = 0.02, radians(1)
 """Maximum pose correction, as a share of the image width and as an angle. A camera that is off by more has been moved
 and stays excluded."""
@@ -78,7 +79,7 @@ SMALLEST = 1e-3
 
 
 def rig_with_drift(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
-    """Returns the rig with the current poses; the given rig if no camera has moved.
+    """Returns the rig with the current poses, or the given rig if no camera has moved.
 
     Args:
         rig: calibrated cameras in the internal world.
@@ -100,9 +101,9 @@ class Poses:
 
     Attributes:
         twists: [C, 6] float64 corrections of the calibration: translation (metres) and rotation, in camera axes.
-        moved: [C, 3] corrections at the last measurement, in pixels, see ``alignment.pixel_offset``.
+        moved: [C, 3] corrections at the last measurement, in pixels; see ``alignment.pixel_offset``.
         offsets: [C, 3] exponential moving average of the measured offsets from the calibration, in pixels.
-        shares: [C] exponential moving average of the share of the residual that earlier offsets explain, 0…1.
+        shares: [C] exponential moving average of the share of the residual (0…1) that earlier offsets explain.
         observations: [C] number of frames in which the camera was measured.
     """
 
@@ -126,7 +127,7 @@ class Poses:
         return {**arrays, "twists": self.twists} if self.twists.any() else arrays
 
     def record_offset(self, row: int, turn: Equations) -> None:
-        """Records the offset of a camera that its residual shows.
+        """Records a camera's offset, estimated from its residual.
 
         Args:
             row: row of the camera.
@@ -165,11 +166,11 @@ def step_twists(
 ) -> Double:
     """Returns the [C, 6] twists after a frame, updated for the cameras in ``follow``.
 
-    Scene motion that the other cameras see too is removed first.
+    Scene motion that the other cameras also see is removed first.
 
     Args:
         twists: [C, 6] twists before the frame.
-        aligned: maps the row of a camera to its equations, the camera with its current pose, and its lens.
+        aligned: maps each camera's row to its equations, the camera with its current pose, and its lens parameters.
         follow: [C] mask of the cameras whose twists are updated.
     """
     matrix, vector = np.eye(6) * 1e-6, np.zeros(6)
@@ -195,7 +196,7 @@ def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
 
 
 def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
-    """Returns the [C, 6] twists without the twist that most cameras share, which is motion of the scene.
+    """Returns the [C, 6] twists without the twist that most cameras share, which is scene motion.
 
     The shared twist is the median of each component, in world axes, over the accepted cameras. With a mean, a camera
     that is off by 3 pixels would move the other cameras, and the world with them.
@@ -260,10 +261,10 @@ class PoseDrift(Effect):
         if shares[row] == 0:
             return Evidence(0.0, "")
         size = float(np.linalg.norm(poses.offsets[row]))
-        return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is off by {size:.1f} pixels")
+        return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is misaligned by {size:.1f} pixels")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Does nothing: the update gets the poses through its views."""
+        """Does nothing, because the update gets the poses through its views."""
 
 
 def _says(seen: FrameObservation) -> bool:
@@ -314,8 +315,9 @@ def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]
 EFFECT = PoseDrift(
     name=NAME,
     group=EffectGroup.CAMERAS,
-    description="Cameras drift, or are knocked by a few pixels: their poses follow the images once per frame.",
-    disambiguation="The median twist over the cameras is 0: motion that most cameras share is motion of the scene.",
+    description="Cameras drift or are knocked by a few pixels; their poses are re-estimated from the images in each "
+    "frame.",
+    disambiguation="The median twist over the cameras is 0; motion that most cameras share is attributed to the scene.",
     cost="samples of eight renderings per frame; while on, one rendering of each misaligned camera and of six others",
     auto=True,
     on_above=0.2,

@@ -31,7 +31,7 @@ class AxisLength(Effect):
 EFFECT = AxisLength(
     name="axis_length",
     group=EffectGroup.COHERENCE,
-    description="No axis of a Gaussian grows beyond its length in frame 0 or 2 cm, whichever is longer.",
+    description="Axes longer than both 2 cm and their length in frame 0 are penalized.",
     disambiguation="The limits come from frame 0.",
     cost="none measurable: it is part of the cascade's backward pass",
 )

@@ -4,10 +4,10 @@ The loss term ``rotation`` is a sum of norms of differences, so it removes rotat
 finds rigid parts, but in swinging cloth it removes nearly all rotation differences. In bending scenes the term is
 therefore switched off. Rigidity, which couples positions to these rotations, fades to zero during an update.
 
-The evidence uses only positions, so it is comparable with and without these terms. It measures patches that each
+The evidence only uses positions, so it is comparable with and without these terms. It measures patches that each
 contain about a hundredth of the moving Gaussians. The evidence is the median rotation of a patch relative to the
 surrounding patches, minus the part of its motion that is not a rotation. Joints affect few patches, and badly tracked
-patches do not move rigidly, so neither gives evidence.
+patches do not move rigidly, so neither provides evidence.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 SAMPLE = 4000
-"""Number of sampled Gaussians, or up to twice as many, so that a patch covers the same part of an object in all states.
+"""Approximate number of sampled Gaussians (up to twice as many); patches then have a similar extent in all states.
 """
 PATCH = 40
 """Number of Gaussians in a patch in addition to its centre; with fewer, the rotation is too noisy."""
 PATCHES = 400
-"""Number of patches, or up to twice as many; the evidence is their median."""
+"""Approximate number of patches (up to twice as many); the evidence is the median over patches."""
 AROUND = 19
 """Number of nearest patches with which a patch is compared; together they cover a twentieth of the object."""
 REST = 1e-3
-"""Minimum motion relative to the extent of the moving Gaussians; if 90 % move less, the frame gives no evidence."""
+"""Minimum motion relative to the extent of the moving Gaussians; if 90 % move less, the frame provides no evidence."""
 
-# Measurements behind the thresholds, in radians: at least 0.030 on swinging `cloth` while the effect is off, also
-# played backwards and with half of the cameras, and at least 0.037 while it is on. All other captures have at most
-# 0.004 while it is off, and 0.014 with rotation pinned off.
+# Measurements on which the thresholds are based, in radians: on swinging `cloth`, at least 0.030 while the effect is
+# off (also when played backwards or with half of the cameras), and at least 0.037 while it is on. All other captures
+# have at most 0.004 while it is off, and 0.014 with rotation pinned off.
 
 Double = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def patch_rotations(before: Double, after: Double) -> tuple[Double, Double]:
 
 
 def measure_bending(before: Gaussians, after: Gaussians) -> float | None:
-    """Returns the median rotation of patches relative to surrounding patches, in radians; None if too little moves.
+    """Returns the median rotation of patches relative to surrounding patches, in radians, or None if too little moves.
 
     Args:
         before, after: Θ_{t−1} and Θ_t, with the same Gaussians.
@@ -98,7 +98,7 @@ class Bending(Effect):
         """Returns a refusal if the rotation term, which this effect removes, is pinned or has weight 0."""
         mode = settings.effects.get("rotation", "auto")
         if mode != "auto":
-            return f"effects.rotation is '{mode}'", "leave effects.rotation 'auto'"
+            return f"effects.rotation is '{mode}'", "set effects.rotation to 'auto'"
         return refusal_at_zero(settings, "weights.rotation")
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 FLOOR_WEIGHT = 2.0
-"""Weight of the term; that of the image loss is 1 (Dynamic3DGaussians). To disable the term, leave the floor unset."""
+"""Weight of the term (Dynamic3DGaussians); the image loss has weight 1. To disable the term, leave the floor unset."""
 
 
 def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
@@ -34,7 +34,7 @@ def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
     normal = np.asarray(plane[:3], dtype=np.float64)
     length = float(np.linalg.norm(normal))
     if not length > 0:
-        raise ValueError(f"floor {tuple(plane)} has no direction; give (a, b, c, d) with (a, b, c) pointing down")
+        raise ValueError(f"floor {tuple(plane)} has a zero normal; use (a, b, c, d) with (a, b, c) pointing down")
     normal = normal / length
     offset = (float(normal @ world.origin) + plane[3] / length) * world.metres_per_unit
     return float(normal[0]), float(normal[1]), float(normal[2]), offset

@@ -23,7 +23,7 @@ MOVES = (
 
 
 def may_be_on(name: str, settings: Settings) -> bool:
-    """Returns true if the settings neither pin an effect off nor contradict it."""
+    """Returns whether the settings neither pin an effect off nor contradict it."""
     return settings.effects.get(name) != "off" and effect(name).refusal(settings) is None
 
 
@@ -32,10 +32,10 @@ class FreeColumns(Effect):
     """An effect that enables the parameters of the same name (``engines.freedom.Freedom``)."""
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a requirement if no effect could move anything otherwise."""
+        """Returns a requirement if nothing could move without this effect."""
         if any(may_be_on(name, settings) for name in MOVES):
             return None
-        return "no effect could move clusters or Gaussians", f"leave one of {', '.join(MOVES)} 'auto'"
+        return "no effect could move clusters or Gaussians", f"set at least one of {', '.join(MOVES)} to 'auto'"
 
     def register(self, builder: PlanBuilder) -> None:
         """Enables the parameters."""

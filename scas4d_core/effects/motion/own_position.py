@@ -12,6 +12,6 @@ EFFECT = FreeColumns(
     name="own_position",
     group=EffectGroup.MOTION,
     description="Each Gaussian may move away from the position given by its clusters.",
-    disambiguation="It learns last and slowly, so it finds only motion that the clusters do not explain.",
+    disambiguation="It is learnt last and slowly, so it captures only motion that the clusters do not explain.",
     cost="1 % of an update, together with own_rotation and own_scale",
 )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OwnScale(FreeColumns):
-    """Log scale Δs, learnt at the rate ``rate_scale``."""
+    """Log scale Δs, learnt with the learning rate ``rate_scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Returns a refusal if the rate is 0."""
@@ -28,6 +28,6 @@ EFFECT = OwnScale(
     name="own_scale",
     group=EffectGroup.MOTION,
     description="Each Gaussian's axes may grow and shrink.",
-    disambiguation="Axis lengths are limited, and it learns last and slowly.",
+    disambiguation="Axis lengths are limited, and changes are learnt last and slowly.",
     cost="1 % of an update, together with own_position and own_rotation",
 )

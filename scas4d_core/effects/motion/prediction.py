@@ -24,11 +24,11 @@ class Prediction(Effect):
     """Starts an update from the previous motion."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if every effect whose parameters it extrapolates is pinned off."""
+        """Returns a refusal if all effects whose parameters are extrapolated are pinned off."""
         carried = CLUSTERS if settings.update.momentum == 0 else CLUSTERS + OWN
         if any(settings.effects.get(name) != "off" for name in carried):
             return None
-        return f"{' and '.join(carried)} are 'off'", "leave one of them 'auto'"
+        return f"{' and '.join(carried)} are 'off'", "set at least one of them to 'auto'"
 
     def register(self, builder: PlanBuilder) -> None:
         """Lets the update start from the previous motion."""
@@ -38,7 +38,7 @@ class Prediction(Effect):
 EFFECT = Prediction(
     name="prediction",
     group=EffectGroup.MOTION,
-    description="An update starts from the motion of the previous frame, if that fits the frame better.",
-    disambiguation="It sets only the start; the images decide where the update ends.",
+    description="An update starts from the motion of the previous frame if that fits the new frame better.",
+    disambiguation="It affects only the starting point; the images determine the result.",
     cost="one comparison of half-size images of four views per update",
 )

@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 AGREE = 4
-"""Minimum number of cameras that see a voxel as new; in a rig of twenty, three can agree on a ghost."""
+"""Minimum number of cameras that see a voxel as new; in a rig of twenty cameras, three can agree on a ghost."""
 MISSES = 0.1
 """Maximum share of the counted cameras that see a voxel as free; outlines can be off by a pixel."""
 COARSE = 32
@@ -31,7 +31,8 @@ COARSE = 32
 VOXEL_PIXELS = 1.5
 """Maximum edge of the smallest voxel, in pixels at the centre of the scene."""
 MAX_CELLS = 1 << 24
-"""Maximum number of grid cells for separating new objects; voxels that need a larger grid are no object."""
+"""Maximum number of grid cells for separating new objects; voxels that need a larger grid are not treated as an
+object."""
 MAX_VOXELS = 1_000_000
 """Maximum number of voxels in a level; refinement stops before this limit is exceeded."""
 AT_ONCE = 1 << 16
@@ -58,7 +59,7 @@ class Hull:
     voxel: float
 
     def only(self, kept: Bool) -> Hull:
-        """Returns the hull with only the voxels in ``kept`` [V]."""
+        """Returns the hull with only the voxels selected by the mask ``kept`` [V]."""
         return Hull(self.points[kept], self.surface[kept], self.things[kept], self.voxel)
 
 
@@ -91,7 +92,7 @@ def _depth_of(one: Novelty, point: Float) -> float:
 
 
 def _distance(pixels: Bool) -> Float:
-    """Returns the [H, W] distance of each pixel to the nearest true pixel, in pixels; infinity if there is none."""
+    """Returns the [H, W] distances to the nearest true pixel, in pixels, or infinity if there is no such pixel."""
     if not pixels.any():
         return np.full(pixels.shape, np.inf)
     result: Float = distance_transform_edt(~pixels)
@@ -170,7 +171,7 @@ def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
 
 
 def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Returns the median colour [P, 3] over the cameras that see a point as new, NaN if none do, and their number [P].
+    """Returns the median colour [P, 3] over the cameras that see a point as new (NaN if none do), and their number [P].
 
     Args:
         seen: novelty map of each camera.

@@ -31,10 +31,10 @@ NAME = "entering"
 MIN_CAMERAS = 2
 """Minimum number of screened cameras that see something new before all cameras are checked."""
 SMALLEST = 0.003
-"""Minimum share of new pixels in an image for a camera to count: 200 of 256 x 256. Moving objects that are tracked with
-a lag leave fewer."""
+"""Minimum share of new pixels in an image for a camera to count (200 of 256 x 256). Moving objects that are tracked
+with a lag leave fewer new pixels."""
 SHARE = 0.05
-"""Minimum share of the squared error of all images that an object explains, to switch the effect on."""
+"""Minimum share of all images' squared error that an object must explain to switch the effect on."""
 WORTH = 0.01
 """Minimum share of the error for adding Gaussians while the effect is on."""
 SURPLUS = 0.5
@@ -44,9 +44,9 @@ BORDER, SUDDEN = 0.5, 0.2
 the border. The second is the minimum share of the error for an object that appears elsewhere. A limb that is tracked
 with a lag can look like such an object: 0.07 in `stage`."""
 TINY = 1e-12
-"""Lower bound of a sum of squared errors, to avoid division by zero."""
+"""Lower bound on a sum of squared errors, to avoid division by zero."""
 SETTLED = 4
-"""Number of frames in which an added Gaussian is still refined outside the update."""
+"""Number of frames for which an added Gaussian is still refined outside the update."""
 DENIED = 0.5
 """An added Gaussian is retired if more than this share of the cameras that have it in view see something else there.
 This is checked once, when the Gaussian is settled."""
@@ -62,9 +62,9 @@ NO_NEWBORNS: Arrays = {
     "share": np.array(0.0),
     "cameras": np.array(0),
 }
-"""Carried arrays before any Gaussian is added."""
+"""Initial carried arrays, before any Gaussian is added."""
 NEWBORN_ARRAYS = ("newborn", "thing", "centres", "volumes", "places")
-"""Arrays that describe only the last frame, see ``NewbornTracking``."""
+"""Arrays that only describe the last frame; see ``NewbornTracking``."""
 BUDGET = 0.1
 """Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
@@ -87,7 +87,7 @@ class EnteredThings:
 
 
 def find_entered(seen: FrameObservation) -> EnteredThings | None:
-    """Returns the objects in a frame that the state does not contain; None if there are none."""
+    """Returns the objects in a frame that the state does not contain, or None if there are none."""
     if sum(_says(one) for one in screen_novelty(seen, MIN_CAMERAS, new=SMALLEST)) < MIN_CAMERAS:
         return None
     everyone = novelty_of_views(seen, seen.views)
@@ -120,7 +120,7 @@ def _says(one: Novelty) -> bool:
 
 
 def _find_denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
-    """Returns the [P] mask of means at which most cameras see that there is no object."""
+    """Returns the [P] mask of means at which most cameras see no object."""
     against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
     for one in seen:
         column, row, _, inside = pixels_inside(one.camera, means)
@@ -159,7 +159,7 @@ class Entering(Effect):
     """Adds Gaussians in frames that show objects missing from the state."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the error share that new objects explain, or the recorded one while added Gaussians are present."""
+        """Returns the error share that new objects explain, or the recorded share while added Gaussians are present."""
         if not seen.views:
             return None
         left = seen.result.carried.get(NAME)
@@ -169,7 +169,7 @@ class Entering(Effect):
         return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """Adds Gaussians for new objects, and refines those added in recent frames."""
+        """Adds Gaussians for new objects, and refines Gaussians added in recent frames."""
         from scas4d_core.effects.presence.newborn_fit import fit_newborns, refine_newborns, sample_seeds
 
         result, things = seen.result, find_entered(seen)
@@ -215,7 +215,9 @@ class Entering(Effect):
 
 
 def _evidence(share: float, cameras: int) -> Evidence:
-    return Evidence(share, f"an object entered: {cameras} cameras agree, it explains {100 * share:.0f} % of the error")
+    return Evidence(
+        share, f"an object entered: {cameras} cameras agree, and it explains {100 * share:.0f} % of the error"
+    )
 
 
 EFFECT = Entering(
@@ -223,7 +225,7 @@ EFFECT = Entering(
     group=EffectGroup.PRESENCE,
     description="Objects enter the scene: Gaussians are added where several cameras see something unexplained.",
     disambiguation="Only pixels that no moving Gaussian covers count, minus those that the state covers wrongly.",
-    cost="a check of the last renderings; when an object enters, about one more update",
+    cost="a check of the last renderings; when an object enters, about as much time as another update",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

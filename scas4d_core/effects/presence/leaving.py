@@ -27,12 +27,12 @@ SHARE, IDLE_SHARE = 0.02, 0.002
 """Shares of the moving Gaussians outside all images at which the effect switches on, and below which it may switch off.
 """
 FRAMES = 2
-"""Number of consecutive frames outside all images before a Gaussian is retired; at the border, objects come and go."""
+"""Number of consecutive frames outside all images before a Gaussian is retired; objects at the border come and go."""
 ABOUT = 0.1
 """Distance, relative to the moving extent, within which a visible Gaussian keeps its neighbours from being retired. The
 visible half of an object still guides the other half."""
 WIDTHS = 3.0
-"""Extent of a Gaussian in standard deviations, all of which must be outside the image."""
+"""Extent of a Gaussian in standard deviations; the entire extent must be outside the image."""
 
 
 def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
@@ -91,11 +91,11 @@ class Leaving(Effect):
         return replace(seen.result, gaussians=state.retire(gone) if gone.any() else state, carried=carried)
 
     def register(self, builder: PlanBuilder) -> None:
-        """Does nothing: Gaussians are retired after the update of a frame."""
+        """Does nothing, because Gaussians are retired after a frame's update."""
 
 
 def _evidence(share: float) -> Evidence:
-    return Evidence(share, f"{100 * share:.0f} % of the moving Gaussians have left all images" if share else "")
+    return Evidence(share, f"{100 * share:.0f} % of the moving Gaussians are outside all images" if share else "")
 
 
 EFFECT = Leaving(

@@ -26,7 +26,7 @@ class MaskTerm(Effect):
             return "update.use_masks is false", "set it to true"
         if update.weights.mask > 0 or update.weights.mask_alone > 0:
             return None
-        return "update.weights.mask and update.weights.mask_alone are 0", "set one of them above 0"
+        return "update.weights.mask and update.weights.mask_alone are 0", "set at least one of them above 0"
 
     def register(self, builder: PlanBuilder) -> None:
         """Adds the loss term with its weight."""
@@ -39,7 +39,8 @@ EFFECT = MaskTerm(
     name="mask_term",
     group=EffectGroup.PRESENCE,
     description="With masks, moving and static Gaussians must cover the pixels that the masks assign to them.",
-    disambiguation="Labels are fixed in frame 0 and are not parameters: the term moves Gaussians without relabelling.",
-    cost="a fourth channel in addition to RGB, forward and backward; nothing without masks",
+    disambiguation="Labels are fixed in frame 0 and are not parameters: the term moves Gaussians, but never relabels "
+    "them.",
+    cost="a fourth channel in addition to RGB, forward and backward; no cost without masks",
     without_masks=False,
 )

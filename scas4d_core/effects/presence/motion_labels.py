@@ -25,5 +25,5 @@ EFFECT = MotionLabels(
     group=EffectGroup.PRESENCE,
     description="Without masks, only Gaussians that most cameras have seen in changed pixels move.",
     disambiguation="A Gaussian that has moved once may always move: labels are only added, never removed.",
-    cost="a comparison of each view with the previous frame; static Gaussians save more time than that takes",
+    cost="a comparison of each view with the previous frame, which takes less time than static Gaussians save",
 )

@@ -3,9 +3,9 @@
 A static Gaussian inside the silhouettes of nearly all cameras is inside a moving object and moves with it. The fit
 learns labels only on the outside of an object. A static Gaussian left inside becomes a ghost when the object leaves.
 
-Without masks, a pixel counts as changed if it differs from the previous frame. A Gaussian moves if most cameras that
-see it have it in changed pixels. Background behind the new position of an object changes for some cameras but not for
-most.
+Without masks, a pixel counts as changed if it differs from the previous frame. A Gaussian counts as moving if it is in
+changed pixels of most cameras that see it. Background behind the new position of an object changes for some cameras but
+not for most.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scas4d_core.posed_pictures import pixels_inside
 Array = NDArray[np.float32]
 
 CHANGE = 0.04
-"""Difference of a colour channel, 0…1, above which a pixel has changed; it is above sensor and JPEG noise."""
+"""Difference of a colour channel (0…1) above which a pixel has changed; it exceeds sensor and JPEG noise."""
 REACH_PIXELS = 5
 """Side of the square marked around a changed pixel, because the inside of a plain surface moves without changing."""
 SEEN_PIXELS = 0.02
@@ -39,27 +39,28 @@ STANDING_SHARE = 0.1
 """Minimum share of static Gaussians in a scene with a static part; below it, static labels are noise."""
 
 INSIDE_SHARE = 0.8
-"""Minimum share of the cameras with a mask and with a Gaussian in view whose masks must contain its mean, for it to
-count as inside a moving object. Automatic masks are ragged; 0.7 to 0.9 fades the ghosts of `basketball` equally well.
+"""A Gaussian counts as inside a moving object if at least this share of the masks contains its mean. Only cameras with
+a mask and with the Gaussian in view are considered. Automatic masks are ragged; 0.7 to 0.9 fades the ghosts of
+`basketball` equally well.
 """
 INSIDE_CAMERAS = 3
-"""Minimum number of such cameras; the intersection of only two silhouettes contains much empty space."""
+"""Minimum number of cameras for this vote; the intersection of only two silhouettes contains much empty space."""
 
 FIRST_LABELS = 32
-"""Minimum number of moving Gaussians for learning the first labels: a mouse in a room is a few hundredths of a percent
-of the scene. Before that, frames that the state already explains are skipped (``robust.solve_frame``); in other frames
-all Gaussians may move."""
+"""Minimum number of moving Gaussians for learning the first labels. A mouse in a room makes up only a few hundredths of
+a percent of the scene. Before that, frames that the state already explains are skipped (``robust.solve_frame``); in
+other frames all Gaussians may move."""
 NEW_LABELS = 0.01
-"""Share of all Gaussians that must be newly found moving before the hierarchy is rebuilt."""
+"""Share of all Gaussians that must be newly detected as moving before the hierarchy is rebuilt."""
 MORE_LABELS = 0.2
-"""The same as a share of the moving Gaussians; the smaller of the two numbers is sufficient."""
+"""Same as ``NEW_LABELS``, but as a share of the moving Gaussians; the smaller of the two numbers is sufficient."""
 
 
 def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
     """Returns the Gaussians of frame 0 with the initial labels of the scene.
 
     Args:
-        gaussians: Gaussians as fitted to frame 0.
+        gaussians: Gaussians fitted to frame 0.
         rig: rig in the internal world, at the size of the masks.
         masks: [H, W] mask of each camera in frame 0, non-zero on the foreground; empty if there are no masks.
     """
@@ -67,12 +68,12 @@ def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.
 
 
 def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
-    """Returns the Gaussians with those in the visual hull of the masks labelled as moving (Laurentini 1994).
+    """Labels all Gaussians in the visual hull of the masks (Laurentini 1994) as moving, and returns the new state.
 
     If no Gaussian is static, or none moves, the labels cannot be extended and are unchanged.
 
     Args:
-        gaussians, rig, masks: as in ``first_labels``.
+        gaussians, rig, masks: see ``first_labels``.
     """
     static = ~gaussians.moving
     if not masks or not static.any() or static.all():
@@ -97,8 +98,9 @@ def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, ND
 def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
     """Returns the Gaussians of frame 0, all labelled as moving if only a few are static.
 
-    These few belong to an object, but no mask determined their label. They would stay behind and hide the object when
-    it moves. If all Gaussians may move, a static background forms clusters that do not move.
+    These few static Gaussians belong to an object, but no mask determined their label. They would stay behind and hide
+    the object when it moves.
+    If all Gaussians may move, a static background forms clusters that do not move.
 
     >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
     >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
@@ -158,12 +160,12 @@ def learn_labels_from_motion(
     now: Sequence[TrainingView],
     renderer: Renderer,
 ) -> NDArray[np.bool_] | None:
-    """Returns the [N] mask of Gaussians that have moved so far; None if too few are new or too few have moved at all.
+    """Returns the [N] mask of Gaussians that have moved so far, or None if too few are new or too few have moved.
 
     Args:
         gaussians: state Θ_{t−1}.
         known: [N] mask of Gaussians that moved in earlier frames, or None.
-        before, now: views of the two frames, see ``find_moving``.
+        before, now: views of the two frames; see ``find_moving``.
         renderer: renderer that accumulates pixel values onto Gaussians.
     """
     moving = find_moving(gaussians, before, now, renderer)

@@ -1,4 +1,4 @@
-"""Creates Gaussians on the hull of new objects and fits only these to the images.
+"""Creates Gaussians on the hull of new objects, and fits only these Gaussians to the images.
 
 Only the part of each image that shows the hull is rendered, with the Gaussians that reach into it. An iteration
 therefore costs a small fraction of an update iteration.
@@ -39,8 +39,8 @@ ITERATIONS = 400
 SETTLING = 150
 """Number of iterations for refining recently added Gaussians after each update."""
 FEWEST = 0.25
-"""Minimum share of a fit's iterations for which there must be time. Half-fitted Gaussians would harm all later frames,
-and the next frame detects the object again anyway."""
+"""Minimum share of a fit's iterations that must fit into the available time. Half-fitted Gaussians would harm all later
+frames, and the next frame detects the object again anyway."""
 SHORTEST = 1e-6
 """Minimum length of an axis, in metres."""
 FIRST_OPACITY = 0.6
@@ -83,7 +83,7 @@ def fit_newborns(
     moves: bool,
     time: FitTime,
 ) -> Gaussians | None:
-    """Returns Gaussians at points, fitted to the views together with the fixed state; None if there is no time.
+    """Returns Gaussians at the given points, fitted to the views next to the fixed state, or None if time is too short.
 
     Args:
         state: state Θ_t; its Gaussians are not changed.
@@ -157,7 +157,7 @@ class _Schedule:
     """Schedule of a fit: as many iterations as planned, or as time allows; rates follow a half-cosine.
 
     Attributes:
-        whole: false if there was time for too few steps; the result is then discarded.
+        whole: whether there was time for enough steps; otherwise, the result is discarded.
     """
 
     def __init__(self, iterations: int, end: float | None, rates: Array) -> None:
@@ -228,7 +228,7 @@ def _beside(
 
 
 def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:
-    """Returns left, top, right and bottom of a box around points [P, 3], with a margin; None if it is too small."""
+    """Returns left, top, right and bottom of a box around points [P, 3] with a margin, or None if it is too small."""
     uv, depth = camera.project(points)
     if not (depth > 0).all():
         return None

@@ -1,4 +1,4 @@
-"""Tracks objects that were added in the previous frame: their motion is unknown and may exceed their width.
+"""Tracks objects that were added in the previous frame, whose motion is unknown and may exceed their width.
 
 The object is removed from the state, and its hull is carved again from the images of the frame. The displacement
 between the two hulls initializes the translation of its clusters.
@@ -60,7 +60,7 @@ class NewbornTracking(UpdatePart):
 
 
 def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
-    """Returns the [3] displacement of an object since it was added; retries may start where another attempt ended."""
+    """Returns the [3] displacement of an object since it was added. Retries may start where another attempt ended."""
     rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):
         return np.zeros(3)

@@ -50,7 +50,7 @@ class Novelty:
         camera: camera in the internal world.
         image: [H, W, 3] image in 0…1, with the camera's exposure removed.
         new: [H, W] mask of pixels in which the image shows something missing from the state.
-        stale: [H, W] mask of pixels in which the state shows something that is not there.
+        stale: [H, W] mask of pixels in which the state shows something that the image does not show.
         covered: [H, W] mask of pixels in which the state shows a moving object, which may hide something new.
         bare: [H, W] mask of pixels in which the state is empty but the image shows static background.
         behind: [H, W] mask of pixels in which image and state show no moving object, as far as measurable.
@@ -74,11 +74,12 @@ class Novelty:
 
 
 class CoarseNovelty(NamedTuple):
-    """Coarse novelty estimate from a subsampled rendering of the update, without rendering again.
+    """Coarse novelty estimate from a subsampled rendering of the update, which avoids rendering again.
 
     Attributes:
         view: training view of the frame.
-        new, bare: shares of new and of bare pixels, see ``Novelty``; regions appear smaller, without their outlines.
+        new, bare: shares of new and bare pixels (see ``Novelty``); regions appear smaller, because outlines are
+            removed.
     """
 
     view: TrainingView
@@ -94,17 +95,17 @@ COARSE_SHARE = 0.5
 regions, and 0.2 to 0.6 of irrelevant outlines."""
 
 _novelty_cache: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
-"""Novelty maps of each state, because several effects use the same ones."""
+"""Novelty maps of each state, cached because several effects use them."""
 _coarse_cache: WeakKeyDictionary[UpdateTrace, list[CoarseNovelty]] = WeakKeyDictionary()
 """Coarse estimates of each update."""
 
 
 def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
-    """Returns novelty maps of some cameras; empty if too few of them may see something new or bare.
+    """Returns novelty maps of some cameras, or an empty list if too few cameras may see something new or bare.
 
     Args:
         seen: the learnt frame.
-        least: minimum number of such cameras.
+        least: minimum number of cameras that may see something new or bare.
         new, bare: minimum shares of new and of bare pixels in each camera's image.
     """
     glimpses = _coarse_novelties(seen) if seen.result.trace.kept is Candidate.END else []
@@ -157,7 +158,7 @@ def _all_corners(plane: Bool) -> Bool:
 
 
 def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
-    """Returns novelty maps with the previous frame's colours, as static colours may have absorbed the new object."""
+    """Returns novelty maps with the previous frame's colours, because static colours may have absorbed a new object."""
     state = seen.result.gaussians
     known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]

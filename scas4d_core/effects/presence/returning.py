@@ -26,7 +26,7 @@ EXPLAINS = 0.8
 ball removes 0.85 to 1 if it has hardly rotated, and a ball with another pattern 0.6. When in doubt, new Gaussians are
 added instead, because a wrong id would be permanent."""
 APART = 0.25
-"""Distance, relative to the size of a hull, up to which retired Gaussians belong to the same object."""
+"""Distance, relative to the hull's size, up to which retired Gaussians belong to the same object."""
 
 
 class ReturnedThing(NamedTuple):
@@ -44,7 +44,7 @@ class ReturnedThing(NamedTuple):
 
 
 def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[ReturnedThing]:
-    """Returns the retired Gaussians that explain new objects when moved to the hull's centre, otherwise unchanged.
+    """Returns the retired Gaussians that explain new objects if they are only moved to the hull's centre.
 
     Args:
         seen: novelty map of each camera.
@@ -89,7 +89,7 @@ def _size(points: Float) -> float:
 
 
 def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
-    """Returns the indices of each group of means [R, 3], an object, whose cells of ``apart`` metres touch."""
+    """Groups means [R, 3] into objects whose cells of ``apart`` metres touch, and returns the indices of each group."""
     if not len(means):
         return []
     cells = np.floor((means - means.min(axis=0)) / apart).astype(np.int64)
@@ -106,7 +106,7 @@ def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
 
 
 def _left(seen: Sequence[Novelty], points: Float, voxel: float, state: Gaussians, renderer: Renderer) -> float:
-    """Returns the share of the squared error at an object that remains with a state."""
+    """Returns the share of the squared error at an object that remains when a state is rendered."""
     before = after = 0.0
     for one in seen:
         where = one.new & footprint(one, points, voxel)

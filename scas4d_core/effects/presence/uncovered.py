@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 NAME = "uncovered"
 MIN_CAMERAS, MIN_CAMERAS_WHILE_ON = 3, 1
-"""Minimum number of screened cameras that see a bare region before all are checked: to switch the effect on, and while
-it is on. Continued motion keeps uncovering background, and at first few cameras see the hole."""
+"""Minimum number of screened cameras that must see a bare region before all cameras are checked, while the effect is
+off and while it is on. Continued motion keeps uncovering background, and few cameras see the hole at first."""
 SMALLEST = 0.0004
-"""Minimum share of bare pixels in an image for a camera to count: 26 of 256 x 256, five by five."""
+"""Minimum share of bare pixels in an image for a camera to count (26 of 256 x 256, about five by five pixels)."""
 SHARE = 0.03
-"""Minimum share of the squared error of all images that is in bare regions, to switch the effect on."""
+"""Minimum share of all images' squared error that must be in bare regions to switch the effect on."""
 WORTH = 0.005
 """Minimum share of the error for adding Gaussians while the effect is on."""
 BUDGET = 0.05
@@ -68,7 +68,7 @@ class UncoveredEffect(Effect):
     """Adds static Gaussians behind moving objects."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the error share of bare regions; once Gaussians have been added, fewer cameras must see them."""
+        """Returns the error share of bare regions. Once Gaussians have been added, fewer cameras must see them."""
         if not seen.views:
             return None
         points = _find_points(seen, MIN_CAMERAS_WHILE_ON if NAME in seen.result.carried else MIN_CAMERAS)
@@ -104,19 +104,19 @@ class UncoveredEffect(Effect):
         )
 
     def register(self, builder: PlanBuilder) -> None:
-        """Does nothing: Gaussians are added after the update of a frame."""
+        """Does nothing, because Gaussians are added after a frame's update."""
 
 
 def _evidence(share: float) -> Evidence:
-    return Evidence(share, f"moving objects have uncovered regions with {100 * share:.0f} % of the error")
+    return Evidence(share, f"regions uncovered by moving objects contain {100 * share:.0f} % of the error")
 
 
 EFFECT = UncoveredEffect(
     name=NAME,
     group=EffectGroup.PRESENCE,
     description="Motion uncovers hidden background: static Gaussians are added where the state has none.",
-    disambiguation="Only pixels in which the state is empty count.",
-    cost="a check of the last renderings; when background is uncovered, about half an update more",
+    disambiguation="Only pixels where the state is empty count.",
+    cost="a check of the last renderings; when background is uncovered, about half the time of an update",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

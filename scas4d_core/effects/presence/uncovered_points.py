@@ -32,7 +32,7 @@ FEWEST = 24
 OPAQUE = 0.1
 """Maximum transmittance at which a pixel has a depth."""
 ROUNDS = 5
-"""Iterations of reweighted least squares; pixels of other surfaces around the region are outliers."""
+"""Number of iterations of reweighted least squares; pixels of other surfaces around the region are outliers."""
 NEAR = 0.02
 """Approximate relative deviation of an inlier from the plane, in inverse depth."""
 CAMERAS, SPREAD = 3, 0.08

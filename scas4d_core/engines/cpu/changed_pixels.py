@@ -176,7 +176,8 @@ class ChangedPixels(CpuRenderer):
         key = _key(view)
         region = self._regions.get(key)
         if region is None or region.view is not view:
-            # Rebuilt in every frame: rounding errors depend on the box, and a replay does not see the earlier frames.
+            # The region is rebuilt in every frame, because rounding errors depend on the box and a replay does not
+            # process the earlier frames.
             region = self._regions[key] = self._make_region(self._moving_blocks(state, view.camera), view)
         while True:
             part = take_rows(state, region.rows)
@@ -298,7 +299,7 @@ def take_rows(state: State, rows: NDArray[np.int64]) -> State:
 
 
 def _key(view: TrainingView) -> tuple[str, int, int]:
-    """Returns camera name and image size, because probe views use the same cameras at a lower resolution."""
+    """Returns a view's camera name and image size. Probe views use the same cameras at a lower resolution."""
     return view.name, view.camera.width, view.camera.height
 
 

@@ -145,7 +145,9 @@ class CpuDeformation:
             ValueError: if this would freeze the last layer.
         """
         if layers and layers >= len(self.clusters):
-            raise ValueError(f"cannot freeze {layers} of {len(self.clusters)} layers; the last layer must stay free")
+            raise ValueError(
+                f"cannot freeze {layers} of {len(self.clusters)} layers; the last layer must remain unfrozen"
+            )
         if layers < self._frozen:
             self._unfreeze_layers()
         for layer in range(self._frozen, layers):

@@ -138,7 +138,7 @@ class CpuEngine:
         lap(REPORT)
 
     def _pictures(self, views: Sequence[int], step: StepScalars) -> tuple[float, Gradients]:
-        """Returns the mean image and mask loss over views, and the gradients (renderer buffers if only one view)."""
+        """Returns the mean image and mask loss over views, and its gradients (renderer buffers for a single view)."""
         loss, total = 0.0, None
         for index in views:
             view_loss, gradients = self._picture(index, step)

@@ -109,7 +109,7 @@ class CpuFitEngine:
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 
     def _backward(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
-        """Returns the gradients of all rendered arrays, or None if only colours are learned, and of the features."""
+        """Returns the gradients of all rendered arrays (None if only colours are learned) and those of the features."""
         if rates[: COLOUR.start].any() or rates[COLOUR.stop :].any():
             gradients = self.renderer.forward_backward(*drawn, view)
             return gradients, gradients.features
@@ -118,7 +118,7 @@ class CpuFitEngine:
         return None, rasterizer.feature_gradients(rasterizer.gradient_buffers()[0])
 
     def _record_rendering(self, factors: Array, g_screen: Array, camera: CameraArrays, fixed: int) -> None:
-        """Updates the statistics with the last rendering, if they are collected."""
+        """Adds the last rendering to the statistics, if statistics are collected."""
         statistics = self._table.statistics
         if statistics is not None:
             half = np.array([camera.width / 2, camera.height / 2], np.float32)

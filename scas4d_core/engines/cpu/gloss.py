@@ -51,7 +51,7 @@ def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None
     Args:
         gaussians: state to shade.
         camera: camera in kernel format.
-        turns: [N, 4] unit quaternions, the rotations of the Gaussians since their gloss was stored. If None, they have
+        turns: [N, 4] rotations of the Gaussians since their gloss was stored, as unit quaternions, or None if they have
             not rotated.
     """
     if gaussians.gloss is None or gaussians.environment is None:
@@ -248,7 +248,7 @@ class LearntGloss:
         return self._shading.gradients
 
     def step(self, factor: float, smooth: bool) -> None:
-        """Takes an optimization step. If ``smooth``, changes of the gloss are then averaged over neighbours."""
+        """Takes an Adam step. If ``smooth`` is true, gloss changes are then averaged over neighbours."""
         self._shading.step(factor)
         if smooth:
             self._shading.smooth(self._roots)

@@ -103,7 +103,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """Returns a contiguous scratch array. A quarter more is allocated to avoid reallocation as sizes drift."""
+        """Returns a contiguous scratch array. Arrays grow by an extra 25 % to avoid reallocation as sizes drift."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view
@@ -289,7 +289,7 @@ class CpuRasterizer:
         return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
-        """Returns only the feature gradients [N, 4] of ``backward``; for images with four channels."""
+        """Returns only the feature gradients [N, 4] of ``backward``. The image must have four channels."""
         last, count = self._last, len(self._last.features)
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
         feature_gradients.blend_features(

@@ -39,7 +39,7 @@ class CpuRenderer:
         limits: rasterizer constants.
 
     Attributes:
-        rasterizer: rasterizer, with the results of the last rendering.
+        rasterizer: rasterizer that contains the results of the last rendering.
         image_part, mask_part: weighted image and mask losses of the last comparison.
         psnr: PSNR of the last comparison, in dB.
         exposure_gradient: [C, 2] gradient of the last loss with respect to the camera's gain and offset.

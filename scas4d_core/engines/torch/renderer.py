@@ -18,7 +18,7 @@ from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 TILE = 32
-"""Number of pixels to a multiple of which ``reached`` pads the image."""
+"""``reached`` pads image sizes to a multiple of this number of pixels."""
 
 
 class TorchRenderer:

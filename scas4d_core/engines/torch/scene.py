@@ -89,7 +89,7 @@ class Scene:
         return torch.cat([seen, self.labels[:, None]], dim=1)
 
     def state(self, moved: Moved, parameters: Parameters | None) -> Gaussians:
-        """Returns Θ_t. If ``parameters`` is None, it has the colours and gloss of Θ_{t−1}, not the learned ones."""
+        """Returns Θ_t, with the colours and gloss of Θ_{t−1} instead of the learned ones if ``parameters`` is None."""
         previous, chosen = self.previous, self.rows[self.sound].numpy()
         means, factors, rotations = previous.means.copy(), previous.factors.copy(), previous.rotations.copy()
         means[chosen] = moved.means.detach()[chosen].float().numpy()

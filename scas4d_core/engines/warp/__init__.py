@@ -1,6 +1,6 @@
-"""GPU engine: NVIDIA Warp kernels in float32. They also run, slowly, on Warp's CPU device for tests.
+"""GPU engine, built on float32 NVIDIA Warp kernels. For tests, the kernels also run (slowly) on Warp's CPU device.
 
-Rendering: ``layout`` defines the structures shared by kernels and ``lanes`` the warp-level primitives. ``projection``,
-``supports``, ``tiles`` and ``blend`` render, ``picture_loss`` compares. ``rasterizer`` and ``pictures`` launch these
-kernels, and ``renderer`` renders states.
+``layout`` defines the structures that the rendering kernels share, and ``lanes`` the warp-level primitives. The kernels
+in ``projection``, ``supports``, ``tiles`` and ``blend`` render images, and ``picture_loss`` compares them with training
+images. ``rasterizer`` and ``pictures`` launch these kernels, and ``renderer`` renders states.
 """

@@ -1,4 +1,4 @@
-"""Activations of a fit's parameters, with backward pass and optimizer; reference: ``kernels.activation``."""
+"""Activation functions for a fit's parameters, with backward pass and Adam step; reference: ``kernels.activation``."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ SHORTEST = wp.constant(wp.float32(QUATERNION_FLOOR))
 
 @wp.func
 def clamped_exp(x: wp.float32) -> wp.float32:
-    """Returns the exponential of a clamped argument."""
+    """Returns exp(x), with x clamped to avoid overflow."""
     return wp.exp(wp.clamp(x, -LARGEST, LARGEST))
 
 
 @wp.func
 def quaternion_of(parameters: wp.array2d[wp.float32], i: wp.int32) -> wp.vec4:
-    """Returns the quaternion of a row, not normalized."""
+    """Returns the unnormalized quaternion of row ``i``."""
     return wp.vec4(parameters[i, 3], parameters[i, 4], parameters[i, 5], parameters[i, 6])
 
 
 @wp.func
 def inverse_norm(q: wp.vec4) -> wp.float32:
-    """Returns 1/|q|, or 0 for a quaternion that is treated as the identity."""
+    """Returns 1/|q|, or 0 if q is so short that it is treated as the identity."""
     square = wp.dot(q, q)
     inverse = wp.float32(0.0)
     if square > SHORTEST:
@@ -41,13 +41,13 @@ def inverse_norm(q: wp.vec4) -> wp.float32:
 
 @wp.func
 def unit(q: wp.vec4, inverse: wp.float32) -> wp.vec4:
-    """Returns the unit quaternion."""
+    """Returns q, normalized with the result of ``inverse_norm``."""
     return wp.where(inverse > 0.0, inverse * q, wp.vec4(1.0, 0.0, 0.0, 0.0))
 
 
 @wp.func
 def scales_of(parameters: wp.array2d[wp.float32], i: wp.int32) -> wp.vec3:
-    """Returns the axis lengths of a row in metres."""
+    """Returns the axis lengths of the Gaussian in row ``i``, in metres."""
     return wp.vec3(clamped_exp(parameters[i, 7]), clamped_exp(parameters[i, 8]), clamped_exp(parameters[i, 9]))
 
 
@@ -60,11 +60,12 @@ def activate(
     opacities: wp.array[wp.float32],
     features: wp.array[wp.vec4],
 ) -> None:
-    """Fills the rasterizer inputs of the fitted Gaussians, with one thread each.
+    """Computes the rasterizer inputs of the fitted Gaussians, with one thread per Gaussian.
 
     Args:
-        fixed: number of fixed Gaussians, which precede the fitted ones. parameters: [N, 15] see ``engines.fit``.
-        means, factors, opacities, features: out [fixed + N].
+        fixed: number of fixed Gaussians, which precede the fitted ones.
+        parameters: [N, 15] parameters; see ``engines.fit`` for the columns.
+        means, factors, opacities, features: [fixed + N] outputs; the first ``fixed`` rows stay unchanged.
     """
     i = wp.tid()
     row = fixed + i
@@ -94,13 +95,16 @@ def step_parameters(
     screen_gradients: wp.array[wp.float32],
     rendered: wp.array[wp.int32],
 ) -> None:
-    """Backpropagates through the activations and steps the parameters, with one thread per fitted Gaussian.
+    """Backpropagates through the activations and takes an Adam step, with one thread per fitted Gaussian.
 
     Args:
-        fixed, parameters, factors, opacities, features: see ``activate``. cameras, view: of the rendering.
-        splats, records: of the rasterizer after the backward pass; see ``projection``.
-        g_means, g_factors, g_features: [fixed + N] gradients of the rendering loss. adam: optimizer of the parameters.
-        screen_gradients, rendered: [N], accumulated; see ``engines.fit.RenderingStatistics``.
+        fixed, parameters, factors, opacities, features: see ``activate``.
+        cameras: [views] cameras of all views.
+        view: [1] index of the rendered view.
+        splats, records: rasterizer buffers after the backward pass; see ``projection``.
+        g_means, g_factors, g_features: [fixed + N] gradients of the rendering loss.
+        adam: optimizer for the parameters.
+        screen_gradients, rendered: [N] statistics, accumulated; see ``engines.fit.RenderingStatistics``.
     """
     i = wp.tid()
     row = fixed + i
@@ -133,6 +137,6 @@ def step_parameters(
         step_element(adam, parameters, i, 11 + k, g_feature[k])
     for k in range(4):
         step_element(adam, parameters, i, 3 + k, g_q[k])
-    # The first value of a record is the gradient of the logarithm of the opacity.
+    # The first value of a record is the gradient with respect to the log opacity.
     step_element(adam, parameters, i, 10, wp.where(second[2] > 0.0, r0[0], 0.0) * (1.0 - opacities[row]))
     step_element(adam, parameters, i, 14, g_feature[3] * feature[3] * (1.0 - feature[3]))

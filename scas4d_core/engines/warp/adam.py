@@ -1,7 +1,7 @@
-"""Adam (Kingma and Ba 2015) over device tables; reference: ``torch.optim.Adam``, guards: ``kernels.adam``.
+"""Adam (Kingma and Ba 2015) for tables on the device; reference: ``torch.optim.Adam``, guards: ``kernels.adam``.
 
-A kernel that computes the gradient of an element also steps it, by calling ``step_element``. This saves launches, and
-the gradient need not be read again.
+The kernel that computes an element's gradient also updates the element, by calling ``step_element``. This saves a
+launch and another read of the gradient.
 """
 
 from __future__ import annotations
@@ -20,19 +20,22 @@ EPSILON = wp.constant(wp.float32(ADAM_EPSILON))
 SMALLEST = wp.constant(wp.float32(MOMENT_FLOOR))
 LARGEST = wp.constant(wp.float32(GRADIENT_CEILING))
 COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
-"""Guards that ``step_element`` counts."""
+"""Names of the guards that ``step_element`` counts."""
 SCALARS = 3
-"""Scalars of a step: factor on all rates, 1 − β₁^steps and 1 − β₂^steps."""
+"""Number of scalars per step: learning rate factor, 1 − β₁^steps and 1 − β₂^steps."""
 
 
 @wp.struct
 class Adam:
-    """Device side of an optimizer for one table [n, columns].
+    """Device-side state of the optimizer for one table [n, columns].
 
     Attributes:
-        columns: [columns] learning rates. by_row: [n] or [1] factor on each row's rates.
-        first, second: [n, columns] moments. guard_counts: [2] see ``COUNTED_GUARDS``; counts are added.
-        scalars: [``SCALARS``] of the current iteration. beta1, beta2: decay rates.
+        columns: [columns] learning rate of each column.
+        by_row: learning rate factors, [n] (one per row) or [1] (one for all rows).
+        first, second: [n, columns] first and second moments.
+        guard_counts: [2] number of times that each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
+        scalars: [``SCALARS``] scalars of the current step.
+        beta1, beta2: decay rates of the moments.
     """
 
     columns: wp.array[wp.float32]
@@ -47,7 +50,7 @@ class Adam:
 
 @wp.func
 def step_element(adam: Adam, table: wp.array2d[wp.float32], i: wp.int32, k: wp.int32, gradient: wp.float32) -> None:
-    """Steps one element of a table; an element with rate 0 and its moments are unchanged."""
+    """Takes an Adam step for one element of a table. If its learning rate is 0, element and moments stay unchanged."""
     row = adam.by_row[0]
     if adam.by_row.shape[0] > 1:
         row = adam.by_row[i]
@@ -72,20 +75,22 @@ def step_element(adam: Adam, table: wp.array2d[wp.float32], i: wp.int32, k: wp.i
 
 @wp.kernel
 def step_table(adam: Adam, gradients: wp.array2d[wp.float32], table: wp.array2d[wp.float32]) -> None:
-    """Steps a table [n, columns] with gradients of the same shape, with one thread per element."""
+    """Takes an Adam step for a table [n, columns], with gradients of the same shape and one thread per element."""
     i, k = wp.tid()
     step_element(adam, table, i, k, gradients[i, k])
 
 
 class Optimizer:
-    """Host side of an optimizer: allocates its arrays, and counts its steps.
+    """Host side of an optimizer, which allocates its arrays and counts its steps.
 
     Args:
-        shape: of the table. scalars: [``SCALARS``] on the device, which the caller fills before each step.
-        varies_by_row: whether the rates differ between rows.
+        shape: shape of the table.
+        scalars: [``SCALARS``] device array that the caller fills before each step.
+        varies_by_row: whether learning rates differ between rows.
 
     Attributes:
-        adam: argument of the kernels that step the table. steps: number of steps so far.
+        adam: device-side state, passed to the kernels that update the table.
+        steps: number of steps so far.
     """
 
     def __init__(self, shape: tuple[int, int], scalars: wp.array, varies_by_row: bool = False) -> None:
@@ -100,11 +105,12 @@ class Optimizer:
     def begin(
         self, columns: Sequence[float], betas: tuple[float, float], by_row: NDArray[np.float32] | None = None
     ) -> None:
-        """Starts an attempt with zero moments.
+        """Resets the moments to zero and sets the learning rates of a new attempt.
 
         Args:
-            columns: learning rate of each column. betas: decay rates of the moments.
-            by_row: [n] factor on each row's rates; None keeps the previous factors.
+            columns: learning rate of each column.
+            betas: decay rates of the moments.
+            by_row: [n] learning rate factor of each row, or None to keep the previous factors.
         """
         self.steps = 0
         self.adam.beta1, self.adam.beta2 = betas
@@ -115,18 +121,18 @@ class Optimizer:
             array.zero_()
 
     def next_scalars(self, factor: float) -> tuple[float, float, float]:
-        """Returns the scalars of the next step; a factor of 0 skips the step and leaves the moments unchanged."""
+        """Returns the next step's scalars. A factor of 0 skips the step and leaves the moments unchanged."""
         if factor == 0:
             return 0.0, 1.0, 1.0
         self.steps += 1
         return factor, 1 - self.adam.beta1**self.steps, 1 - self.adam.beta2**self.steps
 
     def load(self, first: NDArray[np.float32], second: NDArray[np.float32], steps: int) -> None:
-        """Continues from given moments."""
+        """Loads the moments and step count from which to continue."""
         self.adam.first.assign(first)
         self.adam.second.assign(second)
         self.steps = steps
 
     def set_columns(self, columns: NDArray[np.float32]) -> None:
-        """Changes the learning rate of each column."""
+        """Sets the learning rate of each column."""
         self.adam.columns.assign(columns)

@@ -1,11 +1,12 @@
-"""Front-to-back blending of tiles, four features at a time, and its backward pass.
+"""Front-to-back blending of four features per tile, and its backward pass.
 
-A tile is 16×16 pixels, and a warp renders 8×4 of them. Its lanes test one list entry each, and the warp blends the
-entries whose support intersects its pixels. On the CPU device, a warp is one lane and renders one pixel.
+A tile has 16×16 pixels, and each warp renders a block of 8×4 pixels. Every lane tests one list entry, and the warp then
+blends the entries whose support intersects its block. On the CPU device, a warp has one lane and renders one pixel.
 
-Few tiles hold most of the work, so lists are split into segments that run in parallel. ``blend_segments`` renders each
-segment as if it were the first, and ``join_segments`` combines them. If a pixel ends within a segment, that segment is
-rendered again to end at the right entry. The start value of each segment is kept for the backward pass.
+A few tiles account for most of the work, so lists are split into segments that are blended in parallel.
+``blend_segments`` blends each segment as if it were the first, and ``join_segments`` combines the segments. If a pixel
+is finished within a segment, that segment is blended again for this pixel, up to the correct entry. The state at the
+start of each segment is kept for the backward pass.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ ONE = wp.constant(wp.uint32(1))
 
 @wp.struct
 class Spot:
-    """A lane's pixel: position and centre, whether it is in the picture, and the first pixel centre of its warp."""
+    """The pixel of a lane: position, centre, whether it is inside the image, and the first pixel centre of its warp."""
 
     x: wp.int32
     y: wp.int32
@@ -69,7 +70,7 @@ def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot
 
 @wp.func
 def meets(spot: Spot, first: wp.vec4, second: wp.vec4) -> wp.int32:
-    """Returns 1 if a support intersects the warp's pixels."""
+    """Returns 1 if a splat's support intersects the warp's pixels, otherwise 0."""
     met = wp.int32(0)
     if second[2] > 0.0:
         across = wp.where(lane_count() > 1, 7.0, 0.0)
@@ -90,7 +91,7 @@ def power_at(first: wp.vec4, second: wp.vec4, dx: wp.float32, dy: wp.float32) ->
 
 @wp.struct
 class Light:
-    """State of a pixel during blending: transmittance, accumulated features, and whether it is unfinished."""
+    """State of a pixel during blending: transmittance, accumulated features, and whether the pixel is unfinished."""
 
     passed: wp.float32
     features: wp.vec4
@@ -110,18 +111,21 @@ def draw_entries(
     passed: wp.float32,
     exact: wp.int32,
 ) -> Light:
-    """Blends list entries front to back, starting from a transmittance; called by all lanes of a warp.
+    """Blends list entries front to back, starting from a given transmittance. All lanes of a warp must call it.
 
     Args:
-        begin, end: range of entries. open: 1 for pixels to render. passed: transmittance before the first entry.
-        exact: 0: a pixel that is finished here keeps a transmittance below the stop; 1: the value before that entry.
+        begin, end: first entry, and last entry plus 1.
+        open: 1 if the lane's pixel must be rendered, otherwise 0.
+        passed: transmittance before the first entry.
+        exact: transmittance returned for a pixel that is finished here: below the stop (0), or before the entry that
+            finishes the pixel (1).
     """
     light = Light()
     light.passed = passed
     light.open = open
     base = wp.int32(begin)
     alive = ballot(light.open)
-    # The next candidates and the next rendered entry are loaded early to hide memory latency.
+    # The next candidates and the next entry to blend are loaded early to hide memory latency.
     item = wp.int32(0)
     first = wp.vec4(0.0, 0.0, 0.0, 0.0)
     second = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -181,13 +185,16 @@ def blend_segments(
     segment_light: wp.array[wp.float32],
     segment_features: wp.array[wp.vec4],
 ) -> None:
-    """Renders each segment independently; each warp repeatedly takes the next segment and part of its tile.
+    """Blends each segment independently. Each warp processes one 8×4 block of one segment after another.
 
     Args:
-        splats: [2 N]. features: [N]. items, starts, segment_starts, segment_tiles: tile lists, see ``tiles``.
+        splats: [2 N] splats; see ``supports``.
+        features: [N] features of the Gaussians.
+        items, starts, segment_starts, segment_tiles: tile lists; see ``tiles``.
         warps: number of warps in the launch.
-        segment_light, segment_features: out [segments · 256] transmittance of a segment at each pixel of its tile,
-            below the stop if this segment alone finishes the pixel, and blended features.
+        segment_light: [segments · 256] output, transmittance of each segment at each pixel of its tile. The value is
+            below the stop if this segment alone finishes the pixel.
+        segment_features: [segments · 256] output, blended features of each segment at each pixel of its tile.
     """
     parts = PIXELS // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
@@ -225,10 +232,11 @@ def join_segments(
     """Combines the segments of each list, with one thread per pixel of each tile.
 
     Args:
-        background: [1] behind all Gaussians. segment_light, segment_features: from ``blend_segments``; replaced by the
-            start values of each segment of an unfinished pixel.
-        begun: out [rows, columns] number of segments at whose start a pixel was unfinished.
-        planes: out [5, rows, columns] features, including the background, and remaining transmittance.
+        background: [1] background features.
+        segment_light, segment_features: outputs of ``blend_segments``. While a pixel is unfinished, they are replaced
+            by the pixel's state at the start of each segment.
+        begun: [rows, columns] output, number of segments at whose start the pixel was unfinished.
+        planes: [5, rows, columns] output, features including the background, and remaining transmittance.
     """
     camera = cameras[view[0]]
     tile = wp.tid() // PIXELS
@@ -284,7 +292,7 @@ def join_segments(
         planes[4, spot.y, spot.x] = light.passed
 
 
-# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2.
+# Transposing butterfly reduction: ten sums over 32 lanes become five over 16, three over 8, two over 4 and one over 2.
 # All indices are known at compile time, so the values stay in registers.
 @wp.func_native("""
 float* record = reinterpret_cast<float*>(records.data + row);
@@ -318,7 +326,7 @@ def add_record(
     records: wp.array[wp.vec4], row: wp.int32, a0: wp.float32, a1: wp.float32, a2: wp.float32, a3: wp.float32,
     a4: wp.float32, a5: wp.float32, a6: wp.float32, a7: wp.float32, a8: wp.float32, a9: wp.float32,
 ) -> None:  # fmt: skip
-    """Sums ten numbers over the lanes and adds them to a record that starts at ``row``."""
+    """Sums ten numbers over the lanes and adds the sums to the record that starts at ``row``."""
     ...
 
 
@@ -341,12 +349,12 @@ def blend_backward(
     g_planes: wp.array3d[wp.float32],
     records: wp.array[wp.vec4],
 ) -> None:
-    """Backpropagates the gradient of the planes to the splats; work is distributed as in the forward pass.
+    """Backpropagates the gradient of the planes to the splats. Work is distributed as in the forward pass.
 
     Args:
-        segment_light, segment_features, begun, planes: from ``join_segments``.
-        g_planes: [4, rows, columns] dL/dplanes of the features.
-        records: [4 N], accumulated; see ``projection``.
+        segment_light, segment_features, begun, planes: outputs of ``join_segments``.
+        g_planes: [4, rows, columns] dL/dplanes for the features.
+        records: [4 N] gradient records, accumulated; see ``projection``.
     """
     parts = PIXELS // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
@@ -363,7 +371,7 @@ def blend_backward(
         passed = wp.float32(1.0)
         behind = wp.float32(0.0)  # contribution of later entries and background
         g = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        label = wp.float32(0.0)  # the part of g[3] that reaches the blending weights; a second vector would spill
+        label = wp.float32(0.0)  # part of g[3] that affects the blending weights; a second vector would spill
         if spot.inside == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
             if number < begun[spot.y, spot.x]:
                 g = wp.vec4(

@@ -1,7 +1,7 @@
-"""Cluster map of equation (6) for a whole layer, and its backward pass; reference: ``engines.torch.deformation``.
+"""Cluster map of equation (6) for an entire layer, and its backward pass; reference: ``engines.torch.deformation``.
 
-A warp processes one cluster. Its Gaussians are a contiguous range of the hierarchy's order, so pivots and parameter
-gradients are sums over lanes that need no atomics.
+Each warp processes one cluster, whose Gaussians are contiguous in hierarchy order. Pivots and parameter gradients are
+therefore sums over lanes, and no atomics are needed.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from scas4d_core.guards import EXPONENT, HALF_TURN
 wp.set_module_options({"enable_backward": False})
 
 LARGEST = wp.constant(wp.float32(EXPONENT / log2(e)))
-"""Upper bound of an exponential's argument."""
+"""Bound on the magnitude of exponents."""
 SMALLEST_COSINE = wp.constant(wp.float32(HALF_TURN))
 COLUMNS = 10
-"""Number of parameters of a cluster: r, t, c (three each) and s."""
+"""Number of parameters per cluster: r, t, c (three each) and s."""
 
 
 @wp.struct
 class ClusterParameters:
-    """Parameters of a cluster, with its rotation as unit quaternion and as matrix."""
+    """Parameters of a cluster, with its rotation as a unit quaternion and as a matrix."""
 
     r: wp.vec3
     t: wp.vec3
@@ -47,7 +47,7 @@ class ClusterParameters:
 
 @wp.func
 def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterParameters:
-    """Reads a row of a layer's parameter table."""
+    """Reads the parameters of a cluster from a layer's table."""
     found = ClusterParameters()
     found.r = wp.vec3(table[cluster, 0], table[cluster, 1], table[cluster, 2])
     found.t = wp.vec3(table[cluster, 3], table[cluster, 4], table[cluster, 5])
@@ -62,7 +62,7 @@ def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterPa
 def pivot_of(
     start: wp.int32, end: wp.int32, sound: wp.array[wp.int32], points: wp.array[wp.vec3]
 ) -> wp.vec3:  # fmt: skip
-    """Returns the mean of a cluster's points in all lanes."""
+    """Returns the mean of a cluster's points, in all lanes."""
     total = wp.vec3(0.0, 0.0, 0.0)
     count = wp.float32(0.0)
     for entry in range(start + lane(), end, lane_count()):
@@ -140,10 +140,13 @@ def map_clusters(
     """Moves the Gaussians of a layer's clusters, with one warp per cluster.
 
     Args:
-        published: 1 for the published variant of the map, 0 for the centred one. starts: [K + 1] ranges of entries.
-        table: [K, 10] parameters. sound: [M] 1 for entries that are finite.
-        points, jacobians, turns: [M] after the coarser layers. pivots: out [K].
-        moved, moved_jacobians, moved_turns: out [M] after this layer.
+        published: 1 for the published variant of the map, 0 for the centred one.
+        starts: [K + 1] first entry of each cluster, followed by the number of entries.
+        table: [K, 10] parameters of the clusters.
+        sound: [M] 1 for entries with finite values, otherwise 0.
+        points, jacobians, turns: [M] points, Jacobians and rotations after the coarser layers.
+        pivots: [K] output, pivot of each cluster.
+        moved, moved_jacobians, moved_turns: [M] outputs, points, Jacobians and rotations after this layer.
     """
     cluster = wp.tid() // lane_count()
     start = starts[cluster]
@@ -187,12 +190,13 @@ def map_clusters_backward(
     g_table: wp.array2d[wp.float32],
     adam: Adam,
 ) -> None:
-    """Backpropagates gradients through a layer, to its inputs, in place, and to its parameters, and steps these.
+    """Backpropagates through a layer to its inputs and parameters, and takes an Adam step for the parameters.
 
     Args:
         published, starts, table, sound, points, jacobians, turns, pivots: see ``map_clusters``.
-        g_points, g_jacobians, g_turns: [M] gradients of the layer's outputs; overwritten. g_table: out [K, 10].
-        adam: optimizer of the table.
+        g_points, g_jacobians, g_turns: [M] gradients of the layer's outputs, replaced by the gradients of its inputs.
+        g_table: [K, 10] output, gradients of the parameters.
+        adam: optimizer for the table.
     """
     cluster = wp.tid() // lane_count()
     own = parameters_of(table, cluster)
@@ -215,13 +219,13 @@ def map_clusters_backward(
             if published == 1:
                 y = back * placed
             inner = f * wp.identity(n=3, dtype=wp.float32) + slope * wp.outer(y, own.c)
-            # The rotation: q ∘ polar ∘ rotation of the coarser layers.
+            # Rotation: q ∘ polar ∘ rotation after the coarser layers.
             bent = polar(f, y, own.c)
             g_here = product(g_turns[entry], conjugate(turns[entry]))
             g_turns[entry] = product(conjugate(product(own.q, bent)), g_turns[entry])
             g_q += product(g_here, conjugate(bent))
             of_polar = polar_backward(f, y, own.c, product(conjugate(own.q), g_here))
-            # The Jacobian: R (f I + f' y cᵀ) J of the coarser layers.
+            # Jacobian: R (f I + f' y cᵀ) J, with J from the coarser layers.
             g_own = g_jacobians[entry] * wp.transpose(jacobians[entry])
             g_jacobians[entry] = wp.transpose(inner) * back * g_jacobians[entry]
             g_rotation = g_own * wp.transpose(inner)
@@ -229,7 +233,7 @@ def map_clusters_backward(
             g_f = of_polar.f + wp.trace(g_inner) + (2.0 - 2.0 * f) * wp.dot(y, g_inner * own.c)
             g_y = of_polar.y + slope * (g_inner * own.c)
             g_c += of_polar.c + slope * (wp.transpose(g_inner) * y)
-            # The point.
+            # Point.
             g_moved = g_points[entry]
             g_placed = g_moved
             g_offset = wp.vec3(0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Colours as parameters of an update, with the soft-colour term."""
+"""Optimization of colours during an update, with the soft-colour loss."""
 
 from __future__ import annotations
 
@@ -25,13 +25,17 @@ def step_colours(
     iteration: wp.array[wp.int32],
     losses: wp.array[wp.float32],
 ) -> None:
-    """Adds the soft-colour term and steps the colours, with one thread per element of N × 3.
+    """Adds the soft-colour loss and takes an Adam step for the colours, with one thread per element of [N, 3].
 
     Args:
-        weight: weight of one element's absolute change. learned: [N] 1 for Gaussians whose colours are learned.
-        before: [N, 4] features of Θ_{t−1}. g_features: [N, 4] gradients of the rendering losses.
-        features: [N, 4], of which the first three columns are updated. gradients: out [N, 3].
-        iteration: [1] row of ``losses``, to which the weighted term is added.
+        weight: weight of each element's absolute change.
+        learned: [N] 1 for Gaussians whose colours are learned, otherwise 0.
+        before: [N, 4] features of Θ_{t−1}.
+        g_features: [N, 4] gradients of the rendering losses.
+        features: [N, 4] features; the first three columns are updated.
+        gradients: [N, 3] output, gradients of the colours.
+        iteration: [1] row of ``losses`` for this iteration.
+        losses: weighted losses of each iteration, to which the soft-colour loss is added.
     """
     i, k = wp.tid()
     g = wp.float32(0.0)
@@ -46,14 +50,17 @@ def step_colours(
 
 
 class WarpColours:
-    """The colours learned in an attempt, which are the first three columns of the features.
+    """Colours that are learned during an attempt; they are the first three columns of the features.
 
     Args:
-        plan: plan of the updates; it must include colours. count: N Gaussians. rows: [M] moving Gaussians.
-        scalars: [3] on the device, those of the optimizer.
+        plan: plan of the scene's updates, with a colour plan.
+        count: number of Gaussians, N.
+        rows: [M] rows of the moving Gaussians.
+        scalars: [3] device array with the optimizer's scalars.
 
     Attributes:
-        gradients: [N, 3], filled by ``step``. optimizer: of the colours.
+        gradients: [N, 3] gradients of the colours, filled by ``step``.
+        optimizer: optimizer for the colours.
     """
 
     def __init__(self, plan: UpdatePlan, count: int, rows: NDArray[np.int64], scalars: wp.array) -> None:
@@ -67,7 +74,7 @@ class WarpColours:
         self.optimizer = Optimizer((count, 3), scalars, varies_by_row=True)
 
     def begin(self, start: AttemptStart) -> None:
-        """Starts an attempt with zero moments."""
+        """Starts an attempt, with zero moments."""
         rates = np.full(self._count, start.static_colour if self._static else 0.0, np.float32)
         rates[self._rows] = start.colour
         self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2), rates)

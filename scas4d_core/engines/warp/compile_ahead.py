@@ -1,4 +1,4 @@
-"""Compiles all GPU kernels without a GPU, to check them and to report the resources that they use."""
+"""Compilation of all GPU kernels without a GPU, to check the kernels and report their resource usage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ARCHITECTURES = (80, 89, 90, 100, 120)
 
 
 def kernel_modules() -> list[wp.Module]:
-    """Returns the Warp modules with all kernels of the engine."""
+    """Returns the Warp modules that contain the engine's kernels."""
     modules = {}
     for found in pkgutil.iter_modules(package.__path__):
         python = importlib.import_module(f"{package.__name__}.{found.name}")
@@ -25,15 +25,15 @@ def kernel_modules() -> list[wp.Module]:
 
 
 def compile_ahead(architecture: int, folder: Path, ptx: bool = False) -> list[Path]:
-    """Compiles all kernels for an architecture and returns the files.
+    """Compiles all kernels for a GPU architecture, and returns the paths of the compiled files.
 
     Args:
         architecture: compute capability times 10, such as 90.
-        folder: folder of the files.
-        ptx: write PTX, which ``ptxas`` reads, instead of machine code.
+        folder: output folder.
+        ptx: whether to write PTX (the input of ``ptxas``) instead of machine code.
 
     Raises:
-        RuntimeError: a kernel does not compile.
+        RuntimeError: if a kernel does not compile.
     """
     for module in kernel_modules():
         wp.compile_aot_module(module, device=None, arch=architecture, module_dir=str(folder), use_ptx=ptx)

@@ -1,4 +1,4 @@
-"""Deformation of an update on the device: cascade, deltas and loss terms, with forward and backward pass."""
+"""Deformation on the device: cascade, per-Gaussian deltas and their loss terms, with forward and backward pass."""
 
 from __future__ import annotations
 
@@ -18,20 +18,25 @@ Array = NDArray[np.float32]
 
 
 class WarpDeformation:
-    """The parameters of a deformation with their optimizers, and the deformed Gaussians.
+    """The parameters of a deformation with their optimizers, and the resulting Gaussians.
 
-    Nothing here waits for the device. ``forward`` and ``backward`` can be captured in a graph.
+    No method waits for the device. ``forward`` and ``backward`` can be captured in a CUDA graph.
 
     Args:
-        device: Warp device, such as "cpu" or "cuda:0". plan, structure: those of the updates.
-        records: what changes between iterations; the first optimizers are those of the layers and of the deltas.
+        device: Warp device, such as "cpu" or "cuda:0".
+        plan: plan of the scene's updates.
+        structure: clusters and neighbour graph of the moving Gaussians.
+        records: values that change between iterations; the optimizers of the layers and of the deltas come first.
 
     Attributes:
-        clusters: [K, 10] per layer, columns r, t, c, s of equation (6). deltas: [M, 9], columns Δp, Δr, Δs.
-        gradients: gradients of the same shapes in the last iteration, layers first.
-        optimizers: of the layers and of the deltas.
-        means, factors: [N] of vec3 and mat33, all Gaussians. turns: [M] of vec4 (w, x, y, z), rotation since Θ_{t−1}.
-        unsound: [1] number of moving Gaussians that are not finite; they stay unchanged.
+        clusters: [K, 10] parameters of each layer, with columns r, t, c, s of equation (6).
+        deltas: [M, 9] per-Gaussian deltas, with columns Δp, Δr, Δs.
+        gradients: gradients of the last iteration, first those of ``clusters``, then those of ``deltas``.
+        optimizers: optimizers for the layers, followed by the optimizer for the deltas.
+        means: [N] vec3 means of all Gaussians.
+        factors: [N] mat33 covariance factors of all Gaussians.
+        turns: [M] vec4 rotations since Θ_{t−1}, as quaternions (w, x, y, z).
+        unsound: [1] number of moving Gaussians with non-finite values, which stay unchanged.
     """
 
     def __init__(self, device: str, plan: UpdatePlan, structure: Structure, records: StepRecords) -> None:
@@ -80,7 +85,7 @@ class WarpDeformation:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, ndim=dimensions, device=self._device)
 
     def load_state(self, means: wp.array, factors: wp.array) -> None:
-        """Loads Θ_{t−1}: means and factors, [N] of vec3 and mat33."""
+        """Loads the means ([N] vec3) and factors ([N] mat33) of Θ_{t−1}."""
         for array, values in (
             (self._previous_means, means), (self._previous_factors, factors), (self.means, means),
             (self.factors, factors),
@@ -93,7 +98,7 @@ class WarpDeformation:
 
     @property
     def previous(self) -> tuple[wp.array, wp.array]:
-        """Means and factors of Θ_{t−1}, [N] of vec3 and mat33."""
+        """Means ([N] vec3) and factors ([N] mat33) of Θ_{t−1}."""
         return self._previous_means, self._previous_factors
 
     def set_tables(self, tables: Tables) -> None:
@@ -105,7 +110,7 @@ class WarpDeformation:
         """Starts an attempt from the current parameters; ``restart`` must follow.
 
         Returns:
-            Whether buffers were replaced, which invalidates captured graphs.
+            Whether buffers were reallocated, which invalidates captured graphs.
         """
         for table, saved in zip([*self.clusters, self.deltas], self._saved, strict=True):
             wp.copy(saved, table)
@@ -120,7 +125,7 @@ class WarpDeformation:
         return replaced
 
     def restart(self, start: AttemptStart) -> None:
-        """Returns to the parameters at the beginning of the attempt, with zero moments."""
+        """Restores the parameters from the start of the attempt, with zero moments."""
         betas = start.beta1, start.beta2
         for optimizer, columns in zip(self.optimizers, [*start.cluster_columns, start.delta_columns], strict=True):
             optimizer.begin(columns, betas)
@@ -128,7 +133,7 @@ class WarpDeformation:
             wp.copy(table, saved)
 
     def scalars(self, step: StepScalars) -> list[float]:
-        """Returns the scalars of an iteration for ``StepRecords.write``: weights, then those of each optimizer."""
+        """Returns an iteration's scalars for ``StepRecords.write``: weights, then each optimizer's scalars."""
         plan, pairs = self._plan, 1
         if self._graph is not None:
             pairs = max(1, self._sample_sizes[step.sample] * self._graph.index.shape[1])
@@ -138,10 +143,10 @@ class WarpDeformation:
         return scalars
 
     def forward(self, unchanged: int = 0) -> None:
-        """Evaluates equations (5) to (7); fills ``means``, ``factors`` and ``turns``.
+        """Evaluates equations (5) to (7) and fills ``means``, ``factors`` and ``turns``.
 
         Args:
-            unchanged: number of layers, starting with the coarsest, that have not changed since the last call.
+            unchanged: number of layers, counted from the coarsest, that have not changed since the last call.
         """
         for layer in range(unchanged, len(self.clusters)):
             table = self.clusters[layer]
@@ -156,12 +161,14 @@ class WarpDeformation:
         return self._points[layer], self._jacobians[layer], self._turned[layer]
 
     def backward(self, g_means: wp.array, g_factors: wp.array, frozen: int, losses: wp.array) -> None:
-        """Computes the gradients and steps all parameters, except those of frozen layers.
+        """Computes gradients and takes an Adam step for all parameters except those of frozen layers.
 
         Args:
-            g_means, g_factors: [N] of vec3 and mat33, gradients of the rendering losses.
-            frozen: number of frozen layers, starting with the coarsest.
-            losses: weighted terms by iteration, excluding rendering losses; added to.
+            g_means: [N] vec3 gradients of the rendering losses with respect to the means.
+            g_factors: [N] mat33 gradients of the rendering losses with respect to the factors.
+            frozen: number of frozen layers, counted from the coarsest.
+            losses: weighted losses of each iteration, excluding rendering losses. The losses of the deformation are
+                added.
         """
         device, iteration = self._device, self._records.iteration
         if self._plan.neighbour_terms and self._graph is not None:

@@ -1,4 +1,4 @@
-"""Description of the device that runs the kernels."""
+"""Textual description of a Warp device."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import warp as wp
 
 
 def describe(name: str) -> str:
-    """Returns the name, memory and versions of a Warp device, such as "cuda:0", in one line."""
+    """Returns one line with the name, memory and versions of a Warp device such as "cuda:0"."""
     device = wp.get_device(name)
     if not device.is_cuda:
         return f"kernels run on the CPU device of NVIDIA Warp {wp.config.version}"

@@ -1,4 +1,4 @@
-"""Reads of device memory by the host: several arrays with one wait."""
+"""Downloads from device memory that wait only once for several arrays."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 
 class Downloads:
-    """Copies arrays to the host, through page-locked buffers that are allocated once.
+    """Copies arrays to the host through page-locked buffers that are allocated once.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
-        waits: number of times that the host waited for the device.
+        waits: number of times the host has waited for the device.
     """
 
     def __init__(self, device: str) -> None:
@@ -23,7 +23,7 @@ class Downloads:
         self.waits = 0
 
     def read(self, *arrays: wp.array) -> list[NDArray[Any]]:
-        """Returns copies of arrays, after everything enqueued before has finished."""
+        """Waits for all work enqueued so far, and returns host copies of the arrays."""
         self.waits += 1
         if not self._device.is_cuda:
             return [array.numpy().copy() for array in arrays]

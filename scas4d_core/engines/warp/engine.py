@@ -1,8 +1,8 @@
-"""GPU engine: one iteration of an update in Warp, in the order of algorithm 1.
+"""GPU engine for updates in Warp, which runs each iteration in the order of algorithm 1.
 
-The launches of an iteration are captured in a CUDA graph. What changes between iterations is read from device memory
-(``StepRecords``), so that the host only enqueues. It reads losses and results when the loop asks for them. If tile
-lists turn out to be too small, the attempt is repeated with larger ones.
+The kernel launches of an iteration are captured in a CUDA graph. Kernels read all values that change between iterations
+from device memory (``StepRecords``), so the host only enqueues graphs. It downloads losses and results when the update
+loop requests them. If a tile list turns out to be too small, the lists are enlarged and the attempt is repeated.
 """
 
 from __future__ import annotations
@@ -46,22 +46,25 @@ from scas4d_core.guards import GuardCounts, summed
 Array = NDArray[np.float32]
 
 MOST_VIEWS = 64
-"""Largest number of views per iteration."""
+"""Maximum number of views per iteration."""
 LOG_ROWS = 1024
-"""Renderings that the device logs before the host reads them."""
+"""Maximum number of renderings that the device logs before the host must read the log."""
 ITERATIONS = "iterations"
-"""Stage of an update in which the host enqueues iterations."""
+"""Name of the update stage in which the host enqueues iterations."""
 AHEAD = 2
-"""Iterations that may be pending while the time limit of an update is checked."""
+"""Maximum number of pending iterations while an update checks its time limit."""
 
 
 class Variant(NamedTuple):
-    """What determines the launches of an iteration.
+    """Parameters that determine the kernel launches of an iteration.
 
     Attributes:
-        views: number of views. unchanged: layers whose output is that of the previous iteration.
-        frozen: layers without backward pass. keeps: whether the renderings are kept.
-        smooths: whether the gloss is smoothed. smooths_first: whether this is the first time in the attempt.
+        views: number of views.
+        unchanged: number of layers whose output has not changed since the previous iteration.
+        frozen: number of layers without a backward pass.
+        keeps: whether the renderings are kept.
+        smooths: whether the gloss is smoothed after this iteration.
+        smooths_first: whether the gloss is smoothed for the first time in this attempt.
     """
 
     views: int
@@ -73,14 +76,14 @@ class Variant(NamedTuple):
 
 
 class WarpEngine:
-    """The ``UpdateEngine`` based on NVIDIA Warp, on a GPU or on Warp's CPU device.
+    """The ``UpdateEngine`` implementation in NVIDIA Warp, for GPUs and Warp's CPU device.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
-        renderer: renderer of states with the background and limits of the plan.
-        downloads: reads of device memory by the host.
+        renderer: renderer for states, with the background and limits of the plan.
+        downloads: helper that copies device arrays to the host.
     """
 
     name = "warp"
@@ -91,11 +94,11 @@ class WarpEngine:
         self.downloads = Downloads(device)
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """See ``UpdateEngine.bind``; this engine supports all options of a plan."""
+        """See ``UpdateEngine.bind``. This engine supports all plans."""
         self._plan, self._structure, self._rows = plan, structure, structure.hierarchy.rows
         count, device, layers = len(structure.roots), self._device, len(structure.hierarchy.sizes)
         self.renderer = WarpRenderer(plan.background, plan.limits, device, plan.image)
-        # The optimizers: one per layer, then those of the deltas, the colours, the gloss and the environment.
+        # Optimizers: one per layer, followed by one each for the deltas, colours, gloss and environment.
         self._records = StepRecords(device, layers + 4, MOST_VIEWS, LOG_ROWS)
         _, colours, *self._gloss_scalars = (self._records.optimizer(layers + k) for k in range(4))
         self._deformation = WarpDeformation(device, plan, structure, self._records)
@@ -136,7 +139,7 @@ class WarpEngine:
         self._reset()
 
     def _load_gloss(self) -> None:
-        """Loads the gloss of Θ_{t−1}, if it has one."""
+        """Loads the gloss of Θ_{t−1}, if any."""
         previous, before = self._previous, self._gloss
         if previous.gloss is None or previous.environment is None:
             self._gloss = None
@@ -149,7 +152,7 @@ class WarpEngine:
 
     @property
     def _learnt_gloss(self) -> WarpGloss | None:
-        """The gloss, if the plan learns it; otherwise iterations render without gloss."""
+        """The gloss if the plan learns it, otherwise None; iterations then render without gloss."""
         return self._gloss if self._plan.gloss else None
 
     def set_tables(self, tables: Tables) -> None:
@@ -161,7 +164,7 @@ class WarpEngine:
         """See ``UpdateEngine.begin``."""
         self._start = start
         replaced = self._deformation.begin(start)
-        # Graphs contain the addresses of buffers and the values of Adam's decay rates.
+        # Graphs contain buffer addresses and Adam's decay rates.
         captured_for = start.beta1, start.beta2, start.gains is None, self._pictures.generation
         if replaced or captured_for != self._captured_for:
             self._graphs.forget()
@@ -169,7 +172,7 @@ class WarpEngine:
         self._reset()
 
     def _reset(self) -> None:
-        """Returns what iterations change to the beginning of the attempt."""
+        """Restores everything that iterations modify to the start of the attempt."""
         wp.copy(self._features, self._previous_features)
         self._losses.zero_()
         self._log, self._history = IterationLog(), list[tuple[Sequence[int], StepScalars | None]]()
@@ -191,10 +194,12 @@ class WarpEngine:
         """See ``UpdateEngine.iterate``.
 
         Raises:
-            ValueError: more than ``MOST_VIEWS`` views.
+            ValueError: if there are more than ``MOST_VIEWS`` views.
         """
         if len(views) > MOST_VIEWS:
-            raise ValueError(f"update.views: {len(views)} views per iteration; this engine has room for {MOST_VIEWS}")
+            raise ValueError(
+                f"update.views: {len(views)} views per iteration, but this engine supports at most {MOST_VIEWS}"
+            )
         if self._used_rows + len(views) > LOG_ROWS:
             self._settle()
         self._history.append((views, step))
@@ -211,11 +216,11 @@ class WarpEngine:
         self._pending.append(views)
         self._used_rows += len(views)
         self._unchanged, self._smoothed = step.frozen, self._smoothed or step.smooth_gloss
-        assert self._start is not None  # iterations follow `begin`
+        assert self._start is not None  # `begin` is called before iterations
         self._start.lap(ITERATIONS)
 
     def _slot(self, view: int) -> int:
-        """Returns the slot for a rendering of a view, as ``IterationLog.keep`` replaces kept pictures."""
+        """Returns the slot for a view's rendering, following the replacement order of ``IterationLog.keep``."""
         self._keeps_unread = True
         slot = self._slots.pop(view, len(self._slots))
         if slot == KEPT_PICTURES:
@@ -224,7 +229,7 @@ class WarpEngine:
         return slot
 
     def _scalars(self, step: StepScalars) -> list[float]:
-        """Returns the scalars of an iteration for ``StepRecords.write``; counts the steps of all optimizers."""
+        """Returns an iteration's scalars for ``StepRecords.write``, and advances the step counts of all optimizers."""
         scalars = self._deformation.scalars(step)
         idle = [0.0, 1.0, 1.0]
         scalars += idle if self._colours is None else self._colours.optimizer.next_scalars(step.colour)
@@ -234,7 +239,7 @@ class WarpEngine:
         return scalars
 
     def _launch(self, variant: Variant) -> None:
-        """Enqueues an iteration."""
+        """Enqueues the kernel launches of an iteration."""
         deformation, pictures, gloss = self._deformation, self._pictures, self._learnt_gloss
         deformation.forward(variant.unchanged)
         for place in range(variant.views):
@@ -250,7 +255,7 @@ class WarpEngine:
                 gloss.smooth(variant.smooths_first)
 
     def _launch_view(self, place: int, variant: Variant) -> None:
-        """Enqueues the rendering of a view of the iteration and its backward pass."""
+        """Enqueues the rendering and backward pass for one of the iteration's views."""
         deformation, pictures, gloss = self._deformation, self._pictures, self._learnt_gloss
         view, record, slot = self._records.view(place)
         shapes = deformation.means, deformation.factors, self._opacities
@@ -276,23 +281,24 @@ class WarpEngine:
             self._gains.leave_out(left_out)
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``; at most ``AHEAD`` iterations stay pending."""
+        """See ``UpdateEngine.wait``. At most ``AHEAD`` iterations stay pending."""
         if wp.get_device(self._device).is_cuda:
             self._events.append(wp.get_stream(self._device).record_event())
             if len(self._events) > AHEAD:
                 wp.synchronize_event(self._events.popleft())
 
     def _settle(self) -> None:
-        """Reads the log of all pending iterations; the attempt is repeated while tile lists are too small."""
+        """Reads the log of all pending iterations, repeating the attempt until all tile lists are large enough."""
         while self._pending and self._read_log() is None:
             pass
 
     def _read_log(self, probes: int = 0) -> Array | None:
-        """Reads the log of the pending iterations and the rows of probes; waits for the device.
+        """Waits for the device, and reads the log of the pending iterations and the log rows of the probes.
 
         Returns:
-            [probes, 8] rows of the probes; None if a picture was incomplete, because the tile lists were too small. The
-            lists are larger then, and the iterations have been repeated.
+            [probes, 8] log rows of the probes, or None if an image was incomplete because its tile lists were too
+            small. In this case, the lists have been enlarged. If an iteration was affected, all iterations have been
+            enqueued again.
         """
         log, losses = self.downloads.read(self._pictures.log, self._losses)
         rows, probed = log[: self._used_rows], log[LOG_ROWS : LOG_ROWS + probes]
@@ -312,7 +318,7 @@ class WarpEngine:
         return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else probed
 
     def _repeat(self) -> None:
-        """Repeats all iterations of the attempt, after buffers were replaced."""
+        """Enqueues all iterations of the attempt again, after buffers were reallocated."""
         self._graphs.forget()
         history = self._history
         self._pictures.forget_guards()
@@ -332,7 +338,7 @@ class WarpEngine:
                 return [float(loss) for loss in rows[:, IMAGE_LOSS]]
 
     def _launch_probes(self, which: Iterable[int], moved: bool, learnt: bool) -> None:
-        """Enqueues the renderings of probe views; see ``UpdateEngine.probe``."""
+        """Enqueues renderings of probe views; see ``UpdateEngine.probe``."""
         deformation, pictures = self._deformation, self._pictures
         means, factors = deformation.previous
         if moved:
@@ -370,7 +376,7 @@ class WarpEngine:
         return self._log
 
     def _guards(self) -> dict[str, int]:
-        """Returns the number of times that each guard was triggered; waits for the device."""
+        """Waits for the device, and returns the number of times that each guard was triggered."""
         optimizers = [*self._deformation.optimizers]
         optimizers += [] if self._colours is None else [self._colours.optimizer]
         optimizers += [] if self._learnt_gloss is None else self._learnt_gloss.optimizers
@@ -412,7 +418,7 @@ class WarpEngine:
         return self._gains.finish(self._pictures.exposures)
 
     def gradients(self) -> dict[str, Array]:
-        """See ``UpdateEngine.gradients``; those of frozen layers are not up to date."""
+        """See ``UpdateEngine.gradients``. The gradients of frozen layers are outdated."""
         *clusters, deltas = self.downloads.read(*self._deformation.gradients)
         tables = {f"cluster {k}": gradient for k, gradient in enumerate(clusters)} | {"deltas": deltas}
         if self._colours is not None:
@@ -423,19 +429,19 @@ class WarpEngine:
 
 
 def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
-    """Returns the record of a rendering from its row of the device's log."""
+    """Converts a row of the device's log to the record of a rendering."""
     height, width = view.target.shape[1:]
     red, green, blue = row[SHIFT : SHIFT + LABEL].tolist()
     return ViewRecord(index, psnr_of(float(row[SQUARES]), height * width), (red, green, blue))
 
 
 def guard_counts(names: Sequence[str], values: NDArray[np.int32]) -> GuardCounts:
-    """Converts counts from the device."""
+    """Converts guard counts from the device."""
     counts = GuardCounts(*names)
     counts.add(names, values.astype(np.int64))
     return counts
 
 
 def _as_table(rows: wp.array) -> wp.array:
-    """Views [N] of vec4 as a table [N, 4] without copying."""
+    """Returns a [N, 4] float32 view of a [N] vec4 array, without copying."""
     return wp.array(ptr=rows.ptr, dtype=wp.float32, shape=(rows.shape[0], 4), device=rows.device)

@@ -1,4 +1,4 @@
-"""GPU engine for fits: one iteration of 3D Gaussian Splatting in Warp."""
+"""GPU engine for fits, which runs single iterations of 3D Gaussian Splatting in Warp."""
 
 from __future__ import annotations
 
@@ -33,16 +33,17 @@ Array = NDArray[np.float32]
 
 @wp.kernel
 def skip_incomplete(capacity: wp.int32, log: wp.array2d[wp.float32], scalars: wp.array[wp.float32]) -> None:
-    """Sets the factors of all optimizers to 0 if the tile lists were too small, with one thread per optimizer."""
+    """Sets each optimizer's factor to 0 if the tile lists were too small, with one thread per optimizer."""
     if log[0, PAIRS] > wp.float32(capacity):
         scalars[SCALARS * wp.tid()] = 0.0
 
 
 class _Shapes(NamedTuple):
-    """Arrays that are rendered for a view: the fixed Gaussians, followed by the fitted ones.
+    """Arrays to render for a view, with the fixed Gaussians followed by the fitted ones.
 
     Attributes:
-        fixed: number of fixed Gaussians. means, factors, opacities, features: of vec3, mat33, float32 and vec4.
+        fixed: number of fixed Gaussians.
+        means, factors, opacities, features: arrays of type vec3, mat33, float32 and vec4, respectively.
     """
 
     fixed: int
@@ -57,12 +58,12 @@ class _Shapes(NamedTuple):
         return cls(0, *(wp.zeros(count, dtype=kind, device=device) for kind in kinds))
 
     def since(self, row: int) -> _Shapes:
-        """Returns views of the rows from ``row`` onwards."""
+        """Returns array views of all rows from ``row`` onwards."""
         return _Shapes(0, *(array[row:] for array in self[1:]))
 
     @classmethod
     def beside(cls, fixed: Gaussians, camera: CameraArrays, count: int, device: str) -> _Shapes:
-        """Returns arrays of the fixed Gaussians, as the camera sees them, with space for ``count`` fitted ones."""
+        """Returns arrays with the fixed Gaussians as seen by a camera, and space for ``count`` fitted Gaussians."""
         rows = len(fixed)
         made = cls.empty(rows + count, device)._replace(fixed=rows)
         if rows:
@@ -73,10 +74,11 @@ class _Shapes(NamedTuple):
 
 
 class WarpFitEngine:
-    """The ``FitEngine`` based on NVIDIA Warp. The host waits once per iteration, for its loss.
+    """The ``FitEngine`` implementation in NVIDIA Warp. The host waits once per iteration, to read its loss.
 
     Args:
-        renderer: renderer that also defines the device. mask_weight: weight of the mask loss.
+        renderer: renderer, which also defines the device.
+        mask_weight: weight of the mask loss.
     """
 
     def __init__(self, renderer: WarpRenderer, mask_weight: float) -> None:
@@ -100,7 +102,7 @@ class WarpFitEngine:
     def load_table(self, table: FitTable) -> None:
         """See ``FitEngine.load_table``."""
         if not isinstance(table.gloss, GlossShading | None):
-            raise EngineError("warp", ["a gloss of another engine"])
+            raise EngineError("warp", ["gloss from another engine"])
         device, count = self._device, len(table.parameters)
         self._table, self._count = table, count
         self._parameters = wp.array(table.parameters, dtype=wp.float32, ndim=2, device=device)
@@ -123,7 +125,7 @@ class WarpFitEngine:
         self._load_gloss(table.gloss, most)
 
     def _load_gloss(self, shading: GlossShading | None, most: int) -> None:
-        """Loads gloss and environment with their moments; ``most``: largest number of rendered Gaussians."""
+        """Loads gloss and environment with their moments; ``most`` is the largest number of rendered Gaussians."""
         self._gloss: GlossTables | None = None
         if shading is not None:
             self._seen = wp.zeros(most, dtype=wp.vec4, device=self._device)
@@ -155,7 +157,7 @@ class WarpFitEngine:
         return FitLoss(view, row[IMAGE_LOSS] + row[MASK_LOSS], psnr, exposure_gradient, shift)
 
     def _launch(self, shapes: _Shapes, scalars: Sequence[float]) -> NDArray[np.float64]:
-        """Runs an iteration and returns its row of the log; nothing is stepped if the tile lists are too small."""
+        """Runs an iteration and returns its log row. If the tile lists are too small, no parameter is updated."""
         device, gloss, rasterizer = self._device, self._gloss, self._rasterizer
         self._scalars.assign(np.array(scalars, np.float32))
         given = [shapes.fixed, self._parameters, *shapes[1:]]
@@ -209,7 +211,7 @@ class WarpFitEngine:
         return self._table
 
     def _read_gloss(self, shading: FitGloss | None) -> FitGloss | None:
-        """Copies gloss, environment and moments from the device to the host's shading, and returns it."""
+        """Copies gloss, environment and moments from the device to ``shading``, and returns ``shading``."""
         if self._gloss is not None and isinstance(shading, GlossShading):
             for table, optimizer, values, moments in zip(
                 self._gloss.tables, self._gloss.optimizers, (shading.gloss, shading.environment), shading.moments,

@@ -30,12 +30,13 @@ FOOT_, DARK_, SATURATED_, SHARE_, ENOUGH_, LOG_LARGEST = (
     wp.constant(wp.float32(value)) for value in (FOOT, DARK, SATURATED, SHARE, ENOUGH, log(LARGEST))
 )
 BLOCK = 256
-"""Threads of the block that measures one channel."""
+"""Number of threads in the block that measures one channel."""
 MOST_SAMPLED = 4 * LOOKED_AT
-"""Upper bound of the pixels sampled per picture; the step between them is rounded down to whole pixels."""
+"""Upper bound on the number of pixels sampled per image; the sampling step is rounded down to whole pixels."""
 
 
-# The ratios are positive, so their bits sort like their values: the rank is found bit by bit from the top.
+# The ratios are positive, so their bit patterns sort like their values. The element of a given rank is therefore found
+# bit by bit, starting with the highest bit.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 __shared__ int total;
@@ -71,7 +72,7 @@ return result.number;
 def value_of_rank(
     thread: wp.int32, ratios: wp.array[wp.float32], first: wp.int32, count: wp.int32, rank: wp.int32
 ) -> wp.float32:
-    """Returns the element of a rank among positive numbers; called by all threads of one block."""
+    """Returns the element with a given rank among positive numbers. All threads of one block must call it."""
     ...
 
 
@@ -96,12 +97,17 @@ def measure_gain(
     counts: wp.array[wp.int32],
     gain: wp.array[wp.float32],
 ) -> None:
-    """Measures the gain of a picture relative to its rendering, with one block per channel.
+    """Measures the gain of an image relative to its rendering, with one block per channel.
 
     Args:
-        threads: threads of a block, 1 on the CPU device. planes: [5, rows, columns] rendering without exposure.
-        targets: [views, 4, rows, columns]. ratios: [3 ``MOST_SAMPLED``] buffer. counts: [3] buffer.
-        gain: out [3] median ratio per channel, or NaN with too few usable pixels.
+        threads: number of threads per block, 1 on the CPU device.
+        cameras: [views] cameras of all views.
+        view: [1] index of the view.
+        planes: [5, rows, columns] rendering, before the camera's exposure is applied.
+        targets: [views, 4, rows, columns] training images and masks.
+        ratios: [3 · ``MOST_SAMPLED``] scratch buffer.
+        counts: [3] scratch buffer.
+        gain: [3] output, median ratio of each channel; NaN if there are too few usable pixels.
     """
     channel = wp.tid() // threads
     thread = wp.tid() - channel * threads
@@ -135,11 +141,13 @@ def measure_gain(
 def end_round(
     cameras: wp.int32, measured: wp.array2d[wp.float32], pending: wp.array[wp.int32], gains: wp.array2d[wp.float32]
 ) -> None:
-    """Updates the gains with the measurements of a round over the cameras; see ``exposure.update_gains``.
+    """Updates the gains from the measurements of one round; see ``exposure.update_gains``.
 
     Args:
-        cameras: number of cameras that take part. measured: [cameras, 3]. pending: [cameras] 1 if measured; reset.
-        gains: [cameras, 3].
+        cameras: number of cameras that contribute to the frame.
+        measured: [cameras, 3] measured gains.
+        pending: [cameras] 1 for cameras measured in this round; reset to 0.
+        gains: [cameras, 3] current gains, updated in place.
     """
     known = wp.int32(0)
     for row in range(gains.shape[0]):
@@ -175,13 +183,16 @@ def record_gain(
     gains: wp.array2d[wp.float32],
     exposures: wp.array2d[wp.vec2],
 ) -> None:
-    """Records a measured gain; the second rendering of a camera starts a new round. Launched with one thread.
+    """Records a measured gain. A camera's second rendering starts a new round. Launched with one thread.
 
     Args:
-        view: [1] index of the view, or −1 to end the round. rows: [views and probes] row of each camera.
-        takes_part: [views and probes] 1 if the exposure follows the gain. views: number of views without probes.
-        gain: [3] from ``measure_gain``. measured, pending, gains: see ``end_round``.
-        exposures: [views and probes, 4] gain and offset, updated when a round ends.
+        view: [1] index of the view, or −1 to end the round.
+        rows: [views and probes] row of each view's camera in ``gains``.
+        takes_part: [views and probes] 1 if the view's exposure follows the camera gain, otherwise 0.
+        views: number of views, excluding probes.
+        gain: [3] output of ``measure_gain``.
+        measured, pending, gains: see ``end_round``.
+        exposures: [views and probes, 4] gain and offset of each channel, updated when a round ends.
     """
     row = wp.int32(-1)
     if view[0] >= 0:
@@ -206,10 +217,11 @@ def record_gain(
 
 
 class WarpGains:
-    """Camera gains of an attempt, which set the exposures of views and probes.
+    """Camera gains of an attempt, which determine the exposures of views and probes.
 
     Args:
-        device: Warp device. cameras: number of cameras of the rig.
+        device: Warp device.
+        cameras: number of cameras in the rig.
     """
 
     def __init__(self, device: str, cameras: int) -> None:
@@ -224,13 +236,14 @@ class WarpGains:
         self._rows, self._views = wp.zeros(0, dtype=wp.int32, device=device), 0
 
     def load_views(self, rows: list[int], views: int) -> bool:
-        """Sets the row of the camera of each view, followed by those of the probes.
+        """Loads the camera row of each view and probe.
 
         Args:
-            views: number of views without probes.
+            rows: row of each view's camera in the gains, followed by the rows for the probes.
+            views: number of views, excluding probes.
 
         Returns:
-            Whether buffers were replaced, which invalidates captured graphs.
+            Whether buffers were reallocated, which invalidates captured graphs.
         """
         replaced = bool(len(rows) != self._rows.shape[0] or views != self._views)
         if replaced:
@@ -240,10 +253,11 @@ class WarpGains:
         return replaced
 
     def begin(self, gains: Array, exposures: wp.array) -> None:
-        """Starts an attempt.
+        """Starts an attempt with the given gains.
 
         Args:
-            gains: [cameras, 3] initial gains. exposures: [views and probes, 4] of vec2, set to them.
+            gains: [cameras, 3] initial gains.
+            exposures: [views and probes, 4] vec2 exposures, set to the initial gains.
         """
         self._gains.assign(gains)
         self._pending.zero_()
@@ -255,14 +269,14 @@ class WarpGains:
         exposures.assign(values)
 
     def leave_out(self, views: set[int]) -> None:
-        """Excludes views from further rounds; their exposures, and those of their probes, stay unchanged."""
+        """Excludes views from further rounds. The exposures of these views and their probes stay unchanged."""
         rows = {self._host_rows[view] for view in views}
         self._takes_part.assign([int(row not in rows) for row in self._host_rows])
 
     def record(
         self, cameras: wp.array, view: wp.array, planes: wp.array, targets: wp.array, exposures: wp.array
     ) -> None:
-        """Measures a camera's gain in its rendering, and ends the round if this camera was measured in it before."""
+        """Measures a camera's gain from a rendering. If the camera was already measured, a new round starts first."""
         inputs = [self._threads, cameras, view, planes, targets, self._ratios, self._counts, self._gain]
         wp.launch(measure_gain, 3 * self._threads, inputs, device=self._device, block_dim=BLOCK)
         self._record(view, exposures)
@@ -273,7 +287,7 @@ class WarpGains:
         wp.launch(record_gain, 1, given + state, device=self._device)
 
     def finish(self, exposures: wp.array) -> Array:
-        """Ends the round and returns the [cameras, 3] gains; waits for the device."""
+        """Ends the round, waits for the device, and returns the gains [cameras, 3]."""
         self._record(self._end, exposures)
         gains: Array = self._gains.numpy().copy()
         return gains

@@ -1,4 +1,4 @@
-"""Per-Gaussian deltas, equation (5), with the scale and floor terms; reference: ``engines.torch``."""
+"""Per-Gaussian deltas of equation (5), with the scale and floor losses; reference: ``engines.torch``."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Terms:
-    """Weights and constants of the per-Gaussian terms.
+    """Weights and constants of the per-Gaussian losses.
 
     Attributes:
-        separate: 1: the Jacobian does not transform the covariance.
-        axis_length, floor: weights per axis and per Gaussian; 0: no such term. plane: plane of the floor.
+        separate: 1 if the Jacobian does not transform the covariance, otherwise 0.
+        axis_length: weight of the scale loss per axis; 0 disables the loss.
+        floor: weight of the floor loss per Gaussian; 0 disables the loss.
+        plane: floor plane; see ``UpdatePlan.floor``.
     """
 
     separate: wp.int32
@@ -35,13 +37,13 @@ class Terms:
 
 @wp.func
 def delta(deltas: wp.array2d[wp.float32], entry: wp.int32, first: wp.int32) -> wp.vec3:
-    """Reads three columns of a row of the deltas."""
+    """Returns three columns of a Gaussian's deltas, starting at column ``first``."""
     return wp.vec3(deltas[entry, first], deltas[entry, first + 1], deltas[entry, first + 2])
 
 
 @wp.func
 def stretch(ds: wp.vec3) -> wp.mat33:
-    """Returns diag(exp Δs), with clamped arguments."""
+    """Returns diag(exp Δs), with clamped exponents."""
     return wp.diag(
         wp.vec3(
             wp.exp(wp.clamp(ds[0], -LARGEST, LARGEST)),
@@ -61,12 +63,15 @@ def take_moving(
     turns: wp.array[wp.vec4],
     unsound: wp.array[wp.int32],
 ) -> None:
-    """Gathers the moving Gaussians of Θ_{t−1}, with one thread each.
+    """Gathers the moving Gaussians of Θ_{t−1}, with one thread per Gaussian.
 
     Args:
-        rows: [M] rows of the Gaussians in Θ. previous_means, previous_factors: [N] of Θ_{t−1}.
-        sound: out [M] 1 for entries that are finite. points: out [M]. turns: out [M] identity.
-        unsound: [1], to which the number of other entries is added.
+        rows: [M] rows of the moving Gaussians in Θ_{t−1}.
+        previous_means, previous_factors: [N] means and factors of Θ_{t−1}.
+        sound: [M] output, 1 for entries with finite values, otherwise 0.
+        points: [M] output, means of the moving Gaussians.
+        turns: [M] output, identity quaternions.
+        unsound: [1] count to which the number of entries with non-finite values is added.
     """
     entry = wp.tid()
     mean = previous_means[rows[entry]]
@@ -94,13 +99,18 @@ def apply_deltas(
     tied_means: wp.array[wp.vec3],
     tied_turns: wp.array[wp.vec4],
 ) -> None:
-    """Applies Δp, ΔR, Δs after the cascade, with one thread per moving Gaussian.
+    """Applies Δp, ΔR and Δs after the cascade, with one thread per moving Gaussian.
 
     Args:
-        rows: [M] rows of the Gaussians in Θ. sound: [M] 1 for entries that are finite; others stay unchanged.
-        points, jacobians, turned: [M] after the cascade. previous_factors: [N] of Θ_{t−1}. deltas: [M, 9].
-        means, factors: out [N], the moving rows. turns: out [M] unit quaternions with w ≥ 0.
-        tied_means, tied_turns: [M] gradients of the neighbour terms, set to 0.
+        terms: constants; only ``separate`` is used.
+        rows: [M] rows of the moving Gaussians in Θ_t.
+        sound: [M] 1 for entries with finite values, otherwise 0; the Gaussians of other entries stay unchanged.
+        points, jacobians, turned: [M] points, Jacobians and rotations after the cascade.
+        previous_factors: [N] covariance factors of Θ_{t−1}.
+        deltas: [M, 9] per-Gaussian deltas.
+        means, factors: [N] outputs, written at ``rows``.
+        turns: [M] output, rotations since Θ_{t−1} as unit quaternions with w ≥ 0.
+        tied_means, tied_turns: [M] gradients of the neighbour terms, reset to 0.
     """
     entry = wp.tid()
     tied_means[entry] = wp.vec3(0.0, 0.0, 0.0)
@@ -141,17 +151,21 @@ def apply_deltas_backward(
     iteration: wp.array[wp.int32],
     losses: wp.array[wp.float32],
 ) -> None:
-    """Backpropagates gradients of the moved Gaussians to deltas and cascade, and steps the deltas.
+    """Backpropagates through ``apply_deltas``, and takes an Adam step for the deltas.
 
-    Adds the scale and floor terms.
+    It also adds the scale and floor losses and their gradients.
 
     Args:
         terms, rows, sound, jacobians, turned, previous_factors, deltas: see ``apply_deltas``.
-        length_bounds: [M] metres; longer axes are penalized (equation (8)). means, factors: [N] after deformation.
-        g_means, g_factors: [N] gradients of the rendering losses. tied_means, tied_turns: [M] of the neighbour terms.
-        g_points, g_jacobians, g_turned: out [M] gradients of the cascade's outputs. g_deltas: out [M, 9].
-        adam: optimizer of the deltas.
-        iteration: [1] row of ``losses``, to which the weighted scale and floor terms are added.
+        length_bounds: [M] axis lengths above which the scale loss (equation (8)) applies, in metres.
+        means, factors: [N] deformed means and factors.
+        g_means, g_factors: [N] gradients of the rendering losses.
+        tied_means, tied_turns: [M] gradients of the neighbour terms.
+        g_points, g_jacobians, g_turned: [M] outputs, gradients of the cascade's results.
+        g_deltas: [M, 9] output, gradients of the deltas.
+        adam: optimizer for the deltas.
+        iteration: [1] row of ``losses`` for this iteration.
+        losses: weighted losses of each iteration, to which the scale and floor losses are added.
     """
     entry = wp.tid()
     if sound[entry] == 0:

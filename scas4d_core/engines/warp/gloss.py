@@ -1,6 +1,6 @@
 """View-dependent colours on the device; formula: ``kernels.appearance.direction``, reference: ``engines.torch.gloss``.
 
-Gloss and environment are parameters of an attempt, as in ``engines.cpu.gloss``.
+Gloss and environment are optimized during an attempt, as in ``engines.cpu.gloss``.
 """
 
 from __future__ import annotations
@@ -37,18 +37,28 @@ FALL, DARK, OVER, DULL = (
 )
 SAME_SIDE_COSINE = wp.constant(wp.float32(SAME_SIDE))
 BETAS = 0.9, 0.999
-"""Adam's decay rates."""
+"""Adam decay rates of gloss and environment."""
 STEP = wp.constant(wp.float32((direction.SIDE - 1) / 2))
 
 
 @wp.struct
 class Reflection:
-    """Reflected direction of a Gaussian, and the cell of the environment that it meets.
+    """Reflected direction of a Gaussian, and the environment cell in this direction.
 
     Attributes:
-        valid: 0 if the Gaussian reflects nothing to the camera. strength: s. normal, view: n and v. cosine: μ = n·v.
-        middle: x − x₀. direction: r + k (x − x₀). length: its Manhattan norm. sign_x, sign_y: signs of the direction.
-        cell, u, v: cell, and position within it. grazing: (1 − μ)⁴. left: fraction of the diffuse light.
+        valid: 0 if the Gaussian reflects no light towards the camera, otherwise 1.
+        strength: gloss strength s.
+        normal: normal n.
+        view: direction v to the camera.
+        cosine: cosine μ = n·v.
+        middle: offset x − x₀ from the scene centre, in metres.
+        direction: lookup direction r + k (x − x₀), not normalized.
+        length: Manhattan norm of the direction.
+        sign_x, sign_y: signs of the direction.
+        cell: environment cell in this direction.
+        u, v: position within the cell.
+        grazing: factor f = (1 − μ)⁴ of the sheen.
+        left: remaining fraction of the diffuse light.
     """
 
     valid: wp.int32
@@ -72,7 +82,7 @@ class Reflection:
 def reflection_of(
     mean: wp.vec3, gloss: wp.vec3, turn: wp.vec4, environment: wp.array2d[wp.float32], camera: Camera
 ) -> Reflection:
-    """Returns the reflection that a camera sees in a Gaussian."""
+    """Returns the reflection of a Gaussian towards a camera."""
     made = Reflection()
     made.strength = wp.length(gloss)
     if made.strength > DULL:
@@ -107,7 +117,7 @@ def reflection_of(
 
 @wp.func
 def mirrored(environment: wp.array2d[wp.float32], at: Reflection, c: wp.int32) -> wp.float32:
-    """Returns one channel of the reflected light, including the sheen."""
+    """Returns channel ``c`` of the reflected light, including the sheen."""
     top = (1.0 - at.u) * environment[at.cell, c] + at.u * environment[at.cell + 1, c]
     bottom = (1.0 - at.u) * environment[at.cell + SIDE, c] + at.u * environment[at.cell + SIDE + 1, c]
     return (1.0 - at.v) * top + at.v * bottom + environment[SHEEN, c] * at.grazing
@@ -115,7 +125,7 @@ def mirrored(environment: wp.array2d[wp.float32], at: Reflection, c: wp.int32) -
 
 @wp.func
 def turn_of(entries: wp.array[wp.int32], turns: wp.array[wp.vec4], turned: wp.int32, i: wp.int32) -> wp.vec4:
-    """Returns the rotation of a Gaussian; the identity for static ones, or if ``turned`` is 0."""
+    """Returns a Gaussian's rotation, or the identity if the Gaussian is static or ``turned`` is 0."""
     turn = wp.vec4(1.0, 0.0, 0.0, 0.0)
     if turned == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
         if entries[i] >= 0:
@@ -136,13 +146,20 @@ def shade(
     features: wp.array[wp.vec4],
     seen: wp.array[wp.vec4],
 ) -> None:
-    """Fills the features that a camera sees, with one thread per Gaussian.
+    """Computes the features that a camera sees, with one thread per Gaussian.
 
     Args:
-        means: [N]. entries: [N] entry of each Gaussian in ``turns``, or −1. turns: [M] rotations.
-        turned: 1 to use the rotations.
-        gloss: [G, 3], G ≤ N: normal times strength, before rotation; other Gaussians have none.
-        environment: see ``Gaussians``. features, seen: [N] in and out.
+        cameras: [views] cameras of all views.
+        view: [1] index of the view.
+        means: [N] means, in metres.
+        entries: [N] index of each Gaussian in ``turns``, or −1 for static Gaussians.
+        turns: [M] rotations of the normals, as unit quaternions (w, x, y, z).
+        turned: 1 to apply the rotations, otherwise 0.
+        gloss: [G, 3] unrotated normals of the first G ≤ N Gaussians, scaled by gloss strength. All other Gaussians are
+            not glossy.
+        environment: [ROWS, 3] environment; see ``Gaussians``.
+        features: [N] features without gloss.
+        seen: [N] output, features seen by the camera.
     """
     i = wp.tid()
     out = features[i]
@@ -175,11 +192,15 @@ def shade_backward(
     g_gloss: wp.array2d[wp.float32],
     g_environment: wp.array2d[wp.float32],
 ) -> None:
-    """Backpropagates the gradients of the features that a camera sees, with one thread per Gaussian.
+    """Backpropagates through ``shade``, with one thread per Gaussian.
 
     Args:
-        adds: 1 to add to ``g_features`` and ``g_gloss``, 0 to overwrite them. g_seen: [N].
-        g_features: [N]. g_gloss: [G, 3]. g_environment: accumulated; that of x₀ stays 0. See ``shade`` for the others.
+        cameras, view, means, entries, turns, turned, gloss, environment, features: see ``shade``.
+        adds: 1 to add to ``g_features`` and ``g_gloss``, 0 to overwrite them.
+        g_seen: [N] gradients of ``seen``.
+        g_features: [N] gradients of ``features``.
+        g_gloss: [G, 3] gradients of ``gloss``.
+        g_environment: [ROWS, 3] gradient of the environment, accumulated; the row of x₀ stays 0.
     """
     i = wp.tid()
     g_out = g_seen[i]
@@ -242,7 +263,7 @@ def shade_backward(
 
 @wp.kernel
 def centre_environment(areas: wp.array[wp.float32], environment: wp.array2d[wp.float32]) -> None:
-    """Makes the environment sum to zero over the sphere, with one thread per channel; the nearness stays ≥ 0."""
+    """Makes the environment sum to zero over the sphere and the nearness ≥ 0, with one thread per channel."""
     c = wp.tid()
     mean = wp.float32(0.0)
     for cell in range(areas.shape[0]):
@@ -256,10 +277,12 @@ def centre_environment(areas: wp.array[wp.float32], environment: wp.array2d[wp.f
 def weigh_neighbours(
     gloss: wp.array2d[wp.float32], neighbours: wp.array2d[wp.int32], weights: wp.array2d[wp.float32]
 ) -> None:
-    """Gives equal weights to the neighbours on the same side of a surface, with one thread per Gaussian.
+    """Gives equal weights to neighbours on the same side of a surface, with one thread per Gaussian.
 
     Args:
-        gloss: [G, 3]. neighbours: [G, k], of which the first one is the Gaussian itself. weights: out [G, k], sum 1.
+        gloss: [G, 3] normal of each Gaussian, scaled by its gloss strength.
+        neighbours: [G, k] neighbours of each Gaussian, starting with the Gaussian itself.
+        weights: [G, k] output, weights that sum to 1 in each row.
     """
     i = wp.tid()
     normal = wp.normalize(wp.vec3(gloss[i, 0], gloss[i, 1], gloss[i, 2]))
@@ -285,7 +308,10 @@ def smooth_changes(
     """Averages the changes of the gloss since ``before`` over neighbours, with one thread per Gaussian.
 
     Args:
-        neighbours, weights: [G, k]. before, gloss: [G, 3]. smooth: out [G, 3].
+        neighbours, weights: [G, k] neighbours and their weights; see ``weigh_neighbours``.
+        before: [G, 3] gloss of Θ_{t−1}.
+        gloss: [G, 3] current gloss.
+        smooth: [G, 3] output, smoothed gloss.
     """
     i = wp.tid()
     for c in range(3):
@@ -297,17 +323,21 @@ def smooth_changes(
 
 
 class GlossTables:
-    """Gloss and environment as parameters with their optimizers.
+    """Gloss and environment parameters with their optimizers.
 
     Args:
-        count: N Gaussians. glossy: number of Gaussians that have a gloss; they come first.
-        rows: [M] rows of the Gaussians that rotate. scalars: [3] on the device for each of the two optimizers.
+        count: number of Gaussians, N.
+        glossy: number of glossy Gaussians, which precede all others.
+        rows: [M] rows of the Gaussians that rotate.
+        scalars: [3] device array with the scalars of each of the two optimizers.
 
     Attributes:
         glossy: as given.
-        seen, g_seen: [N] features as the camera of the last rendering sees them, and their gradients.
-        tables: gloss [glossy, 3] and environment. gradients: those of the last iteration.
-        optimizers: of gloss and environment.
+        seen: [N] vec4 features seen by the camera of the last rendering.
+        g_seen: [N] vec4 gradients of ``seen``.
+        tables: gloss [glossy, 3] and environment [ROWS, 3].
+        gradients: gradients of ``tables`` in the last iteration.
+        optimizers: optimizers for gloss and environment.
     """
 
     def __init__(self, count: int, glossy: int, rows: NDArray[np.int64], scalars: tuple[wp.array, wp.array]) -> None:
@@ -325,7 +355,7 @@ class GlossTables:
         self.optimizers = Optimizer(shapes[0], scalars[0]), Optimizer(shapes[1], scalars[1], varies_by_row=True)
 
     def begin(self, rates: tuple[float, float, float]) -> None:
-        """Starts with zero moments; ``rates`` are those of the gloss, the environment and its nearness."""
+        """Resets the moments to zero and sets the learning rates of the gloss, the environment and its nearness."""
         by_row = np.full(direction.ROWS, rates[1], np.float32)
         by_row[direction.MIDDLE], by_row[direction.NEARNESS] = 0, rates[2]
         self.optimizers[0].begin([rates[0]] * 3, BETAS)
@@ -335,12 +365,15 @@ class GlossTables:
         self, cameras: wp.array, view: wp.array, means: wp.array, turns: wp.array | None, features: wp.array,
         tables: list[wp.array],
     ) -> None:  # fmt: skip
-        """Fills ``seen`` with the features [N] of vec4 as a camera sees them.
+        """Fills ``seen`` with the features that a camera sees.
 
         Args:
-            cameras, view: all cameras, and [1] index of the view. means: [N] of vec3.
-            turns: [M] of vec4, rotations since the gloss was stored; None: no rotation.
-            tables: gloss and environment, usually the attribute.
+            cameras: [views] cameras of all views.
+            view: [1] index of the view.
+            means: [N] vec3 means, in metres.
+            turns: [M] vec4 rotations since the gloss was stored, or None if there are no rotations.
+            features: [N] vec4 features without gloss.
+            tables: gloss and environment, usually the ``tables`` attribute.
         """
         given = [cameras, view, means, self._entries, self.seen if turns is None else turns, int(turns is not None)]
         wp.launch(shade, self._count, [*given, *tables, features, self.seen], device=self._device)
@@ -349,10 +382,12 @@ class GlossTables:
         self, cameras: wp.array, view: wp.array, means: wp.array, turns: wp.array | None, features: wp.array,
         g_features: wp.array, add: bool,
     ) -> None:  # fmt: skip
-        """Backpropagates ``g_seen`` to ``g_features`` [N] of vec4 and to ``gradients``.
+        """Backpropagates ``g_seen`` to ``g_features`` and ``gradients``.
 
         Args:
-            add: add to the gradients of another view instead of overwriting them. See ``shade`` for the others.
+            cameras, view, means, turns, features: see ``shade``.
+            g_features: [N] vec4 output, gradients of ``features``.
+            add: whether to add to the gradients of another view instead of overwriting them.
         """
         if not add:
             self.gradients[1].zero_()
@@ -361,18 +396,20 @@ class GlossTables:
         wp.launch(shade_backward, self._count, given, device=self._device)
 
     def step(self) -> None:
-        """Performs one optimization step of both tables."""
+        """Takes an Adam step for both tables."""
         for optimizer, table, gradient in zip(self.optimizers, self.tables, self.gradients, strict=True):
             wp.launch(step_table, table.shape, [optimizer.adam, gradient, table], device=self._device)
         wp.launch(centre_environment, 3, [self._areas, self.tables[1]], device=self._device)
 
 
 class WarpGloss(GlossTables):
-    """Gloss and environment as parameters of an attempt at an update.
+    """Gloss and environment parameters of an attempt.
 
     Args:
-        previous: state with a gloss. rows: [M] moving Gaussians. roots: [N, 3] metres, positions in frame 0.
-        scalars, environment_scalars: [3] on the device, those of the two optimizers.
+        previous: state with a gloss.
+        rows: [M] rows of the moving Gaussians.
+        roots: [N, 3] positions in frame 0, in metres, used to find neighbours.
+        scalars, environment_scalars: [3] device arrays with the scalars of the optimizers for gloss and environment.
 
     Attributes:
         before: gloss and environment of Θ_{t−1}.
@@ -410,7 +447,7 @@ class WarpGloss(GlossTables):
         self.begin(self._rates)
 
     def smooth(self, first: bool) -> None:
-        """Averages the changes of the gloss over neighbours; ``first``: for the first time in an attempt."""
+        """Averages gloss changes over neighbours; ``first`` is set for the first call of an attempt."""
         gloss = self.tables[0]
         if first:
             inputs = [gloss, self._neighbours, self._weights]

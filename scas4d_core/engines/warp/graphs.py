@@ -1,4 +1,4 @@
-"""Sequences of launches that are captured once and replayed: CUDA graphs, or plain launches on the CPU device."""
+"""Kernel launch sequences that are captured as CUDA graphs and replayed; the CPU device launches them directly."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warp as wp
 
 
 class Graphs:
-    """The captured variants of one sequence of launches.
+    """The captured variants of one launch sequence.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -20,18 +20,19 @@ class Graphs:
         self._graphs: dict[Hashable, wp.Graph | None] = {}
 
     def forget(self) -> None:
-        """Discards all graphs; call it after a buffer was replaced."""
+        """Discards all graphs. Call it after a buffer was reallocated."""
         self._graphs = {}
 
     def run(self, variant: Hashable, launch: Callable[[], None]) -> None:
-        """Runs a variant.
+        """Runs a variant of the launch sequence, and captures it the second time.
 
         Args:
-            variant: identifies the launches. launch: enqueues them; it must neither wait for the device nor allocate.
+            variant: key that identifies the launches.
+            launch: function that enqueues the launches. It must neither wait for the device nor allocate memory.
         """
         if not self._captures:
             launch()
-        elif variant not in self._graphs:  # the first run compiles kernels, which a capture does not allow
+        elif variant not in self._graphs:  # the first run compiles kernels, which is not allowed during capture
             launch()
             self._graphs[variant] = None
         else:

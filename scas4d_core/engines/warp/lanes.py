@@ -1,19 +1,19 @@
 """Warp-level primitives for kernels.
 
-A warp has 32 lanes on a GPU and one on Warp's CPU device, so a kernel that uses these functions runs on both. All
-lanes of a warp must call the functions that exchange data. Native code snippets have one branch per device type.
+A warp has 32 lanes on a GPU and one lane on Warp's CPU device; kernels that use these functions run on both. Functions
+that exchange data must be called by all lanes of a warp. Native code snippets have one branch per device type.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING  # compilation messages would mix with the output of commands
+wp.config.log_level = wp.LOG_WARNING  # compilation messages would clutter the output of commands
 wp.set_module_options({"enable_backward": False})
 
 
 def lanes_of(device: str) -> int:
-    """Returns the number of lanes of a warp on a device."""
+    """Returns the number of lanes per warp on a device."""
     return 32 if wp.get_device(device).is_cuda else 1
 
 
@@ -37,7 +37,7 @@ return 1;
 #endif
 """)
 def lane_count() -> wp.int32:
-    """Returns the number of lanes of a warp."""
+    """Returns the number of lanes per warp."""
     ...
 
 
@@ -73,7 +73,7 @@ return value;
 #endif
 """)
 def broadcast(value: wp.int32, source: wp.int32) -> wp.int32:
-    """Returns the value of the lane ``source`` in all lanes."""
+    """Returns, in all lanes, the value from lane ``source``."""
     ...
 
 
@@ -83,7 +83,7 @@ __syncwarp();
 #endif
 """)
 def sync_lanes() -> None:
-    """Synchronizes the lanes of a warp and makes their writes visible to each other."""
+    """Synchronizes the lanes of a warp, and makes their memory writes visible to each other."""
     ...
 
 
@@ -94,7 +94,7 @@ for (int k = 16; k > 0; k >>= 1) value += __shfl_xor_sync(0xffffffffu, value, k)
 return value;
 """)
 def sum_over_lanes(value: wp.float32) -> wp.float32:
-    """Returns the sum of a value over the lanes."""
+    """Returns the sum of a value over all lanes of a warp."""
     ...
 
 
@@ -106,7 +106,7 @@ return ::expf(x);
 #endif
 """)
 def fast_exp(x: wp.float32) -> wp.float32:
-    """Returns the exponential with a relative error of about 1e-6."""
+    """Returns exp(x) with a relative error of about 1e-6."""
     ...
 
 
@@ -118,7 +118,7 @@ return a / b;
 #endif
 """)
 def fast_divide(a: wp.float32, b: wp.float32) -> wp.float32:
-    """Returns the quotient with a relative error of about 1e-7; 0 for divisors above 2^126."""
+    """Returns a / b with a relative error of about 1e-7, or 0 if b exceeds 2^126."""
     ...
 
 
@@ -128,7 +128,7 @@ either.number = x;
 return either.bits;
 """)
 def bits_of(x: wp.float32) -> wp.uint32:
-    """Returns the bits of a number; for positive numbers, they sort in the same order."""
+    """Returns a number's bit pattern; patterns of positive numbers sort in the same order as the numbers."""
     ...
 
 

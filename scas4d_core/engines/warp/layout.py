@@ -1,7 +1,7 @@
-"""Structures shared by rendering kernels: cameras, sizes of pictures and lists, log.
+"""Structures shared by the rendering kernels: cameras, rasterizer constants, and the columns of the log.
 
-Launch dimensions are constants of a CUDA graph, so buffers have the size of the largest picture. Kernels read the
-actual picture size from the camera. All pictures use the tile stride of the largest one.
+A CUDA graph fixes the launch dimensions, so buffers have the size of the largest image. Kernels read the actual image
+size from the camera. All images use the tile stride of the largest image.
 """
 
 from __future__ import annotations
@@ -16,23 +16,24 @@ from scas4d_core.engines.views import CameraArrays
 wp.set_module_options({"enable_backward": False})
 
 TILE = 16
-"""Side of a tile in pixels."""
+"""Side length of a tile in pixels."""
 PIXELS = TILE * TILE
-"""Pixels of a tile, and threads of a block that renders one."""
+"""Number of pixels per tile, and of threads in a block that renders a tile."""
 SEGMENT = 128
-"""Entries per segment of a list; segments are blended in parallel. 64 and 256 are 5 to 15 % slower."""
+"""Number of list entries per segment; segments are blended in parallel. Values of 64 and 256 are 5 to 15 % slower."""
 
 COLUMNS = 8
-"""Columns of the log, which has one row per rendering."""
+"""Number of columns in the log, which has one row per rendering."""
 IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
-"""Columns of the log: weighted losses, sum of squared RGB differences, mean of the picture minus mean of the rendering
-(three columns, RGB in 0…1, with exposure), and number of tile-list entries, or the capacity that would hold them with
-room to spare, if they exceed it."""
+"""Columns of the log: weighted image and mask loss, sum of squared RGB differences, colour shift, and tile-list size.
+The colour shift (three columns, RGB in 0…1) is the mean of the training image minus the mean of the rendering, with
+exposure applied. The size is the number of tile-list entries or, if this exceeds the capacity, the capacity required
+with room to spare."""
 
 
 @wp.struct
 class Camera:
-    """A camera in kernel format: world to camera, OpenCV axes; focal lengths and centre in pixels; picture size."""
+    """A camera in kernel format: world-to-camera transform (OpenCV axes), and intrinsics and image size in pixels."""
 
     rotation: wp.mat33
     translation: wp.vec3
@@ -46,14 +47,16 @@ class Camera:
 
 @wp.struct
 class Raster:
-    """Constants of a rasterizer.
+    """Rasterizer constants.
 
     Attributes:
-        count: number of Gaussians. columns, rows: size of the largest picture in pixels. tiles_x, tiles_y: in tiles.
-        capacity: maximum number of entries in all lists of one picture.
-        alpha_floor, alpha_cap, stop, low_pass, near, margin: the fields of ``Limits``.
+        count: number of Gaussians.
+        columns, rows: size of the largest image, in pixels.
+        tiles_x, tiles_y: size of the largest image, in tiles.
+        capacity: maximum total number of entries in the tile lists of one image.
+        alpha_floor, alpha_cap, stop, low_pass, near, margin: values of the ``Limits`` fields.
         log_floor: natural logarithm of ``alpha_floor``.
-        detached: 1 if the gradient of the label only reaches the labels, not the shapes.
+        detached: 1 if the label channel's gradient only affects the labels, not the geometry; otherwise 0.
     """
 
     count: wp.int32
@@ -73,7 +76,7 @@ class Raster:
 
 
 def camera_of(camera: CameraArrays) -> Camera:
-    """Converts a camera to its kernel structure."""
+    """Converts a camera to the kernel structure."""
     made = Camera()
     made.rotation = wp.mat33(*camera.pose[:, :3].ravel().tolist())
     made.translation = wp.vec3(*camera.pose[:, 3].tolist())
@@ -83,10 +86,12 @@ def camera_of(camera: CameraArrays) -> Camera:
 
 
 def raster_of(limits: Limits, count: int, columns: int, rows: int, capacity: int, detached: bool = False) -> Raster:
-    """Returns the kernel structure of the rasterizer constants.
+    """Returns the kernel structure with the rasterizer constants.
 
     Args:
-        count: number of Gaussians. columns, rows: size of the largest picture in pixels.
+        limits: rasterizer constants.
+        count: number of Gaussians.
+        columns, rows: size of the largest image, in pixels.
         capacity, detached: see ``Raster``.
     """
     made = Raster()

@@ -1,4 +1,4 @@
-"""Rigidity, isometry and rotation terms between neighbours, with gradients; reference: ``engines.torch.losses``."""
+"""Rigidity, isometry and rotation losses between neighbours, with gradients; reference: ``engines.torch.losses``."""
 
 from __future__ import annotations
 
@@ -30,18 +30,26 @@ def neighbour_terms(
     iteration: wp.array[wp.int32],
     losses: wp.array[wp.float32],
 ) -> None:
-    """Accumulates the three terms and their gradients, with one thread per sampled Gaussian.
+    """Accumulates the three losses and their gradients, with one thread per sampled Gaussian.
 
-    Square roots are exact: without motion, differences are rounding errors, and a fast square root would turn them into
-    full-size gradients.
+    Square roots are exact. Without motion, all differences are rounding errors, which a fast square root would turn
+    into full-size gradients.
 
     Args:
-        weights: [3] weights of rigidity, isometry and rotation per pair; 0: no such term.
-        samples: [samples, S] entries; −1 fills short samples. sample: [1] index of the sample. sound: [M] 1 for entries
-            that are finite. neighbours, pair_weights, distances: [M, k]; weights are 0 for unused pairs.
-        rows: [M] rows of the Gaussians in Θ. previous, means: [N] of Θ_{t−1} and after deformation. turns: [M].
-        tied_means, tied_turns: [M] accumulated gradients.
-        iteration: [1] row of ``losses``, to which the weighted terms are added.
+        weights: [3] weights of rigidity, isometry and rotation per pair; 0 disables a loss.
+        samples: [samples, S] entries of the sampled Gaussians; shorter samples are padded with −1.
+        sample: [1] index of the current sample.
+        sound: [M] 1 for entries with finite values, otherwise 0.
+        neighbours: [M, k] neighbours of each Gaussian.
+        pair_weights: [M, k] weights of the pairs; 0 for unused pairs.
+        distances: [M, k] distances of the pairs in frame 0, in metres.
+        rows: [M] rows of the moving Gaussians in Θ_t.
+        previous: [N] means of Θ_{t−1}.
+        means: [N] deformed means.
+        turns: [M] rotations since Θ_{t−1}.
+        tied_means, tied_turns: [M] gradients of means and rotations, accumulated.
+        iteration: [1] row of ``losses`` for this iteration.
+        losses: weighted losses of each iteration, to which the three losses are added.
     """
     i = samples[sample[0], wp.tid()]
     if i < 0:

@@ -1,4 +1,4 @@
-"""Rendering pass of an iteration: renders a view, compares it, and backpropagates its loss to the Gaussians."""
+"""Rendering pass of an iteration: renders a view, computes its loss, and backpropagates the loss to the Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def step_of(camera: Camera) -> wp.int32:
-    """Returns the step between the kept rows and columns of a picture; see ``engine.Thinned``."""
+    """Returns the subsampling factor of a kept rendering; see ``engine.kept_step``."""
     return wp.max(1, wp.min(camera.height, camera.width) // KEPT_ROWS)
 
 
@@ -32,10 +32,14 @@ def keep_picture(
     planes: wp.array3d[wp.float32],
     kept: wp.array4d[wp.float32],
 ) -> None:
-    """Copies a subsampled rendering, with one thread per element of a slot.
+    """Copies a subsampled rendering to a slot, with one thread per element of the slot.
 
     Args:
-        slot: [1] index of the slot. planes: [5, rows, columns]. kept: [slots, 5, rows, columns].
+        cameras: [views] cameras of all views.
+        view: [1] index of the view.
+        slot: [1] index of the slot.
+        planes: [5, rows, columns] rendering.
+        kept: [slots, 5, rows, columns] output, kept renderings.
     """
     plane, y, x = wp.tid()
     camera = cameras[view[0]]
@@ -45,20 +49,22 @@ def keep_picture(
 
 
 class PicturePass:
-    """Renders, compares and backpropagates the views of an iteration one after the other.
+    """Renders the views of an iteration one after another, and computes and backpropagates their losses.
 
-    ``launch``, ``measure`` and ``keep`` can be captured in a CUDA graph after each has run once, which compiles the
-    kernels. A graph is valid while ``generation`` does not change.
+    ``launch``, ``measure`` and ``keep`` can be captured in a CUDA graph once each has run, because the first run
+    compiles the kernels. A graph remains valid until ``generation`` changes.
 
     Args:
-        device: Warp device, such as "cpu" or "cuda:0". plan: plan of the updates. count: N Gaussians.
+        device: Warp device, such as "cpu" or "cuda:0".
+        plan: plan of the scene's updates.
+        count: number of Gaussians, N.
 
     Attributes:
-        grad_means, grad_factors, grad_features: [N] of vec3, mat33 and vec4, filled by ``launch``.
-        planes: [5, rows, columns] of the last rendering: RGB before exposure, label, remaining transmittance.
-        exposures: [views, 4] of vec2, gain and offset; may be changed between launches.
-        log: [records, 8] float32, columns as in ``layout``.
-        generation: number of times that buffers were replaced.
+        grad_means, grad_factors, grad_features: [N] gradients of type vec3, mat33 and vec4, filled by ``launch``.
+        planes: [5, rows, columns] last rendering: RGB before exposure, label, and remaining transmittance.
+        exposures: [views, 4] vec2 gain and offset of each channel; may be changed between launches.
+        log: [records, 8] float32 log; see ``layout`` for the columns.
+        generation: number of times that buffers were reallocated.
     """
 
     def __init__(self, device: str, plan: UpdatePlan, count: int) -> None:
@@ -84,25 +90,25 @@ class PicturePass:
 
     @property
     def cameras(self) -> wp.array:
-        """[views] of type ``layout.Camera``."""
+        """[views] cameras of all views, of type ``layout.Camera``."""
         return self._loss.cameras
 
     @property
     def targets(self) -> wp.array:
-        """[views, 4, rows, columns] pictures and masks."""
+        """[views, 4, rows, columns] training images and masks."""
         return self._loss.targets
 
     @property
     def guard_counts(self) -> wp.array:
-        """[3] number of times that the guards ``projection.COUNTED_GUARDS`` were triggered."""
+        """[3] number of times that each guard in ``projection.COUNTED_GUARDS`` was triggered."""
         return self._rasterizer.guard_counts
 
     def forget_guards(self) -> None:
-        """Resets the counts of the guards to 0."""
+        """Resets the guard counts to 0."""
         self.guard_counts.zero_()
 
     def load_views(self, views: Sequence[TrainingView]) -> None:
-        """Uploads the pictures, cameras and exposures of a frame; pictures that are already loaded are reused."""
+        """Uploads the images, cameras and exposures of a frame. Images that are already loaded are reused."""
         replaced = self._loss.load(views)
         if replaced:
             self._rasterizer.resize(self._loss.columns, self._loss.rows)
@@ -115,13 +121,13 @@ class PicturePass:
         self.generation += replaced
 
     def reserve(self, records: int) -> None:
-        """Allocates log rows for a number of records; the previous contents may be lost."""
+        """Allocates log rows for at least ``records`` renderings. The contents of the log may be lost."""
         if records > self.log.shape[0]:
             self.log = wp.zeros((records, COLUMNS), dtype=wp.float32, device=self._device)
             self.generation += 1
 
     def grow(self, room: float) -> bool:
-        """Enlarges the tile lists if a picture needs more room; see ``Rasterizer.grow``."""
+        """Enlarges the tile lists if an image needs more entries; see ``Rasterizer.grow``."""
         grew = self._rasterizer.grow(room)
         self.generation += grew
         return grew
@@ -130,12 +136,15 @@ class PicturePass:
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array,
     ) -> None:  # fmt: skip
-        """Renders a view into ``planes`` and compares it; the losses are written to a row of the log.
+        """Renders a view into ``planes``, and writes its losses to a log row.
 
         Args:
-            view: [1] int32, index of the view. record: [1] int32, row of the log.
-            means, factors, opacities, features: [N] of vec3, mat33, float32, and vec4 as the camera sees them; all
-                contiguous.
+            view: [1] int32 index of the view.
+            record: [1] int32 row of the log.
+            means: [N] vec3 means.
+            factors: [N] mat33 covariance factors.
+            opacities: [N] float32 opacities.
+            features: [N] vec4 features seen by the camera. All arrays must be contiguous.
         """
         cameras, log = self._loss.cameras, self.log
         self._rasterizer.project(cameras, view, means, factors, opacities, features, record, log)
@@ -146,11 +155,13 @@ class PicturePass:
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array, weight: float, *, add: bool, grad_features: wp.array | None = None,
     ) -> None:  # fmt: skip
-        """Runs ``measure`` and backpropagates.
+        """Runs ``measure``, and backpropagates the losses to the Gaussians.
 
         Args:
-            weight: factor on all gradients. add: add to the gradients of another view instead of overwriting them.
-            grad_features: [N] of vec4 for the gradient of the features; the attribute if None.
+            view, record, means, factors, opacities, features: see ``measure``.
+            weight: factor that scales all gradients.
+            add: whether to add to the gradients of another view instead of overwriting them.
+            grad_features: [N] vec4 output for the gradients of the features, or None to use the attribute.
         """
         self.measure(view, record, means, factors, opacities, features)
         rasterizer, cameras = self._rasterizer, self._loss.cameras
@@ -161,12 +172,12 @@ class PicturePass:
         rasterizer.carry_to_world(cameras, view, means, factors, *gradients, add=add)
 
     def keep(self, view: wp.array, slot: wp.array) -> None:
-        """Keeps the last rendering, subsampled, in a slot; both arguments are [1] int32."""
+        """Stores the last rendering, subsampled, in a slot. Both arguments are [1] int32 arrays."""
         inputs = [self._loss.cameras, view, slot, self.planes, self._kept]
         wp.launch(keep_picture, self._kept.shape[1:], inputs, device=self._device)
 
     def kept(self, slots: Sequence[tuple[int, TrainingView]], downloads: Downloads) -> list[Thinned]:
-        """Returns kept pictures, each given by slot and view; waits for the device."""
+        """Waits for the device, and returns the kept rendering for each pair of slot and view."""
         (kept,), pictures = downloads.read(self._kept), []
         for slot, view in slots:
             rows, columns = kept_size(view)
@@ -176,6 +187,6 @@ class PicturePass:
 
 
 def kept_size(view: TrainingView) -> tuple[int, int]:
-    """Returns the rows and columns of a kept rendering of a view."""
+    """Returns the number of rows and columns in a view's kept rendering."""
     every = kept_step(view.camera.height, view.camera.width)
     return -(-view.camera.height // every), -(-view.camera.width // every)

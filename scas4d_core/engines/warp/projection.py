@@ -1,7 +1,7 @@
 """EWA projection of Gaussians into a camera, and its backward pass. Reference: ``engines.torch.rasterizer``.
 
-Gaussians with invalid values are not rendered, because they would corrupt the pixels of others. Gradients that overflow
-are dropped (``guards``).
+Gaussians with invalid values are not rendered, because they would corrupt every pixel that they cover. Overflowing
+gradients are discarded (see ``guards``).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ BRIGHTEST = wp.constant(wp.float32(FEATURE_CEILING))
 WIDEST = wp.constant(wp.float32(FOOTPRINT_CEILING))
 STEEPEST = wp.constant(wp.float32(GRADIENT_NOT_FINITE))
 COUNTED_GUARDS = ("not_finite", "footprint_ceiling", "gradient_not_finite")
-"""Counted guards: the first two in ``project``, the last in ``project_backward``."""
+"""Names of the counted guards: ``project`` counts the first two, ``project_backward`` the last."""
 RECORD = 4
-"""Rows per splat in ``records`` [4 N]. Ten values are sums over pixels: dL/dpower times 1, x, y, xx, xy and yy of the
-offset (x, y) from the mean, and dL/dfeatures. The rest is padding to 64 bytes."""
+"""Number of rows per splat in ``records`` [4 N]. The first ten values are sums over pixels: dL/dpower times 1, x, y,
+xx, xy and yy, where (x, y) is the offset from the mean, and dL/dfeatures. The rest is padding to 64 bytes."""
 FEATURES = 6
-"""Index of the first of the ten values that belongs to the features."""
+"""Index of the first feature gradient among the ten values."""
 
 
 @wp.func
 def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.float32, size: wp.int32) -> wp.vec2:
-    """Returns x/z or y/z clamped for the Jacobian, and 1 if it was within the bounds, else 0."""
+    """Returns x/z or y/z, clamped for the Jacobian, and a flag: 1 if the value was within the bounds, otherwise 0."""
     margin = raster.margin * 0.5 * wp.float32(size) / focal
     low = -(centre / focal + margin)
     high = (wp.float32(size) - centre) / focal + margin
@@ -39,7 +39,7 @@ def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.floa
 
 @wp.func
 def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
-    """Returns the sum of a Gaussian's absolute values, which is NaN or infinite if one of them is."""
+    """Returns the sum of the absolute values of a Gaussian, which is NaN or infinite if any value is."""
     size = wp.abs(mean[0]) + wp.abs(mean[1]) + wp.abs(mean[2]) + wp.abs(opacity)
     for row in range(3):
         size += wp.abs(factor[row, 0]) + wp.abs(factor[row, 1]) + wp.abs(factor[row, 2])
@@ -48,7 +48,7 @@ def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
 
 @wp.func
 def sound(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32, feature: wp.vec4) -> wp.bool:
-    """Returns whether a Gaussian is finite and neither too distant, too large nor too bright."""
+    """Returns whether a Gaussian's values are finite and within the bounds on distance, size and brightness."""
     return (
         size_of(mean, factor, opacity) <= FARTHEST
         and wp.abs(feature[0]) <= BRIGHTEST
@@ -64,7 +64,7 @@ def project_one(
     opacities: wp.array[wp.float32], features: wp.array[wp.vec4], splats: wp.array[wp.vec4],
     boxes: wp.array[wp.vec4i], records: wp.array[wp.vec4], guard_counts: wp.array[wp.int32],
 ) -> wp.int32:  # fmt: skip
-    """Projects a Gaussian; returns 1 if its box meets the picture, else 0. See ``project``."""
+    """Projects a Gaussian. Returns 1 if its bounding box intersects the image, otherwise 0. See ``project``."""
     zero = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for k in range(3):
         store(records, RECORD * i + k, zero)
@@ -74,7 +74,7 @@ def project_one(
     place = camera.rotation * mean + camera.translation
     second = zero
     drawn = wp.int32(0)
-    # Comparisons with NaN are false.
+    # Comparisons with NaN are always false.
     fit = sound(mean, factor, opacity, features[i])
     if not fit:
         wp.atomic_add(guard_counts, 0, 1)
@@ -135,12 +135,20 @@ def project(
     """Projects N Gaussians with one thread each, and counts the entries of each tile list; launched in whole warps.
 
     Args:
-        raster: constants. cameras: all views. view: [1] index of the camera.
-        means, factors, opacities, features: [N]; Σ = F Fᵀ.
-        splats: out [2 N], see ``supports``. boxes: out [N] tiles x0, y0, x1, y1 (exclusive) around the support;
-            undefined if culled. records: out [4 N], set to 0.
-        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, accumulated.
-        tile_counts: [tiles], accumulated. starts, keys: buffers of the lists, not used.
+        raster: rasterizer constants.
+        cameras: [views] cameras of all views.
+        view: [1] index of the view.
+        means: [N] means, in metres.
+        factors: [N] covariance factors F, with Σ = F Fᵀ.
+        opacities: [N] opacities.
+        features: [N] features, which are only checked for invalid values.
+        splats: [2 N] output, splats; see ``supports``.
+        boxes: [N] output, bounding box of each support in tiles: x0, y0, x1, y1 (exclusive). It is undefined if the
+            Gaussian is culled.
+        records: [4 N] gradient records, reset to 0.
+        guard_counts: [3] number of times that each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
+        tile_counts: [tiles] number of entries in each list, accumulated.
+        starts, keys: list buffers, not used.
     """
     i = wp.tid()
     camera = cameras[view[0]]
@@ -168,12 +176,15 @@ def project_backward(
     g_factors: wp.array[wp.mat33],
     g_features: wp.array[wp.vec4],
 ) -> None:
-    """Backpropagates the gradients of splats to the Gaussians, with one thread per Gaussian.
+    """Backpropagates the splat gradients to the Gaussians, with one thread per Gaussian.
 
     Args:
-        raster, cameras, view, means, factors: see ``project``. splats: from it. records: from ``blend_backward``.
-        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, accumulated.
-        adds: 1 to add to the gradients, 0 to overwrite them. g_means, g_factors, g_features: [N] gradients.
+        raster, cameras, view, means, factors: see ``project``.
+        splats: [2 N] output of ``project``.
+        records: [4 N] output of ``blend_backward``.
+        guard_counts: [3] number of times that each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
+        adds: 1 to add to the gradients, 0 to overwrite them.
+        g_means, g_factors, g_features: [N] outputs, gradients of the Gaussians.
     """
     i = wp.tid()
     second = load(splats, 2 * i + 1)
@@ -198,7 +209,7 @@ def project_backward(
         c = second[0]
         gx = a * r0[1] + b * r0[2]
         gy = b * r0[1] + c * r0[2]
-        # dL/dcov2d = −conic dL/dconic conic, all symmetric.
+        # dL/dcov2d = −conic dL/dconic conic, where all matrices are symmetric.
         ga = -0.5 * r0[3]
         gb = -0.5 * r1[0]
         gc = -0.5 * r1[1]
@@ -217,7 +228,7 @@ def project_backward(
         g_axis0 = camera.fx * inverse * gm0
         g_axis1 = camera.fy * inverse * gm1
         g_axis2 = -(u * g_axis0 + v * g_axis1)
-        # Clamped tangents are treated as constants; the projected mean always gets a gradient.
+        # Clamped tangents are treated as constants, but the projected mean always gets a gradient.
         g_place0 = camera.fx * inverse * gx - at_u[1] * inverse * wp.dot(g_axis0, axes[2])
         g_place1 = camera.fy * inverse * gy - at_v[1] * inverse * wp.dot(g_axis1, axes[2])
         g_place2 = -inverse * (wp.dot(gm0, m0) + wp.dot(gm1, m1) + place[0] * g_place0 + place[1] * g_place1)

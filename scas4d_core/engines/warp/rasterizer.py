@@ -1,6 +1,6 @@
-"""Rasterizer: the buffers of one picture, and the launches that render it and backpropagate its gradient.
+"""Rasterizer: buffers for one image, and kernel launches that render the image and backpropagate its gradient.
 
-Except for ``resize`` and ``grow``, nothing here waits for the device or allocates memory, so that everything can be
+Except for ``resize`` and ``grow``, no method waits for the device or allocates memory, so all other methods can be
 captured in a CUDA graph.
 """
 
@@ -17,26 +17,31 @@ from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, TILE, raster_of
 LEAST_CAPACITY = 1 << 16
 """Minimum initial capacity of the tile lists, in entries."""
 TILES_EACH = 8
-"""Initial capacity of the tile lists per Gaussian; on average, a Gaussian intersects two to four tiles."""
+"""Initial tile-list capacity per Gaussian. On average, a Gaussian intersects two to four tiles."""
 WARPS_EACH = 24
-"""Warps per multiprocessor that blend segments; more do not fit into the registers."""
+"""Number of warps per multiprocessor that blend segments; the registers are too small for more."""
 
 
 class Rasterizer:
-    """Renders pictures of a fixed number of Gaussians.
+    """Renders images of a fixed number of Gaussians.
 
     Args:
-        device: Warp device, such as "cpu" or "cuda:0". count: number of Gaussians. limits: constants of the rasterizer.
-        detached: whether the gradient of the label only reaches the labels.
+        device: Warp device, such as "cpu" or "cuda:0".
+        count: number of Gaussians.
+        limits: rasterizer constants.
+        detached: whether the label channel's gradient only affects the labels.
 
     Attributes:
         count: number of Gaussians; see ``draw_fewer``.
-        planes: [5, rows, columns] of the last picture: four features, with background, and remaining transmittance.
-        g_planes: [4, rows, columns] gradient that ``carry_back`` reads.
-        splats, records: [2 N] and [4 N] of vec4, see ``projection``.
-        starts, items: [tiles + 1] and [capacity] tile lists of the last picture. tiles_x: number of tiles in a row.
-        guard_counts: [3] number of times that the guards ``projection.COUNTED_GUARDS`` were triggered.
-        capacity: maximum number of list entries; a picture that needs more is rendered empty, see ``grow``.
+        planes: [5, rows, columns] last image: four features including the background, and remaining transmittance.
+        g_planes: [4, rows, columns] gradient of the features, which ``carry_back`` reads.
+        splats: [2 N] vec4 splats; see ``supports``.
+        records: [4 N] vec4 gradient records; see ``projection``.
+        starts: [tiles + 1] first entry of each tile list of the last image.
+        items: [capacity] Gaussian of each tile-list entry.
+        tiles_x: number of tile columns.
+        guard_counts: [3] number of times that each guard in ``projection.COUNTED_GUARDS`` was triggered.
+        capacity: maximum number of tile-list entries; an image that needs more is rendered empty (see ``grow``).
     """
 
     def __init__(self, device: str, count: int, limits: Limits = DEFAULT, detached: bool = False) -> None:
@@ -51,7 +56,7 @@ class Rasterizer:
         self.guard_counts = wp.zeros(len(projection.COUNTED_GUARDS), dtype=wp.int32, device=device)
 
     def resize(self, columns: int, rows: int) -> None:
-        """Allocates buffers for pictures of a given size and for ``capacity`` list entries."""
+        """Allocates buffers for images of the given size, and for ``capacity`` tile-list entries."""
         device = self._device
         self._columns, self._rows = columns, rows
         self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity, self._detached)
@@ -71,21 +76,21 @@ class Rasterizer:
         self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
 
     def draw_fewer(self, count: int) -> None:
-        """Sets the number of Gaussians, at most that of the buffers."""
+        """Sets the number of Gaussians, which must not exceed the size of the buffers."""
         self.count = self._raster.count = count
 
     def holds(self, columns: int, rows: int) -> bool:
-        """Returns whether pictures of a given size fit into the buffers."""
+        """Returns whether images of the given size fit into the buffers."""
         return columns <= self._columns and rows <= self._rows
 
     def grow(self, room: float) -> bool:
-        """Enlarges the lists if a picture needs more room.
+        """Enlarges the tile lists if an image needs more entries.
 
         Args:
-            room: largest value of the column ``layout.PAIRS`` of the log.
+            room: largest value in the log column ``layout.PAIRS``.
 
         Returns:
-            Whether buffers were replaced, which invalidates captured graphs.
+            Whether buffers were reallocated, which invalidates captured graphs.
         """
         if room <= self.capacity:
             return False
@@ -100,9 +105,11 @@ class Rasterizer:
         """Projects the Gaussians and builds the tile lists.
 
         Args:
-            cameras: array of ``Camera``. view: [1] index of the camera.
-            means, factors, opacities, features: [N] of vec3, mat33, float32 and vec4.
-            record, log: [1] and [records, 8]: this row of the log is reset to 0, except the column ``PAIRS``.
+            cameras: [views] cameras of all views, of type ``Camera``.
+            view: [1] index of the view.
+            means, factors, opacities, features: [N] arrays of type vec3, mat33, float32 and vec4, respectively.
+            record: [1] row of the log.
+            log: [records, 8] log. The row is reset to 0, except for the column ``PAIRS``, which is set.
         """
         device, view_of = self._device, [cameras, view]
         count = -(-self.count // self._lanes) * self._lanes
@@ -125,7 +132,9 @@ class Rasterizer:
         """Renders the projected Gaussians.
 
         Args:
-            cameras, view: as in ``project``. features: [N] of vec4. background: [1] of vec4, behind all Gaussians.
+            cameras, view: see ``project``.
+            features: [N] vec4 features.
+            background: [1] vec4 background features.
         """
         given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]
         state = [self._segment_light, self._segment_features]
@@ -135,7 +144,7 @@ class Rasterizer:
         wp.launch(blend.join_segments, self._tiles * PIXELS, inputs, device=self._device, block_dim=PIXELS)
 
     def carry_back(self, cameras: wp.array, view: wp.array, features: wp.array) -> None:
-        """Backpropagates ``g_planes`` to ``records``; the arguments are those of ``draw``."""
+        """Backpropagates ``g_planes`` to ``records``. See ``draw`` for the arguments."""
         given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]
         state = [self._segment_light, self._segment_features, self._begun, self.planes, self.g_planes, self.records]
         inputs = [*given, self._segment_tiles, self._warps, *state]
@@ -148,7 +157,9 @@ class Rasterizer:
         """Computes the gradients of the Gaussians from ``records``.
 
         Args:
-            g_means, g_factors, g_features: [N] of vec3, mat33 and vec4. add: add to them instead of overwriting.
+            cameras, view, means, factors: see ``project``.
+            g_means, g_factors, g_features: [N] outputs of type vec3, mat33 and vec4, respectively.
+            add: whether to add to the outputs instead of overwriting them.
         """
         given = [self._raster, cameras, view, means, factors, self.splats, self.records, self.guard_counts]
         inputs = [*given, int(add), g_means, g_factors, g_features]

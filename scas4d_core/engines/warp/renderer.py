@@ -19,15 +19,17 @@ from scas4d_core.guards import FEATURE_CEILING
 
 Array = NDArray[np.float32]
 PADDING = 32
-"""``reached`` pads a picture to multiples of this number of pixels."""
+"""``reached`` pads image sizes to a multiple of this number of pixels."""
 
 
 class WarpRenderer:
-    """The ``Renderer`` of the Warp engine. Each call uploads a state and waits for the result.
+    """The ``Renderer`` implementation in NVIDIA Warp. Each call uploads a state and waits for the result.
 
     Args:
-        background: RGB in 0…1. limits: constants of the rasterizer.
-        device: Warp device, such as "cpu" or "cuda:0". image_weight: weight of the image loss in ``compare``.
+        background: background colour, RGB in 0…1.
+        limits: rasterizer constants.
+        device: Warp device, such as "cpu" or "cuda:0".
+        image_weight: weight of the image loss in ``compare``.
 
     Attributes:
         device, limits, background: as given.
@@ -86,7 +88,7 @@ class WarpRenderer:
         return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """See ``Renderer.gather``; computed as the feature gradient of a weighted sum of pixels."""
+        """See ``Renderer.gather``. The sums are computed as feature gradients of a weighted sum of pixels."""
         features = np.zeros((len(state), CHANNELS), np.float32)
         cameras = self._projected(state, camera, features)
         on_device = self._rasterize(cameras, features, np.zeros(CHANNELS, np.float32))
@@ -121,13 +123,14 @@ class WarpRenderer:
         return blocks
 
     def _projected(self, state: Gaussians, camera: CameraArrays, features: Array) -> wp.array:
-        """Projects a state and builds lists of sufficient capacity; returns the cameras, [1], on the device."""
+        """Projects a state and builds sufficiently large tile lists. Returns the camera as a [1] device array."""
         device, count = self.device, len(state)
         if count != self._rasterizer.count or not self._rasterizer.holds(camera.width, camera.height):
             self._rasterizer = Rasterizer(device, count, self.limits)
             self._rasterizer.resize(camera.width, camera.height)
         cameras = wp.array([camera_of(camera)], dtype=Camera, device=device)
-        # Projection gets no features if there are more than four; Gaussians it would drop get zero opacity instead.
+        # Projection gets placeholder features, because there may be more than four. Gaussians that it would cull for
+        # invalid features get zero opacity instead.
         sound = (np.abs(features) <= FEATURE_CEILING).all(axis=1)
         means = wp.array(state.means, dtype=wp.vec3, device=device)
         factors = wp.array(state.factors, dtype=wp.mat33, device=device)
@@ -140,7 +143,7 @@ class WarpRenderer:
         return cameras
 
     def _rasterize(self, cameras: wp.array, features: Array, background: Array) -> wp.array:
-        """Rasterizes features [N, 4] of the projected Gaussians; returns the uploaded features."""
+        """Rasterizes features [N, 4] of the projected Gaussians, and returns the uploaded features."""
         on_device = wp.array(np.ascontiguousarray(features, np.float32), dtype=wp.vec4, device=self.device)
         self._behind.assign(background[None])
         self._rasterizer.draw(cameras, self._first, on_device, self._behind)

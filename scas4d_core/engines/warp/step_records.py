@@ -1,4 +1,4 @@
-"""What changes between the iterations of a captured graph: the host writes it, and kernels read it from the device."""
+"""Values that change between iterations of a captured graph. The host writes them; kernels read them on the device."""
 
 from __future__ import annotations
 
@@ -10,21 +10,25 @@ import warp as wp
 from scas4d_core.engines.warp.adam import SCALARS
 
 WEIGHTS = 3
-"""Scalars before those of the optimizers: weights of rigidity, isometry and rotation per pair of neighbours."""
+"""Number of scalars that precede the optimizer scalars: weights of rigidity, isometry and rotation per neighbour
+pair."""
 VIEW_COLUMNS = 3
-"""Integers of a view: index of the view, row of the log, and slot of the kept picture."""
+"""Number of integers per view: index of the view, row of the log, and slot of the kept rendering."""
 
 
 class StepRecords:
-    """One record on the device, and a ring of records on the host from which it is filled without waiting.
+    """One record on the device, and a ring buffer of host records from which it is filled without waiting.
 
     Args:
-        device: Warp device. optimizers: number of optimizers. views: largest number of views per iteration.
-        rows: number of records that may be pending; the caller waits for the device before it writes more.
+        device: Warp device.
+        optimizers: number of optimizers.
+        views: maximum number of views per iteration.
+        rows: maximum number of pending records. The caller must wait for the device before writing more.
 
     Attributes:
-        sample, iteration: [1] int32, sample of neighbours and row of the iteration in the log.
-        weights: [3] float32, see ``WEIGHTS``.
+        sample: [1] int32 index of the neighbour sample.
+        iteration: [1] int32 row of the iteration in the losses.
+        weights: [3] float32 weights of the neighbour terms; see ``WEIGHTS``.
     """
 
     def __init__(self, device: str, optimizers: int, views: int, rows: int) -> None:
@@ -40,12 +44,12 @@ class StepRecords:
         self.weights = self._scalars[:WEIGHTS]
 
     def optimizer(self, place: int) -> wp.array:
-        """Returns the [``SCALARS``] scalars of an optimizer."""
+        """Returns the scalars of an optimizer, [``SCALARS``]."""
         first = WEIGHTS + SCALARS * place
         return self._scalars[first : first + SCALARS]
 
     def view(self, place: int) -> tuple[wp.array, wp.array, wp.array]:
-        """Returns the integers of a view of the iteration, [1] each; see ``VIEW_COLUMNS``."""
+        """Returns the integers of one of the iteration's views, as [1] arrays; see ``VIEW_COLUMNS``."""
         first = 2 + VIEW_COLUMNS * place
         view, record, slot = (self._integers[k : k + 1] for k in range(first, first + VIEW_COLUMNS))
         return view, record, slot
@@ -56,7 +60,10 @@ class StepRecords:
         """Enqueues a record.
 
         Args:
-            views: integers of each view. scalars: weights, followed by the scalars of each optimizer.
+            sample: index of the neighbour sample.
+            iteration: row of the iteration in the losses.
+            views: integers of each view; see ``VIEW_COLUMNS``.
+            scalars: weights, followed by the scalars of each optimizer.
         """
         row, self._next = self._next, (self._next + 1) % self.rows
         integers = self._host_integers[row]

@@ -1,8 +1,8 @@
-"""Supports of splats, and the tiles that they intersect.
+"""Supports of splats, and intersection tests between supports and tiles.
 
-A splat is two rows of ``splats`` [2 N]: (mean x, mean y, conic a, conic b) and (conic c, ln opacity, reach, depth).
-Its support is the set of points whose squared Mahalanobis distance from the mean is at most the reach. The reach is
-slightly enlarged, so that rounding does not cull pixels that blending would cover. It is 0 for culled Gaussians.
+A splat consists of two rows of ``splats`` [2 N]: (mean x, mean y, conic a, conic b) and (conic c, ln opacity, reach,
+depth). Its support is the set of points whose squared Mahalanobis distance from the mean is at most the reach. The
+reach is slightly enlarged so that rounding never culls pixels that blending would cover. It is 0 for culled Gaussians.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 SLACK = wp.constant(wp.float32(COVER_SLACK))
 HUGE = wp.constant(wp.float32(3.0e38))
-FEW = wp.constant(4)  # boxes with at most this many tiles are handled by one lane, larger ones by the warp
+FEW = wp.constant(4)  # boxes with up to this many tiles are processed by one lane, larger boxes by the whole warp
 NONE = wp.constant(wp.uint32(0))
 ONE = wp.constant(wp.uint32(1))
 
@@ -69,7 +69,7 @@ def enter_list(
     tile_y: wp.int32, starts: wp.array[wp.int32], tile_counts: wp.array[wp.int32], keys: wp.array[wp.uint64],
     filling: wp.int32,
 ) -> None:  # fmt: skip
-    """Adds a splat to the list of a tile if its support intersects the tile; see ``enter_lists``."""
+    """Adds a splat to a tile's list if its support intersects the tile; see ``enter_lists``."""
     if tile_form(camera, first, second, tile_x, tile_y) <= second[2]:
         tile = tile_y * raster.tiles_x + tile_x
         place = wp.atomic_add(tile_counts, tile, 1)
@@ -83,12 +83,18 @@ def enter_lists(
     boxes: wp.array[wp.vec4i], starts: wp.array[wp.int32], tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64], filling: wp.int32,
 ) -> None:  # fmt: skip
-    """Adds the splats of a warp to the lists of the tiles that they intersect, or only counts the entries.
+    """Adds the splats of a warp to the lists of all tiles that they intersect, or only counts the entries.
 
     Args:
-        i: the lane's splat. drawn: whether it has a box. splats, boxes: from projection.
-        starts: first entry of each list. tile_counts: [tiles], accumulated. keys: out depth and row of each entry.
-        filling: 0: only count; ``starts`` and ``keys`` are not used.
+        raster: rasterizer constants.
+        camera: camera of the image.
+        i: index of the lane's splat.
+        drawn: 1 if this splat has a bounding box, otherwise 0.
+        splats, boxes: outputs of ``projection.project``.
+        starts: first entry of each list.
+        tile_counts: [tiles] number of entries in each list, accumulated.
+        keys: output, depth and row of each entry.
+        filling: 1 to add the entries, or 0 to only count them; ``starts`` and ``keys`` are then not used.
     """
     area = wp.int32(0)
     if drawn == 1:

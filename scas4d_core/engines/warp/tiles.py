@@ -1,8 +1,8 @@
-"""Tile lists: the Gaussians of each tile sorted by depth, with ties in row order.
+"""Tile lists, which contain the Gaussians of each tile, sorted by depth and then by row.
 
-Projection counts the entries of each list. Here, ``place_lists`` computes the offsets, ``fill_lists`` writes the
-entries and ``sort_lists`` sorts each list. Lists are divided into segments of ``SEGMENT`` entries, which blending
-processes in parallel.
+Projection counts the entries of each list. ``place_lists`` then computes the offsets, ``fill_lists`` writes the
+entries, and ``sort_lists`` sorts each list. Lists are divided into segments of ``SEGMENT`` entries, which are blended
+in parallel.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from scas4d_core.engines.warp.supports import enter_lists, least_form
 wp.set_module_options({"enable_backward": False})
 
 SCAN_BLOCK = 1024
-"""Threads of the single block that computes the list offsets."""
+"""Number of threads in the single block that computes the list offsets."""
 SORT_BLOCK = 512
-"""Threads of a block that sorts a list."""
+"""Number of threads in a block that sorts a list."""
 
 
 @wp.func_native("""
@@ -79,7 +79,7 @@ def scan_lists(
     thread: wp.int32, capacity: wp.int32, length: wp.int32, counts: wp.array[wp.int32], starts: wp.array[wp.int32],
     segment_starts: wp.array[wp.int32],
 ) -> wp.float32:  # fmt: skip
-    """Implements ``place_lists``; called by all threads of one block."""
+    """Implements ``place_lists``. All threads of one block must call it."""
     ...
 
 
@@ -96,9 +96,13 @@ def place_lists(
     """Computes the first entry and the first segment of each list; launched as one block.
 
     Args:
-        threads: threads of the block, 1 on the CPU device. tile_counts: [tiles] entries of each list; reset to 0.
-        starts, segment_starts: out [tiles + 1]; all 0 if the lists exceed the capacity.
-        record: [1] row of the log to initialize. log: [records, ``COLUMNS``].
+        threads: number of threads in the block, 1 on the CPU device.
+        raster: rasterizer constants.
+        tile_counts: [tiles] number of entries in each list, reset to 0.
+        starts, segment_starts: [tiles + 1] outputs, first entry and first segment of each list. If the lists exceed the
+            capacity, all values are 0.
+        record: [1] row of the log to initialize.
+        log: [records, ``COLUMNS``] log.
     """
     room = scan_lists(wp.tid(), raster.capacity, SEGMENT, tile_counts, starts, segment_starts)
     if wp.tid() == threads - 1:
@@ -118,12 +122,16 @@ def fill_lists(
     tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Writes the entries of the lists in arbitrary order, with one thread per Gaussian; launched in whole warps.
+    """Writes the list entries in arbitrary order, with one thread per Gaussian; launched in whole warps.
 
     Args:
-        splats, boxes: from projection. starts: from ``place_lists``.
-        tile_counts: [tiles] initially 0; incremented to the number of entries of each list.
-        keys: out [capacity] depth and row of each entry, whose order is by depth, then by row.
+        raster: rasterizer constants.
+        cameras: [views] cameras of all views.
+        view: [1] index of the view.
+        splats, boxes: outputs of ``projection.project``.
+        starts: [tiles + 1] output of ``place_lists``.
+        tile_counts: [tiles] initially 0; incremented to the number of entries in each list.
+        keys: [capacity] output, depth and row of each entry; sorting the keys orders entries by depth, then by row.
     """
     i = wp.tid()
     drawn = wp.int32(0)
@@ -176,7 +184,7 @@ for (int i = 0; i < count; ++i) items.data[first + i] = (int)(list[i] & 0xffffff
 def sort_list(
     thread: wp.int32, first: wp.int32, count: wp.int32, keys: wp.array[wp.uint64], items: wp.array[wp.int32]
 ) -> None:
-    """Sorts a list; called by all threads of a block, or by a single thread on the CPU device."""
+    """Sorts a list. All threads of a block must call it; on the CPU device, a single thread."""
     ...
 
 
@@ -193,10 +201,12 @@ def sort_lists(
     """Sorts each list, with one block per tile.
 
     Args:
-        threads: threads of a block, 1 on the CPU device. starts, segment_starts: from ``place_lists``.
-        tile_counts: [tiles], reset to 0. keys: from ``fill_lists``; undefined order afterwards.
-        items: out [capacity] rows of the Gaussians of each list.
-        segment_tiles: out [segments] tile of each segment.
+        threads: number of threads per block, 1 on the CPU device.
+        starts, segment_starts: [tiles + 1] outputs of ``place_lists``.
+        tile_counts: [tiles] number of entries in each list, reset to 0.
+        keys: [capacity] output of ``fill_lists``; its order is undefined afterwards.
+        items: [capacity] output, Gaussian of each entry.
+        segment_tiles: [segments] output, tile of each segment.
     """
     tile = wp.tid() // threads
     thread = wp.tid() - tile * threads
@@ -221,8 +231,10 @@ def mark_blocks(
     """Marks the blocks of pixels that the supports of Gaussians intersect, with one thread per Gaussian.
 
     Args:
-        side: side of a block in pixels, a divisor of the tile's side. cameras: [1]. splats, boxes: from projection.
-        marks: [rows, columns] of blocks, set to 1 or unchanged.
+        side: side length of a block in pixels; must divide the side length of a tile.
+        cameras: [1] camera of the image.
+        splats, boxes: outputs of ``projection.project``.
+        marks: [block rows, block columns] output, set to 1 for marked blocks and otherwise unchanged.
     """
     i = wp.tid()
     first = load(splats, 2 * i)

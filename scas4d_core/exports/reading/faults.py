@@ -24,7 +24,7 @@ def translate_read_errors(name: str) -> Iterator[None]:
         name: name of the file, for the message.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: if the file cannot be read.
 
     >>> with translate_read_errors("a.glb"):
     ...     {}["accessors"]

@@ -16,7 +16,7 @@ from scas4d_core.query.ply import SH_DEGREE_0, Splats
 
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 FLOAT = 5126
-REMEDY = "give a .glb written by scas4d export --format glb"
+REMEDY = "use a .glb file written by scas4d export --format glb"
 
 
 class GltfFrame:
@@ -27,7 +27,7 @@ class GltfFrame:
         name: name of the file, for messages.
 
     Raises:
-        InputError: the file is not a .glb, or contains an animation of parts.
+        InputError: if the file is not a .glb, or contains an animation of parts.
     """
 
     def __init__(self, data: bytes, name: str) -> None:
@@ -39,8 +39,8 @@ class GltfFrame:
             raise InputError(f"{name} is not a .glb file ({error})", REMEDY) from None
         if self._document.get("animations"):
             raise InputError(
-                f"{name} contains parts and their motion (glb-parts), not the states of frames",
-                "give files written by scas4d export --format glb, usd or s4d",
+                f"{name} contains the motion of parts (glb-parts) instead of one state per frame",
+                "use files written by scas4d export --format glb, usd or s4d",
             )
 
     @property
@@ -48,14 +48,14 @@ class GltfFrame:
         """Metres per unit of the user's world."""
         unit = self._document.get("asset", {}).get("extras", {}).get("metres_per_unit", 1.0)
         if not isinstance(unit, int | float) or not 0 < unit < float("inf"):
-            raise InputError(f"{self._name}: metres_per_unit is {unit!r}", REMEDY)
+            raise InputError(f"{self._name}: invalid metres_per_unit {unit!r}", REMEDY)
         return float(unit)
 
     def cloud(self) -> Cloud:
         """Returns the Gaussians with all harmonics, in the user's world and units with OpenCV axes.
 
         Raises:
-            InputError: attributes or ids are missing, or the file does not contain exactly one set of splats.
+            InputError: if attributes or ids are missing, or the file does not contain exactly one set of splats.
         """
         if not self._meshes:
             none = np.zeros((0, 3))
@@ -67,7 +67,7 @@ class GltfFrame:
             attributes = primitive["attributes"]
             if "_ID" not in attributes:
                 raise InputError(
-                    f"{self._name} has no ids (_ID), so Gaussians cannot be identified in other frames",
+                    f"{self._name} has no ids (_ID), so Gaussians cannot be matched between frames",
                     "export it as usd or s4d; a .glb cannot store ids of 2^24 or more",
                 )
             means, scales, rotations = (
@@ -87,7 +87,7 @@ class GltfFrame:
             if {len(each) for each in (means, scales, rotations, harmonics, ids, opacities)} != {len(means)}:
                 raise ValueError("attributes have different counts")
             if not np.linalg.norm(rotations, axis=1).all():
-                raise ValueError("a rotation is zero")
+                raise ValueError("a rotation has length 0")
             cloud = Cloud(splats, harmonics, ids)
         except (ValueError, KeyError, IndexError, TypeError) as error:
             if isinstance(error, InputError):
@@ -101,7 +101,7 @@ class GltfFrame:
         view = self._document["bufferViews"][accessor["bufferView"]]
         width, count = WIDTHS[accessor["type"]], accessor["count"]
         if accessor["componentType"] != FLOAT or "byteStride" in view or "sparse" in accessor:
-            raise ValueError("values are not plain float32")
+            raise ValueError("values are not contiguous float32")
         begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         return np.frombuffer(self._bytes, "<f4", count * width, begin).reshape(count, width).astype(np.float64)
 
@@ -110,10 +110,10 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     """Returns the document and the binary chunk (glTF 2.0, section 4.4)."""
     magic, version, _ = struct.unpack_from("<4sII", data)
     if magic != b"glTF" or version != 2:
-        raise ValueError("it has no glTF 2.0 header")
+        raise ValueError("no glTF 2.0 header")
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":
-        raise ValueError("its first chunk is not JSON")
+        raise ValueError("the first chunk is not JSON")
     document = json.loads(data[20 : 20 + length])
     begin = 20 + length
     if begin + 8 > len(data):

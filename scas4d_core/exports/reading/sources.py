@@ -23,28 +23,28 @@ from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 from scas4d_core.query.ply import SH_DEGREE_0, read_ply
 
 DEFAULT_FPS = 30.0
-"""Default frame rate of numbered files, which have no times."""
+"""Default frame rate of numbered files, which do not store times."""
 NUMBERED = re.compile(r"frame_(\d+)(\.\w+)")
 LOST = {
     ".splat": "its rows are sorted by size and have no ids",
     ".spz": "it has no ids",
     ".csv": "it contains only centres or poses",
 }
-REMEDY = "give a .s4d file, USD, or numbered .glb files (scas4d export --format s4d, usd, glb)"
+REMEDY = "use a .s4d file, a USD file or numbered .glb files (scas4d export --format s4d, usd or glb)"
 Bytes = Callable[[], bytes]
 LARGEST = 1 << 30
 """Maximum uncompressed size of a frame in a .zip, in bytes; a small archive could otherwise exhaust memory."""
 
 
 def open_export(path: Path | str, frames_per_second: float = DEFAULT_FPS) -> ExportedStates:
-    """Opens an export as states; frames are read one at a time.
+    """Opens an export as a sequence of states; frames are read one at a time.
 
     Args:
         path: folder or .zip of numbered .glb or .ply files, a single such file, or a USD file.
         frames_per_second: frame rate of numbered files; the time of frame n is n / frames_per_second.
 
     Raises:
-        InputError: the path is not an export, or its format has no Gaussian ids.
+        InputError: if the path is not an export, or its format has no Gaussian ids.
 
     >>> open_export("scene.splat")
     Traceback (most recent call last):
@@ -69,7 +69,7 @@ def _opened(given: Path, suffix: str, frames_per_second: float) -> ExportedState
     if suffix == ".zip":
         return _numbered(str(given), _of_zip(given), frames_per_second)
     if suffix not in (".glb", ".ply"):
-        raise InputError(f"{str(given)!r} is not a readable export", REMEDY)
+        raise InputError(f"{str(given)!r} is not a supported export", REMEDY)
     return _sequence(str(given), suffix, {_number(given.name): (given.name, given.read_bytes)}, frames_per_second)
 
 
@@ -88,7 +88,7 @@ def _of_zip(path: Path) -> dict[str, Bytes]:
 
     def read(name: str) -> bytes:
         if sizes[name] > LARGEST:
-            raise InputError(f"{name} in {path.name} has {sizes[name]} bytes", f"frames have at most {LARGEST}")
+            raise InputError(f"{name} in {path.name} has {sizes[name]} bytes", f"a frame can have at most {LARGEST}")
         with zipfile.ZipFile(path) as opened:
             return opened.read(name)
 
@@ -101,31 +101,31 @@ def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ExportedStat
     if lost := [suffix for suffix in suffixes if suffix in LOST]:
         raise InputError(f"{source!r} cannot be read as states: {lost[0]}: {LOST[lost[0]]}", REMEDY)
     if suffixes not in ([".glb"], [".ply"]):
-        held = f"files {', '.join(suffixes)}" if suffixes else "no numbered files (frame_000000.glb)"
+        held = f"{', '.join(suffixes)} files" if suffixes else "no numbered files such as frame_000000.glb"
         raise InputError(f"{source!r} contains {held}", REMEDY)
     by_index = {int(match[1]): (name, files[name]) for name, match in matches.items()}
     if len(by_index) < len(matches):
         raise InputError(
-            f"{source!r} has several files of one frame, such as frame_1 and frame_000001", "remove all but one"
+            f"{source!r} has several files for one frame, such as frame_1 and frame_000001", "remove all but one"
         )
     return _sequence(source, suffixes[0], dict(sorted(by_index.items())), rate)
 
 
 def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rate: float) -> ExportedStates:
     if not 0 < rate < float("inf"):
-        raise InputError(f"frames_per_second is {rate!r}", "give a positive number")
+        raise InputError(f"invalid frames_per_second {rate!r}", "use a positive number")
     frames, named = list(files), list(files.values())
     name, read = named[0]
-    remarks = [f"numbered files have no times: {rate:g} frames per second are assumed"] if len(frames) > 1 else []
+    remarks = [f"numbered files have no times; assuming {rate:g} frames per second"] if len(frames) > 1 else []
     if NUMBERED.fullmatch(name) is None:
         remarks.append(
-            f"{name} has no frame number, so frame 0 is assumed: for frame 13, rename it to frame_000013{suffix}"
+            f"{name} has no frame number; assuming frame 0 (for frame 13, rename it to frame_000013{suffix})"
         )
     cloud: Callable[[int], Cloud]
     if suffix == ".ply":
         rows = PlyRows(named)
         cloud, metres, deep = rows.cloud, 1.0, rows.glossy
-        remarks.append("a .ply has no unit: metres are assumed")
+        remarks.append("a .ply file has no unit; assuming metres")
     else:
         first = GltfFrame(read(), name)
         metres, deep = first.metres_per_unit, first.cloud().harmonics.shape[1] > 1
@@ -135,7 +135,7 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
             return GltfFrame(read(), name).cloud()
 
     if deep:
-        remarks.append("gloss is read as the mean over all directions")
+        remarks.append("gloss is averaged over all directions")
     return ExportedStates(frames, [index / rate for index in frames], cloud, default_header(metres, rate), {}, remarks)
 
 
@@ -148,7 +148,7 @@ class PlyRows:
         files: name of each file, and a function that returns its contents.
 
     Raises:
-        InputError: the first file is not a 3DGS .ply.
+        InputError: if the first file is not a 3DGS .ply.
     """
 
     def __init__(self, files: list[tuple[str, Bytes]]) -> None:
@@ -161,15 +161,15 @@ class PlyRows:
         """Returns the Gaussians of a frame in the user's world; ids are row numbers.
 
         Raises:
-            InputError: the frame does not have the same Gaussians as the first.
+            InputError: if the frame does not have the same Gaussians as the first.
         """
         name, read = self._files[place]
         splats = read_ply(io.BytesIO(read()), name)
         own = np.asarray(_vertex(name, read)["opacity"], np.float64)
         if not np.array_equal(own, self._opacities):
             raise InputError(
-                f"{name} has different Gaussians from {self._files[0][0]}, and a .ply has no ids with which they could "
-                "be matched",
+                f"{name} does not have the same Gaussians as {self._files[0][0]}, and .ply files have no ids to match "
+                "them",
                 REMEDY,
             )
         return Cloud(splats, (splats.colours[:, None] - 0.5) / SH_DEGREE_0, np.arange(len(splats), dtype=np.int64))
@@ -179,4 +179,4 @@ def _vertex(name: str, read: Bytes) -> PlyData:
     try:
         return PlyData.read(io.BytesIO(read()))["vertex"]
     except Exception as error:
-        raise InputError(f"{name}: not a 3D Gaussian Splatting .ply ({error})", REMEDY) from None
+        raise InputError(f"{name} is not a 3D Gaussian Splatting .ply file ({error})", REMEDY) from None

@@ -1,9 +1,9 @@
 """Reconstructs states from one cloud per frame: assigns rows to Gaussians, and detects births and retirements.
 
 A cloud contains the Gaussians present in its frame, with their ids. A Gaussian gets its row in the first frame that
-contains it, and is retired in each later frame that does not. Data missing from the files is inferred: a Gaussian moves
-if its position changes. Its material rotation is the rotation of its covariance axes, which exports keep in the order
-of the transported axes.
+contains it, and is retired in each later frame that does not contain it. Data missing from the files is inferred: a
+Gaussian moves if its position changes. Its material rotation is the rotation of its covariance axes, which exports keep
+in the order of the transported axes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STANDS = 1e-6
-"""Displacement below which a Gaussian is static, relative to the extent of all; float32 resolves a tenth of it."""
+"""Displacement, relative to the extent of all Gaussians, below which a Gaussian is static; float32 resolves a tenth of
+it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class _GaussianTable:
 
 @dataclass(eq=False)
 class ExportedStates:
-    """Presents a sequence of clouds as states. Only one frame and the constant data of each Gaussian are in memory.
+    """Presents a sequence of clouds as states, keeping one frame and the constant data of Gaussians in memory.
 
     Attributes:
         frames: frame indices in increasing order.
@@ -79,7 +80,7 @@ class ExportedStates:
         return self._known
 
     def parts(self) -> Int | None:
-        """Returns the part label of each Gaussian [N], −1 for none; None if the file has no parts."""
+        """Returns the part label of each Gaussian [N] (−1 for none), or None if the file has no parts."""
         if not self.part_of:
             return None
         return np.array([self.part_of.get(id, -1) for id in self.known.ids.tolist()], np.int64)
@@ -88,7 +89,7 @@ class ExportedStates:
         """Yields the index, time in seconds and state of frames ``low`` to ``high``, in the internal world of ``head``.
 
         Raises:
-            InputError: a file is damaged, or is inconsistent with previous ones.
+            InputError: if a file is damaged, or is inconsistent with previous files.
         """
         known, world = self.known, self.head.world
         row_of = {id: row for row, id in enumerate(known.ids.tolist())}

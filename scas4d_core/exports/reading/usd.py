@@ -16,14 +16,14 @@ from scas4d_core.query.ply import SH_DEGREE_0, Splats
 
 GAUSSIANS = "/World/Gaussians"
 PARTS = "/World/Parts"
-REMEDY = "give a file written by scas4d export --format usd"
+REMEDY = "use a file written by scas4d export --format usd"
 
 
 def open_usd(path: Path) -> ExportedStates:
-    """Opens a USD file as states; frames are read on demand.
+    """Opens a USD file as a sequence of states; frames are read on demand.
 
     Raises:
-        InputError: usd-core is missing, or the file was not written by ``exports.usd`` or has no ids.
+        InputError: if usd-core is missing, or the file was not written by ``exports.usd`` or has no ids.
     """
     usd, geometry, volume = (import_optional(f"pxr.{name}", "usd") for name in ("Usd", "UsdGeom", "UsdVol"))
     failure = import_optional("pxr.Tf", "usd").ErrorException
@@ -42,7 +42,7 @@ def open_usd(path: Path) -> ExportedStates:
     origin = stage.GetRootLayer().customLayerData.get("scas4d", {})
     rate = float(stage.GetTimeCodesPerSecond())
     if not 0 < rate < float("inf"):
-        raise InputError(f"{path.name}: timeCodesPerSecond is {rate!r}", REMEDY)
+        raise InputError(f"{path.name}: invalid timeCodesPerSecond {rate!r}", REMEDY)
     codes = _codes(stage, prim)
     first, begin = int(origin.get("first_frame", 0)), float(origin.get("first_time_s", 0.0))
     frames = [first + round(code) for code in codes]
@@ -57,7 +57,7 @@ def open_usd(path: Path) -> ExportedStates:
         lambda place: reader.cloud(codes[place]),
         default_header(unit, rate),
         part_of,
-        ["gloss is read as the mean over all directions"] if reader.degree else [],
+        ["gloss is averaged over all directions"] if reader.degree else [],
     )
 
 

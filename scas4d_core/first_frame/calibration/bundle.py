@@ -4,7 +4,7 @@ Matches leave some degrees of freedom undetermined: the position, orientation an
 slight bend of a camera ring, are nearly undetermined. Here, a Cauchy loss pulls each camera towards its calibrated
 pose. Values that the matches do not determine thus stay as calibrated, and a camera that is far off does not pull the
 others along. pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of an
-exact rig by a median of 0.6 pixels (docs/calibration.md).
+exact rig by a median of 0.6 pixels (`robot`, 2026-11-23).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def bundle_adjust(
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Observed features: the camera index [M], point index [M] and pixel [M, 2] of each."""
+    """Observed features, with the camera index [M], point index [M] and pixel [M, 2] of each feature."""
 
     camera: NDArray[np.intp]
     point: NDArray[np.intp]
@@ -138,7 +138,7 @@ class _BundleAdjustment:
         return float(np.median(pulls[np.unique(self.seen.camera)]))
 
     def _depths(self, cameras: Sequence[Camera], points: Float) -> Float:
-        """Returns the [V] median depth of each camera's points; 1 for cameras without points."""
+        """Returns the [V] median depth of each camera's points, or 1 for cameras without points."""
         depths = np.ones(self.count)
         for index, camera in enumerate(cameras):
             own = points[self.seen.point[self.seen.camera == index]]

@@ -1,4 +1,4 @@
-"""SIFT matches between neighbouring cameras, by appearance only, so that calibration errors do not bias them.
+"""SIFT matches between neighbouring cameras, based only on appearance so that calibration errors do not bias them.
 
 The matches for the initial points (``points/triangulation.py``) are restricted to within two pixels of the epipolar
 lines of the given calibration. Here, the whole image is searched. This yields fewer matches, but they reveal how large
@@ -144,7 +144,7 @@ def _mutual_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> 
 
 
 def epipolar_distances(matches: Matches, pair: Pair) -> Float:
-    """Returns the [M] epipolar distance of each match of a pair in pixels: the larger of those in the two images."""
+    """Returns the [M] epipolar distances of a pair's matches, each the larger one of both images, in pixels."""
     (a, b), rows = pair, matches.pairs[pair]
     first, second = (np.pad(matches.pixels[v][rows[:, k]], ((0, 0), (0, 1)), constant_values=1.0)
                      for k, v in enumerate((a, b)))  # fmt: skip

@@ -36,7 +36,7 @@ def calibrate_first_frame(
         rig: calibrated rig, at the size of the frame's images.
         frame: frame 0.
         settings: settings of frame 0.
-        on_progress: called at the start and at the end.
+        on_progress: function called at the start and at the end.
         measured: whether to check the calibration even if no refinement is requested.
 
     Returns:
@@ -51,7 +51,7 @@ def calibrate_first_frame(
 
 
 def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> CalibrationReport | None:
-    """Measures the calibration error in the images of a frame; returns None if fewer than two cameras have an image.
+    """Measures the calibration error in a frame's images, or returns None if fewer than two cameras have an image.
 
     Args:
         rig: rig in the user's world, at image size.
@@ -87,17 +87,18 @@ def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], 
     if not known:
         return []
     usual = float(np.median(list(known.values())))
-    remedy = "set static.refine_calibration to refine it from the images of frame 0"
+    remedy = "set static.refine_calibration to refine it using the images of frame 0"
     inside = [known[camera.name] / scale for camera, scale in zip(matches.cameras, matches.scale, strict=True)
               if camera.name in known]  # fmt: skip
     if float(np.median(inside)) > MAX_RESIDUAL:
         return [
-            f"the calibration seems to be off: matching features miss their epipolar lines by {usual:.1f} px (median "
-            f"over {len(known)} cameras); {remedy}"
+            f"the calibration seems to be inaccurate: matching features are {usual:.1f} px from their epipolar lines "
+            f"(median over {len(known)} cameras); {remedy}"
         ]
     return [
-        f"the calibration of camera {name!r} seems to be off: its matching features miss their epipolar lines by "
-        f"{known[name]:.1f} px (median of {cameras[name].matches}), compared with {usual:.1f} px for the rig; {remedy}"
+        f"the calibration of camera {name!r} seems to be inaccurate: its matching features are {known[name]:.1f} px "
+        f"from their epipolar lines (median of {cameras[name].matches}), compared with {usual:.1f} px for the rig; "
+        f"{remedy}"
         for name in off
     ]
 
@@ -124,8 +125,8 @@ def refine_rig(rig: Rig, matches: Matches) -> Refinement:
         return _not_refined(f"only {len(best.losses)} matches could be held out for testing")
     if not best.is_better:
         return _not_refined(
-            f"the error of {len(best.losses)} held-out matches did not improve: {best.before:.2f} px before, "
-            f"{best.after:.2f} px after"
+            f"the error of {len(best.losses)} held-out matches did not decrease ({best.before:.2f} px before, "
+            f"{best.after:.2f} px after)"
         )
     longer = _HeldOutTest.of(held, best.cameras, bundle_adjust(before, tracks, focal=True))
     after = longer.cameras if longer.is_better else best.cameras
@@ -168,7 +169,7 @@ class _HeldOutTest:
 
     @property
     def is_better(self) -> bool:
-        """True if the loss decreased significantly."""
+        """Whether the loss decreased significantly."""
         count = len(self.losses)
         return (
             count >= MIN_HELD_OUT
@@ -189,14 +190,17 @@ def _refinement(rig: Rig, matches: Matches, test: _HeldOutTest, fixed: Sequence[
         )  # fmt: skip
     far = max(cameras, key=lambda name: cameras[name].rotation_deg)
     text = (
-        f"the calibration was refined, as requested: {len(test.losses)} held-out matches miss their epipolar lines "
-        f"by {test.after:.2f} px instead of {test.before:.2f}; camera {far!r} was rotated most, by "
-        f"{cameras[far].rotation_deg:.2f}°: {cameras[far].after:.2f} px instead of {cameras[far].before:.2f}"
+        f"the calibration was refined as requested: {len(test.losses)} held-out matches are {test.after:.2f} px from "
+        f"their epipolar lines ({test.before:.2f} px before); camera {far!r} was rotated most, by "
+        f"{cameras[far].rotation_deg:.2f}°, and its error is {cameras[far].after:.2f} px "
+        f"({cameras[far].before:.2f} px before)"
     )
     if focal:
-        text += "; focal lengths were adjusted too"
+        text += "; focal lengths were also adjusted"
     if fixed:
-        text += f"; unchanged for lack of matches: {', '.join(matches.cameras[index].name for index in fixed)}"
+        text += (
+            f"; cameras with too few matches are unchanged: {', '.join(matches.cameras[index].name for index in fixed)}"
+        )
     return Refinement(True, text, test.before, test.after, len(test.losses), cameras)
 
 

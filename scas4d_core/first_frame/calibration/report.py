@@ -1,4 +1,4 @@
-"""Calibration results in the report of frame 0, and the refined rig that is read from it. Needs only numpy."""
+"""Calibration results in the report of frame 0, and the refined rig that is read from it. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ class Refinement:
     Attributes:
         accepted: whether the scene uses the refined rig.
         text: user-facing explanation.
-        before: error before refinement: the epipolar distance in pixels that has the mean loss of held-out matches.
+        before: error before refinement, i.e. the epipolar distance in pixels whose loss is the mean over held-out
+            matches.
         after: the same error after refinement.
         matches: number of held-out matches.
         cameras: refined cameras, keyed by name; empty if the refinement was not accepted.
@@ -69,7 +70,7 @@ class Refinement:
     cameras: dict[str, RefinedCamera] = field(default_factory=dict)
 
     def apply_to(self, camera: Camera) -> Camera:
-        """Returns a camera, at any image size, with its refined pose and focal length; unchanged if it has none."""
+        """Returns a camera, at any image size, with its refined pose and focal length (unchanged if not refined)."""
         refined_camera = self.cameras.get(camera.name)
         return camera if refined_camera is None else _with_pose(camera, refined_camera.pose, refined_camera.focal)
 
@@ -81,8 +82,8 @@ class CalibrationReport:
     Attributes:
         cameras: residual of each camera before refinement, keyed by name.
         miscalibrated: names of cameras that are clearly off.
-        warnings: user-facing warnings; about the refined rig if there is one.
-        refined: result of the refinement; None if not requested.
+        warnings: user-facing warnings, which describe the refined rig if there is one.
+        refined: result of the refinement, or None if no refinement was requested.
     """
 
     cameras: dict[str, CameraResidual]
@@ -92,7 +93,7 @@ class CalibrationReport:
 
 
 def effective_rig(rig: Rig, record: Mapping[str, Any]) -> Rig:
-    """Returns the rig that a scene uses: with refined cameras if frame 0 accepted a refinement.
+    """Returns the rig that a scene uses, with refined cameras if a refinement was accepted in frame 0.
 
     Args:
         rig: calibrated rig at any image size, or a subset of its cameras.

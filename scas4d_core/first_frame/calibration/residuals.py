@@ -1,4 +1,4 @@
-"""Measures the epipolar residual of each camera in pixels: its calibration error in the images of frame 0."""
+"""Measures the epipolar residual of each camera in pixels, i.e. its calibration error in the images of frame 0."""
 
 from __future__ import annotations
 

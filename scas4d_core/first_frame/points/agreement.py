@@ -38,7 +38,7 @@ from scas4d_core.posed_pictures import (
 )
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with the name of a stage, and its completed and total number of steps."""
+"""Callback that receives the name of a stage, and its completed and total numbers of steps."""
 
 REFUTING_VIOLATIONS = 2
 """Number of cameras that must see through an unconfirmed point to reject it; a single depth may be wrong."""
@@ -81,7 +81,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     """Finds points on which at least ``search.min_views`` cameras agree.
 
     Raises:
-        InitialPointsError: there are no such points.
+        InitialPointsError: if there are no such points.
     """
     views, plain, min_views, seed = search.views, search.backdrop, search.min_views, search.seed
     middle = look_at_point(views)

@@ -65,8 +65,8 @@ def merge_candidates(
         needed = np.concatenate([needed, np.full(len(new), views_needed, dtype=np.intp)])
     if len(points) == 0:
         raise InitialPointsError(
-            "images: no point is supported by enough cameras; check that the calibration matches the images, "
-            "or start from a point cloud"
+            "images: no point is confirmed by enough cameras; check that the calibration matches the images, "
+            "or provide a point cloud"
         )
     visible = visible_from(views, points, fine)
     foreground = labelled_share(labelled, points, visible)
@@ -97,14 +97,14 @@ def merge_candidates(
         scale *= 1.15
     if not chosen.any():
         raise InitialPointsError(
-            "images: the cameras contradict every candidate point; check that the calibration matches the images, "
-            "or start from a point cloud"
+            "images: every candidate point contradicts the cameras; check that the calibration matches the images, "
+            "or provide a point cloud"
         )
     return InitialPoints(points[chosen], seen.colours[chosen], None if foreground is None else foreground[chosen])
 
 
 def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
-    """Returns the fraction of the cameras that may see each point whose masks contain it, [P]; None without masks."""
+    """Returns the fraction of the cameras that may see a point whose masks contain it, [P], or None without masks."""
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):
         if view.mask is None:

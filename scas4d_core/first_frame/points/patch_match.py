@@ -136,7 +136,7 @@ def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
 
 @kernel
 def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, float]:
-    """Fills in the samples around a pixel and their bilateral weights; returns their mean and standard deviation."""
+    """Fills in the samples around a pixel and their bilateral weights, and returns the mean and standard deviation."""
     height, width = image.shape
     middle = image[y, x]
     sum_w, sum_i, sum_ii = 0.0, 0.0, 0.0

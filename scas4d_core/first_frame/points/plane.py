@@ -57,7 +57,7 @@ MAX_VIEWS = 6
 CLOSED = 15
 """Maximum width, in cells, of gaps between agreeing cells that are filled."""
 
-NO_PLANE = "images: cameras agree on no plane; start from a point cloud"
+NO_PLANE = "images: the cameras do not agree on any plane; provide a point cloud"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
         labelled: views, with masks if available.
 
     Raises:
-        InitialPointsError: there is no plane on which the images agree.
+        InitialPointsError: if there is no plane on which the images agree.
 
     >>> from scas4d_core.cameras import Camera
     >>> texture = np.random.default_rng(0).integers(0, 255, (100, 100, 1), np.uint8).repeat(3, axis=2)
@@ -134,7 +134,7 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
     """Returns the plane on which images agree most: horizontal, parallel to the camera ring, or facing the cameras.
 
     Raises:
-        InitialPointsError: the images hardly agree more than mirrored images do.
+        InitialPointsError: if the images agree hardly more than mirrored images do.
     """
     candidates = [(_best(views, start), start) for start in _starts(views)]
     (score, plane), start = max(candidates, key=lambda one: one[0][0])

@@ -12,8 +12,8 @@ from scipy.ndimage import label
 from scas4d_core.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
-"""Maximum difference of a background pixel from the background colour in any channel, in levels of 255; above the noise
-from resampling and mild compression."""
+"""Maximum difference of a background pixel from the background colour in any channel, in 8-bit levels; it exceeds the
+noise from resampling and mild compression."""
 PLAIN_BORDER = 0.95
 """Minimum fraction of the border of each image that must have the same colour for a plain background."""
 SMALL_HOLE = 12
@@ -21,12 +21,12 @@ SMALL_HOLE = 12
 
 PLAIN = 0.2
 """Minimum fraction of all pixels that must have a similar colour for a plain backdrop; most cameras must reach half of
-it."""
+this fraction."""
 SAME = 0.05
 """Minimum fraction of all pixels that must have exactly the same colour for a synthetic background. Quantized images of
 rooms reach up to 0.03."""
 ALIKE = 8
-"""Maximum difference between similar colours, in levels of 255, due to noise and JPEG artefacts."""
+"""Maximum difference between similar colours, in 8-bit levels, due to noise and JPEG artefacts."""
 PIXEL_STRIDE = 4
 """Spacing of the sampled pixels."""
 
@@ -36,7 +36,7 @@ def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
-    """Returns the [3] colour of a plain backdrop that many images show, in levels of 255; None if there is none.
+    """Returns the [3] colour of a plain backdrop that many images show, in 8-bit levels, or None if there is none.
 
     Args:
         images: images [H, W, 3], each side larger than ``PIXEL_STRIDE`` pixels.
@@ -55,7 +55,7 @@ def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
 
 
 def mean_colour(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-    """Returns the [3] mean colour of all images, in levels of 255."""
+    """Returns the [3] mean colour of all images, in 8-bit levels."""
     mean: NDArray[np.float64] = np.concatenate([_sampled(image) for image in images]).mean(axis=0)
     return mean
 
@@ -72,14 +72,14 @@ def _is_backdrop(of_it: list[Bool], share: float) -> bool:
     """Returns whether enough pixels show the backdrop.
 
     Args:
-        of_it: for each camera, whether each pixel shows the backdrop.
-        share: minimum fraction of all pixels; most cameras must reach half of it.
+        of_it: one mask per camera, true for pixels that show the backdrop.
+        share: minimum fraction of all pixels; most cameras must reach half of this fraction.
     """
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 
 
 def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
-    """Returns the [3] uint8 colour that the borders of all images share; None if they differ."""
+    """Returns the [3] uint8 colour that the borders of all images share, or None if they differ."""
     borders = [_border(view.image) for view in views]
     colour = np.median(np.concatenate(borders), axis=0)
     for border in borders:

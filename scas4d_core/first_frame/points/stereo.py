@@ -66,7 +66,7 @@ class StereoBudget:
 
 
 def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> StereoBudget | None:
-    """Selects the effort that the time limit allows, based on the pace on tiny images; None if stereo takes too long.
+    """Returns the effort that the time limit allows, based on the pace on tiny images, or None if it allows none.
 
     Args:
         views: views at full size.
@@ -99,7 +99,7 @@ def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, l
     if index:
         planned_effort = efforts[index]
         limit.shortened.append(
-            f"stereo on images at most {planned_effort.width} pixels wide, {planned_effort.iterations} rounds"
+            f"stereo on images at most {planned_effort.width} pixels wide, with {planned_effort.iterations} rounds"
         )
     return efforts[index]
 
@@ -114,7 +114,7 @@ def load_stereo() -> None:
 
 
 def _pixels(view: PosedPicture, width: int) -> int:
-    """Returns the number of pixels that ``halved`` leaves of a view."""
+    """Returns the number of pixels in a view after ``halved``."""
     columns, rows = view.camera.width, view.camera.height
     while columns > width:
         columns, rows = columns // 2, rows // 2
@@ -122,7 +122,7 @@ def _pixels(view: PosedPicture, width: int) -> int:
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
-    """Returns the views to compare a view with: the nearest in angle about ``middle`` [3], within the angle limits."""
+    """Returns the views to compare with a view: the nearest in angle about ``middle`` [3], within the angle limits."""
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
@@ -155,7 +155,7 @@ def depth_maps(
         seed: random seed of the planes.
         hull: hull of the masks; depths of masked pixels outside of it are rejected.
         fewest: minimum number of neighbours of an image.
-        progress: called with (completed views, number of views).
+        progress: function called with (completed views, number of views).
     """
     greys = [_grey(view) for view in views]
     depths = []
@@ -277,7 +277,7 @@ def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float
 def count_violations(
     maps: Sequence[DepthMap], points: Float, min_views: int, margin: float = 0.03, skip: int = -1
 ) -> NDArray[np.intp]:
-    """Returns the number of cameras that see through each of the points [P, 3], [P].
+    """Returns, for each of the points [P, 3], the number of cameras that see through it, [P].
 
     A camera sees through a point if its trusted depth is more than ``margin`` (relative) behind the point. All 3 × 3
     pixels around the point must agree, because next to an outline, the adjacent pixel sees past the point.

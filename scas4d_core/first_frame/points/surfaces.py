@@ -45,7 +45,7 @@ class Surface(Protocol):
         """Returns the [P, 3] unit normals at the surface points nearest to points [P, 3]."""
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """Returns the [R] ray parameters of the intersections from inside the room; infinity if there is none."""
+        """Returns the [R] ray parameters of the intersections from inside the room, or infinity if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class PatchPlane:
         return np.broadcast_to(self.normal, points.shape)
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """Returns the [R] ray parameters; infinity if the ray points away."""
+        """Returns the [R] ray parameters, or infinity if the ray points away."""
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (self.offset - origin @ self.normal) / (directions @ self.normal)
         result: Float = np.where(along > 0, along, np.inf)
@@ -91,7 +91,7 @@ class Sphere:
         return result
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """Returns the [R] ray parameters of the far intersections; infinity if the ray misses the sphere."""
+        """Returns the [R] ray parameters of the far intersections, or infinity if the ray misses the sphere."""
         offset = origin - self.centre
         a = (directions**2).sum(-1)
         b = directions @ offset
@@ -111,7 +111,7 @@ class Support:
 
 
 def fit_plane(points: Float) -> PatchPlane | None:
-    """Returns the least-squares plane of points [P, 3], P ≥ 3; None if they are collinear."""
+    """Returns the least-squares plane of points [P, 3], P ≥ 3, or None if they are collinear."""
     middle = points.mean(0)
     _, values, axes = np.linalg.svd(points - middle, full_matrices=False)
     if len(points) < 3 or values[1] < 1e-9 * max(values[0], 1e-300):
@@ -121,7 +121,7 @@ def fit_plane(points: Float) -> PatchPlane | None:
 
 
 def fit_sphere(points: Float) -> Sphere | None:
-    """Returns the least-squares sphere of points [P, 3], P ≥ 4; None if they are coplanar.
+    """Returns the least-squares sphere of points [P, 3], P ≥ 4, or None if they are coplanar.
 
     Solves |x|² = 2 x·c + (r² − |c|²), which is linear in c and r² − |c|².
     """
@@ -182,7 +182,7 @@ def fit_surfaces(
 
 
 def _bounds(surface: Surface, points: Float, centres: Float, tolerance: float) -> bool:
-    """Returns true if the cameras and nearly all points are on the same side of the surface."""
+    """Returns whether the cameras and nearly all points are on the same side of the surface."""
     cameras, behind = surface.offsets(centres), surface.offsets(points)
     if isinstance(surface, Sphere):
         reach = np.linalg.norm(centres - surface.centre, axis=1).max()

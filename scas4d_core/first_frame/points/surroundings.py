@@ -38,7 +38,7 @@ class Stage:
         return cls(look_at_point(views), STAGE * max(distances))
 
     def holds(self, points: NDArray[np.floating]) -> Bool:
-        """Returns whether each of the points [P, 3] is on the stage, [P].
+        """Returns whether each of the points [P, 3] is inside the stage, [P].
 
         >>> Stage(np.zeros(3), 2.0).holds(np.array([[1.0, 0, 0], [3.0, 0, 0]]))
         array([ True, False])

@@ -24,7 +24,7 @@ RATIO = 0.8
 MAX_DESCRIPTOR_DISTANCE = 0.7
 """Maximum distance between two matching unit descriptors, as in COLMAP."""
 MAX_FEATURES = 4096
-"""Maximum number of SIFT features per image; matching time grows with the product of two images' numbers."""
+"""Maximum number of SIFT features per image; matching time grows with the product of two images' feature counts."""
 EPIPOLAR_ERROR = 2.0
 """Maximum epipolar distance of a match and maximum reprojection error, in pixels. Calibration residuals are typically
 near 0.5."""
@@ -94,7 +94,7 @@ def _all_features(
             index = limit.choose(FEATURES, [each * sum(size[1:]), *(each * sum(size) / n**2 for n in (2, 4))])
             if index:
                 divisor = 2 ** min(index, 2)
-                limit.shortened.append(f"features from images downscaled to 1/{divisor}")
+                limit.shortened.append(f"features extracted from images downscaled to 1/{divisor}")
                 features_by_view = [_features(views[0], extract, divisor)]
         features_by_view.append(_features(view, extract, divisor))
     return features_by_view
@@ -129,7 +129,7 @@ def guided_matches(
 
     Args:
         first: camera, feature positions [A, 2] and unit descriptors [A, 128] of a view.
-        second: the same for the other view.
+        second: camera, feature positions [B, 2] and unit descriptors [B, 128] of the other view.
     """
     (camera_a, uv_a, descriptors_a), (camera_b, uv_b, descriptors_b) = first, second
     if len(uv_a) == 0 or len(uv_b) == 0:
@@ -233,7 +233,7 @@ def group_by_track(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _affordable_pairs(
     found: Sequence[tuple[Camera, Float, NDArray[np.float32]]], limit: TimeLimit
 ) -> list[tuple[int, int]]:
-    """Returns the pairs of views that can be matched in time: all, or those with the most similar directions."""
+    """Returns the pairs of views that can be matched in time: all pairs, or those with the most similar directions."""
     pairs = [(a, b) for a in range(len(found)) for b in range(a + 1, len(found))]
     if not limit.bounded or len(pairs) <= FEW_PAIRS:
         return pairs
@@ -247,7 +247,7 @@ def _affordable_pairs(
     most = int((each * np.cumsum(work) <= limit.seconds_left(MATCHES)).sum())
     if most < len(pairs):
         most = max(most, FEW_PAIRS)
-        limit.shortened.append(f"features matched in {most} of {len(pairs)} image pairs")
+        limit.shortened.append(f"features matched in only {most} of {len(pairs)} image pairs")
     return sorted(pairs[:most])
 
 
@@ -297,7 +297,7 @@ def triangulate(
 
     Args:
         views: views of one frame.
-        tracks: result of ``match_tracks``; computed if None.
+        tracks: result of ``match_tracks``, or None to compute it.
         min_views: minimum number of inlier views of a point.
         seed: random seed of RANSAC.
     """

@@ -101,7 +101,7 @@ class VisualHull:
 
 
 def pixel_size_at(views: Sequence[PosedPicture], point: Float) -> float:
-    """Returns the pixel size at ``point`` [3] in world units, median over the cameras that face it; 1 if none do."""
+    """Returns the median pixel size at ``point`` [3] over the cameras that face it, in world units, or 1 if none do."""
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
     ]
@@ -173,7 +173,7 @@ def count_contradictions(
 
 
 def _distance(mask: Bool) -> Float:
-    """Returns the [H, W] distance in pixels to the nearest silhouette pixel; infinity if there is none."""
+    """Returns the [H, W] distance in pixels to the nearest silhouette pixel, or infinity if there is no such pixel."""
     if not mask.any():
         return np.full(mask.shape, np.inf)
     result: Float = distance_transform_edt(~mask)

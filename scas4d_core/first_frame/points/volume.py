@@ -38,7 +38,7 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         seed: random seed of the samples.
 
     Raises:
-        InitialPointsError: no two cameras look at the same place.
+        InitialPointsError: if no two cameras look at the same place.
 
     >>> from scas4d_core.cameras import Camera
     >>> def seen(x):
@@ -67,8 +67,8 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
             break
     else:
         raise InitialPointsError(
-            "images: no two cameras see the same place; check that the calibration matches the images, and that its "
-            "poses have the direction that its format requires (world to camera; transforms.json: camera to world)"
+            "images: no two cameras see the same place; check that the calibration matches the images, and that the "
+            "poses have the direction that the format requires (world to camera; transforms.json: camera to world)"
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
@@ -85,7 +85,7 @@ def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:
 
 
 def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) -> list[float]:
-    """Returns each camera's distance to the scene: to known points, or else to the intersection of the optical axes.
+    """Returns each camera's distance to the scene: to known points or, if there are none, to where optical axes meet.
 
     Args:
         views: views of the cameras.

@@ -123,7 +123,7 @@ def test_scenes_are_managed(service):
         scenes("keep", id, "--frames", "5", "--states", "all")
         kept = client.scene(id).ingest
         assert (kept.keep_frames.last, kept.keep_states.last) == (5, None)
-        assert "neither a number of frames nor all" in scas4d("scenes", "keep", id, "--frames", "few").stderr
+        assert "--frames must be a number of frames or all" in scas4d("scenes", "keep", id, "--frames", "few").stderr
         assert "asleep" in scenes("sleep", id).stdout
         assert "archived" in scenes("archive", id).stdout
         assert id not in scenes().stdout
@@ -163,7 +163,7 @@ def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
             client.delete_scene(status.id)
     broken = scas4d("push", str(studio), "--pictures", "videos")
     assert broken.returncode == 1
-    assert "put each camera's video into videos/<camera>.mp4" in broken.stderr
+    assert "put each camera's video in videos/<camera>.mp4" in broken.stderr
 
 
 def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path):
@@ -173,7 +173,7 @@ def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path)
     folder = write_rig(tmp_path / "mixed")
     done = scas4d("push", str(folder), "--url", service.url, "--test", "c8", COLUMNS="200")
     assert "2 of 2 frames committed" in done.stdout, done.stderr
-    assert "camera 'c2': its 16-bit images are rounded to 8 bits" in done.stdout
+    assert "camera 'c2': 16-bit images are rounded to 8 bits" in done.stdout
     with Client(service.url) as client:
         (status,) = client.scenes()
         assert status.cameras == [f"c{number}" for number in range(COUNT - 1)]
@@ -219,7 +219,7 @@ def test_a_budget_is_told_set_and_taken_back(service):
             assert said("--iterations", "50").startswith("50 iterations per frame")
             assert said("--reset") == made
             refused = scas4d("budget", scene, "--reset", "--iterations", "5", "--url", service.url)
-            assert (refused.returncode, "leave one out" in refused.stderr) == (1, True)
+            assert (refused.returncode, "omit one of them" in refused.stderr) == (1, True)
         finally:
             client.delete_scene(scene)
 
@@ -250,7 +250,7 @@ def test_a_scene_begins_again(service, tmp_path):
                 "--points",
                 str(tmp_path / "cloud.npz"),
             )
-            assert said(*given) == f"scene {scene} restarts at frame 1, reconstruction 1; 1 queued"
+            assert said(*given) == f"scene {scene}: reconstruction 1 starts at frame 1; 1 queued"
             assert client.wait(scene, 1).state == "committed"
             status = client.scene(scene)
             assert (status.gaussians, status.settings["update"]["iterations"]) == (4, 9)
@@ -268,10 +268,10 @@ def test_serve_refuses_to_listen_beyond_this_machine():
     ("arguments", "said"),
     [
         (("push", "nowhere"), "nowhere: no such folder"),
-        (("push", "TINY", "--url", "http://127.0.0.1:9"), "start one with: scas4d serve"),
+        (("push", "TINY", "--url", "http://127.0.0.1:9"), "start a service with: scas4d serve"),
         (("push", "TINY", "--set", "iterations"), "update.iterations=200"),
-        (("push", "TINY", "--node", "stage-a"), "use the form rig=stage-a"),
-        (("push", "TINY", "--node", "rig=a", "--node", "rig=b"), "'rig' has two values"),
+        (("push", "TINY", "--node", "stage-a"), "use the form NAME=VALUE, such as rig=stage-a"),
+        (("push", "TINY", "--node", "rig=a", "--node", "rig=b"), "'rig' is set to both"),
         (("push", "TINY", "--node", "rig=a", "--scene", "x"), "--node applies only to new scenes"),
     ],
 )

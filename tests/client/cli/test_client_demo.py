@@ -92,7 +92,7 @@ def test_it_waits_for_what_will_be_ready_without_anybodys_doing(said, tmp_path, 
             said.get("kernels", 1),
         )
     else:
-        with pytest.raises(RuntimeError, match="cannot become ready: 503: not yet"):
+        with pytest.raises(RuntimeError, match="failed to become ready: 503: not yet"):
             _compile_progress("http://127.0.0.1:1", tmp_path)
 
 
@@ -121,6 +121,6 @@ def test_a_service_that_ends_is_told_with_its_reason(capture_folder, tmp_path):
 def test_kernels_that_cannot_be_made_are_not_waited_for(capture_folder, tmp_path):
     ended = demo(capture_folder, tmp_path / "out", FAKE_FAULT="1")
     assert ended.returncode == 1
-    assert ended.stderr.startswith("scas4d: the service cannot become ready: 503")
+    assert ended.stderr.startswith("scas4d: the service failed to become ready: 503")
     assert "the fake was told to raise" in ended.stderr
     assert ended.stderr.count("\n") == 1

@@ -96,11 +96,11 @@ def test_up_may_be_given_and_one_key_is_enough(tmp_path):
         ({"keys": [placed(0, (0, 1, 0), aim=1)]}, r"keys\[0\].aim 1: extra inputs are not permitted"),
         (
             {"keys": [placed(0, (0, 0, 1)), placed(0, (0, 0, 2))]},
-            r"keys\[1\].time 0.0 is not later than that of keys\[0\]",
+            r"keys\[1\].time 0.0 is not later than keys\[0\]",
         ),
-        ({"keys": [{"time": 0, "position": [0, 0, 1]}]}, r"keys\[0\]: position and look_at go together"),
-        ({"keys": [{"time": 0}]}, r"keys\[0\]: give either position and look_at, or world_to_camera"),
-        ({"keys": [placed(0, (0, 0, 1), frame=1)]}, r"keys\[0\]: give either time .* or frame"),
+        ({"keys": [{"time": 0, "position": [0, 0, 1]}]}, r"keys\[0\]: position and look_at must be set together"),
+        ({"keys": [{"time": 0}]}, r"keys\[0\]: set either position and look_at, or world_to_camera"),
+        ({"keys": [placed(0, (0, 0, 1), frame=1)]}, r"keys\[0\]: set either time .* or frame"),
         ({"keys": [placed(0, (0, 0, 0))]}, r"keys\[0\]: position and look_at are the same point"),
         (
             {"keys": [{"frame": 4, "position": [0, 0, 1], "look_at": [0, 0, 0]}]},

@@ -80,7 +80,7 @@ def test_points_by_part_have_the_colour_of_their_class(source, tmp_path):
 
 
 def test_faults_and_a_package_that_is_missing(source, tmp_path):
-    with pytest.raises(InputError, match=r"ends in '.mp4'; give a name that ends in .rrd"):
+    with pytest.raises(InputError, match=r"has the unsupported suffix '.mp4'; use .rrd"):
         made(source, tmp_path / "a.mp4")
     said = install_hint(ModuleNotFoundError("No module named 'rerun'", name="rerun"))
     assert said is not None

@@ -93,11 +93,11 @@ def test_parts_and_their_poses(source):
 def test_faults_have_remedies(source, tmp_path):
     given = Scene.open(source)
     for ask, said in (
-        (lambda: given.tracks(ids=[7]), "ids: there is no Gaussian 7 in frame 4"),
-        (lambda: next(given.states("9:")), "frames 9: do not exist; give frames 0 to 4"),
-        (lambda: Scene.open(source, frames="8:"), "frames 8: are not in states; it has frames 0 to 4"),
-        (lambda: Scene.open(tmp_path), "contains no numbered files .*; give a .s4d file"),
-        (lambda: Scene.open(tmp_path / "no.s4d"), "does not exist; give a compact file"),
+        (lambda: given.tracks(ids=[7]), "ids: no Gaussian 7 in frame 4"),
+        (lambda: next(given.states("9:")), "no frames in the range 9:; use frames 0 to 4"),
+        (lambda: Scene.open(source, frames="8:"), "states has no frames in the range 8:; it contains frames 0 to 4"),
+        (lambda: Scene.open(tmp_path), "contains no numbered files .*; use a .s4d file"),
+        (lambda: Scene.open(tmp_path / "no.s4d"), "does not exist; use a compact file"),
     ):
         with pytest.raises(InputError, match=said):
             ask()

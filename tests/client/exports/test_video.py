@@ -202,9 +202,9 @@ def test_tracks_of_what_stands_are_refused(tmp_path):
     with CompactWriter(tmp_path / "states.s4d", FileHeader(WORLD, rig=make_rig())) as writer:
         still = state(0)
         writer.add(0, 0.0, still.replace(foreground=0 * still.foreground))
-    with pytest.raises(InputError, match="tracks: there is no motion in these frames; leave --tracks out"):
+    with pytest.raises(InputError, match="tracks: these frames contain no motion; omit --tracks"):
         made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", tracks=3))
-    with pytest.raises(InputError, match="parts: states contains no parts; leave --parts out"):
+    with pytest.raises(InputError, match="parts: states contains no parts; omit --parts"):
         made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", parts=True))
     assert [path.name for path in tmp_path.iterdir()] == ["states.s4d"]
 
@@ -219,13 +219,13 @@ def test_a_moment_from_all_around(source, tmp_path):
 @pytest.mark.parametrize(
     ("out", "options", "more", "said"),
     [
-        ("a.gif", FRONT, {}, r"out .*a.gif' ends in '.gif'; give a name that ends in .mp4 or .webp"),
-        ("a.mp4", VideoOptions(path="camera", size=(63, 48)), {}, "size 63x48 is odd, .*; give 62x48, or a .webp"),
-        ("a.mp4", VideoOptions(path="camera", camera="up"), {}, "camera 'up' does not exist; give one of front, side"),
-        ("a.mp4", VideoOptions(path="way.json"), {}, "path 'way.json' is not a file; give orbit, camera, or a JSON"),
-        ("a.mp4", FRONT, {"frames": "7:9"}, "frames 7:9 are not in states; it has frames 0 to 4"),
+        ("a.gif", FRONT, {}, r"out .*a.gif' has the unsupported suffix '.gif'; use .mp4 or .webp"),
+        ("a.mp4", VideoOptions(path="camera", size=(63, 48)), {}, "size 63x48 .* odd dimension, .*; use 62x48, or"),
+        ("a.mp4", VideoOptions(path="camera", camera="up"), {}, "camera 'up' does not exist; choose from front, side"),
+        ("a.mp4", VideoOptions(path="way.json"), {}, "path 'way.json' is not a file; use orbit, camera, or a JSON"),
+        ("a.mp4", FRONT, {"frames": "7:9"}, "states has no frames in the range 7:9; it contains frames 0 to 4"),
         ("a.mp4", VideoOptions(fps=200, speed=1e-6), {}, "speed 1e-06 result in 80000001 images; change --frames"),
-        ("a.mp4", VideoOptions(), {"compared": True}, "compare is given for path 'orbit'; use --path camera"),
+        ("a.mp4", VideoOptions(), {"compared": True}, "compare cannot be used with path 'orbit'; use --path camera"),
         ("a.mp4", VideoOptions(path="camera", interpolate=True), {"compared": True}, "compare and interpolate are"),
     ],
 )  # fmt: skip
@@ -238,7 +238,7 @@ def test_what_cannot_be_is_refused_and_nothing_is_left(source, tmp_path, true_ca
 
 def test_a_size_names_its_remedy():
     for wrong in ("640", "0x0", "640x480x3", "9999x9999", "-640x480"):
-        with pytest.raises(InputError, match="is not an image size; give WIDTHxHEIGHT, such as 1280x720"):
+        with pytest.raises(InputError, match="is not a valid image size; use WIDTHxHEIGHT, such as 1280x720"):
             picture_size(wrong)
 
 
@@ -252,4 +252,4 @@ def test_the_command(source, tmp_path):
     with Image.open(tmp_path / "a.webp") as file:
         assert (file.size, file.n_frames) == ((65, 49), FRAMES)
     done = CliRunner().invoke(app, [*arguments, "--size", "65"])
-    assert "size '65' is not an image size" in str(done.exception)
+    assert "size '65' is not a valid image size" in str(done.exception)

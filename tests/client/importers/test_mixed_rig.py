@@ -40,7 +40,7 @@ def test_each_camera_keeps_its_size_and_sees_the_ball_where_it_is(folder):
 
 def test_what_is_not_as_usual_is_said(folder):
     remarks = open_source(folder).remarks
-    assert f"camera {DEEP!r}: its 16-bit images are rounded to 8 bits (value / 257)" in remarks
+    assert f"camera {DEEP!r}: 16-bit images are rounded to 8 bits (value / 257)" in remarks
     assert any(remark.startswith(f"grayscale cameras among colour ones: {GREY};") for remark in remarks)
     assert len(remarks) == 2
 
@@ -96,13 +96,13 @@ def test_pictures_at_half_of_the_calibrated_size_scale_their_cameras_and_say_so(
         np.testing.assert_allclose(one.intrinsics, other.intrinsics, rtol=1e-3 if one.name == FISHEYE else 1e-12)
     said = [remark for remark in capture.remarks if "scaled by 0.5" in remark]
     assert len(said) == COUNT
-    assert said[0] == "camera 'c0': calibrated for 96x72, but images are 48x36: intrinsics scaled by 0.5"
+    assert said[0] == "camera 'c0': calibrated for 96x72, but images are 48x36; intrinsics scaled by 0.5"
 
 
 def test_pictures_a_little_off_are_refused_until_it_is_said_why(folder, tmp_path):
     cut = resized(folder, tmp_path / "cut", lambda picture: picture.crop((0, 0, picture.width - 8, picture.height)))
     with pytest.raises(
-        CaptureError, match=r"c0/0.png: is 88x72 .* 'c0' was calibrated for 96x72.* --size-mismatch corner"
+        CaptureError, match=r"c0/0.png is 88x72 .* 'c0' was calibrated for 96x72.* --size-mismatch corner"
     ):
         open_source(cut)
     shown = {}

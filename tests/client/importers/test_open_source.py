@@ -36,7 +36,7 @@ def test_pictures_of_straight_lenses_go_as_they_are(straight):
 def test_pictures_of_a_camera_without_a_calibration_are_named(straight):
     assert open_source(straight).remarks == ()
     (straight / "images" / "cam7").mkdir()
-    assert open_source(straight).remarks == ("left out cameras that are not in transforms.json: cam7",)
+    assert open_source(straight).remarks == ("skipped cameras that are not in transforms.json: cam7",)
     assert open_source(straight).rig.names == ("cam1", "cam2", "cam10")
 
 
@@ -91,7 +91,7 @@ def test_the_files_that_the_calibration_names(tmp_path):
         Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "photos" / f"{name}.png")
     assert open_source(tmp_path).frame_count == 1
     (tmp_path / "photos/cam10.png").unlink()
-    with pytest.raises(CaptureError, match=r"photos/cam10.png: no such file, but .*transforms.json names it"):
+    with pytest.raises(CaptureError, match=r"photos/cam10.png: no such file, although .*transforms.json lists it"):
         open_source(tmp_path)
 
 
@@ -176,26 +176,26 @@ def empty(folder):
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (cut, r"images/cam2: has no pictures for 1 of 2 frames \(000001\), which 'cam1' has"),
+        (cut, r"images/cam2 has no images for 1 of 2 frames \(000001\), but 'cam1' has"),
         (
             resize,
-            r"cam10/000000.png: is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--size-mismatch",
+            r"cam10/000000.png is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--size-mismatch",
         ),
-        (empty, r"images/cam1: has no pictures; give files ending in .jpg"),
+        (empty, r"images/cam1 contains no images; supported file types: .jpg"),
         (
             lambda f: (f / "images/cam10").rename(f / "images/ten"),
-            r"images/cam10: no such folder.* images/ has cam1, cam2",
+            r"images/cam10: no such folder.* images/ contains cam1, cam2",
         ),
         (lambda f: (f / "images/cam1/000000.tif").write_bytes(b""), r"000000.tif: .tif is not supported; use JPEG"),
-        (lambda f: (f / "images/cam1/000000.jpg").write_bytes(b""), r"000000.png: 000000.jpg is the same frame"),
-        (lambda f: (f / "images/cam1/000000.png").write_bytes(b"x"), r"cam1/000000.png: cannot be read as a picture"),
-        (lambda f: (f / "transforms.json").unlink(), r"no known capture layout: no train_meta.json .*--calibration"),
-        (lambda f: (f / "videos").mkdir(), r"has images/ and videos/; .*--pictures images"),
+        (lambda f: (f / "images/cam1/000000.jpg").write_bytes(b""), r"000000.png and 000000.jpg are the same frame"),
+        (lambda f: (f / "images/cam1/000000.png").write_bytes(b"x"), r"cam1/000000.png cannot be read as an image"),
+        (lambda f: (f / "transforms.json").unlink(), r"unknown capture layout: no train_meta.json .*--calibration"),
+        (lambda f: (f / "videos").mkdir(), r"contains images/ and videos/; .*--pictures images"),
         (lambda f: (f / "masks").mkdir(), r"masks/cam1: no such folder"),
-        (lambda f: write_pictures(f / "masks", frames=("000000",)), r"frame 1: its image is .* and its mask is None"),
+        (lambda f: write_pictures(f / "masks", frames=("000000",)), r"frame 1: its image is .*, but its mask is None"),
         (
             lambda f: write_pictures(f / "masks", frames=("000000", "7")),
-            r"frame 1: .*masks/cam1/7.png; name masks like the images",
+            r"frame 1: .*masks/cam1/7.png; name each mask like its image",
         ),
     ],
 )
@@ -208,11 +208,11 @@ def test_what_a_folder_lacks_is_named(straight, damage, said):
 def test_choices_that_cannot_be_are_named(straight):
     with pytest.raises(CaptureError, match="no such folder"):
         open_source(straight / "nowhere")
-    with pytest.raises(CaptureError, match=r"videos: no such folder; put each camera's video into videos/<camera>.mp4"):
+    with pytest.raises(CaptureError, match=r"videos: no such folder; put each camera's video in videos/<camera>.mp4"):
         open_source(straight, pictures="videos")
-    with pytest.raises(CaptureError, match=r"neither a transforms.json, nor the folder of a COLMAP model, nor cali"):
+    with pytest.raises(CaptureError, match=r"neither a transforms.json, nor a COLMAP model folder, nor cali"):
         open_source(straight, calibration=straight / "images")
-    with pytest.raises(CaptureError, match="fps -1"):
+    with pytest.raises(CaptureError, match="fps must be a positive number; got -1"):
         open_source(straight, fps=-1)
 
 

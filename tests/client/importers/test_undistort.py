@@ -196,10 +196,10 @@ def test_a_picture_of_another_size_is_refused():
 @pytest.mark.parametrize(
     ("model", "changes", "said"),
     [
-        ("FOV", {}, "model FOV, which is not supported; calibrate with one of SIMPLE_PINHOLE"),
-        ("SIMPLE_RADIAL", {"k2": 0.1}, "k2 = 0.1, which the model SIMPLE_RADIAL lacks"),
-        ("PINHOLE", {"fx": -1.0}, "focal lengths -1"),
-        ("OPENCV", {"k1": float("nan")}, "k1 is NaN"),
+        ("FOV", {}, "unsupported model FOV; calibrate with one of SIMPLE_PINHOLE"),
+        ("SIMPLE_RADIAL", {"k2": 0.1}, "k2 = 0.1, which model SIMPLE_RADIAL does not support"),
+        ("PINHOLE", {"fx": -1.0}, "focal lengths must be positive, got -1"),
+        ("OPENCV", {"k1": float("nan")}, "k1 must be finite"),
         ("OPENCV", {"cx": float("inf")}, "NaN or infinity"),
     ],
 )
@@ -210,5 +210,7 @@ def test_what_cannot_be_a_camera_is_named(model, changes, said):
 
 
 def test_a_missing_package_names_the_extra():
-    with pytest.raises(MissingExtraError, match=r"opening boxes needs no_such_box.*pip install -e '\.\[importers\]'"):
+    with pytest.raises(
+        MissingExtraError, match=r"opening boxes requires no_such_box.*pip install -e '\.\[importers\]'"
+    ):
         load("no_such_box", needed="opening boxes")

@@ -130,9 +130,9 @@ def test_files_can_be_pushed_without_decoding(folder):
     with pytest.raises(KeyError):
         capture.encoded_image(0, "7")
     for index in (-1, 3):
-        with pytest.raises(IndexError, match=r"not one of 0…2"):
+        with pytest.raises(IndexError, match=r"out of range 0…2"):
             capture.encoded_image(index, "3")
-        with pytest.raises(IndexError, match=r"not one of 0…2"):
+        with pytest.raises(IndexError, match=r"out of range 0…2"):
             capture.frame(index)
 
 
@@ -141,7 +141,7 @@ def test_pictures_are_decoded_when_looked_at(folder):
     (folder / "ims/1/000001.png").write_bytes(b"damaged")
     frame = capture.frame(1)
     assert frame.images["0"].shape == (6, 8, 3)
-    with pytest.raises(ImageError, match=r"000001\.png: cannot be read"):
+    with pytest.raises(ImageError, match=r"000001\.png cannot be read"):
         frame.images["1"]
 
 
@@ -170,7 +170,7 @@ def test_test_cameras_may_lack_masks(folder):
 def test_no_folder_and_no_layout(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         open_capture(tmp_path / "nowhere")
-    with pytest.raises(CaptureError, match=r"no known capture layout.*train_meta\.json"):
+    with pytest.raises(CaptureError, match=r"unknown capture layout.*train_meta\.json"):
         open_capture(tmp_path)
 
 
@@ -182,26 +182,29 @@ ELSEWHERE[1][0][3] = 0.01
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ({"w": 8.5}, r"w is 8\.5; give a whole number"),
-        ({"h": 0}, "h is 0"),
-        ({"w": 16}, r"0[/\\]000000\.png: is 8x6 pixels, but camera '0' was calibrated for 16x6"),
+        ({"w": 8.5}, r"w must be a positive whole number of pixels; got 8\.5"),
+        ({"h": 0}, "h must be .* got 0"),
+        ({"w": 16}, r"0[/\\]000000\.png is 8x6 pixels, but camera '0' was calibrated for 16x6"),
         ({"k": [[[1, 2], [3, 4]]]}, r"k must have shape \[3, 3, 3, 3\]"),
-        ({"k": [[1, 2], [3]]}, "k must be numbers"),
-        ({"k": [[[["a"] * 3] * 3] * 3] * 3}, "k must be numbers"),
+        ({"k": [[1, 2], [3]]}, "k must be numeric"),
+        ({"k": [[[["a"] * 3] * 3] * 3] * 3}, "k must be numeric"),
         ({"k": [[[[9.0, 0, float("nan")], [0, 9.0, 3], [0, 0, 1]]] * 3] * 3}, "camera '0': intrinsics contains NaN"),
         (
             {"w2c": [MOVED, MOVED, ELSEWHERE]},
-            "w2c of camera number 1 changes at frame 2; the cameras of a rig must not move",
+            "w2c of camera number 1 changes at frame 2, but cameras must not move",
         ),
         ({"cam_id": [[0, 1, 3], [0, 1, 3], [1, 0, 3]]}, "cam_id of frame 2 differs"),
-        ({"cam_id": []}, "cam_id must be a list of frames"),
+        ({"cam_id": []}, "cam_id must be a non-empty list"),
         ({"cam_id": [[0, 0, 3]] * 3}, "duplicates: 0"),
-        ({"cam_id": [[0, 1, 2]] * 3}, "cam_id 2 is also in train_meta"),
+        ({"cam_id": [[0, 1, 2]] * 3}, "cam_id 2 is also used in train_meta"),
         ({"fn": [["0/000000.png"] * 3] * 2}, "fn must list 3 frames"),
         ({"fn": [["0/000000.png"] * 2] * 3}, r"fn\[0\] must list 3 file names"),
         ({"fn": [["0/000000.png", "../../secret.png", "a.png"]] * 3}, r"secret\.png' points outside ims/"),
         ({"fn": [["0/000000.png", "/etc/passwd", "a.png"]] * 3}, "points outside ims/"),
-        ({"fn": [["0/000000.png", "1/000000.png", "3/000009.png"]] * 3}, r"000009\.png: no such file, but train_meta"),
+        (
+            {"fn": [["0/000000.png", "1/000000.png", "3/000009.png"]] * 3},
+            r"000009\.png: no such file \(listed in train_meta",
+        ),
     ],
 )
 def test_faults_of_the_cameras_are_named(folder, entries, message):
@@ -211,10 +214,10 @@ def test_faults_of_the_cameras_are_named(folder, entries, message):
 
 
 def test_broken_json_is_named(folder):
-    faults = ("{", "is not valid JSON"), ("[]", "must contain a JSON object"), ('{"w": 3}', "has no h, k, w2c")
+    faults = ("{", " is not valid JSON"), ("[]", " must contain a JSON object"), ('{"w": 3}', ": missing h, k, w2c")
     for text, message in faults:
         (folder / "train_meta.json").write_text(text)
-        with pytest.raises(CaptureError, match=rf"train_meta\.json: {message}"):
+        with pytest.raises(CaptureError, match=rf"train_meta\.json{message}"):
             open_capture(folder)
 
 
@@ -228,15 +231,15 @@ def test_a_missing_mask_of_a_training_camera_is_named(folder):
 def test_test_cameras_must_have_the_same_frames(folder):
     short = {key: value[:2] if isinstance(value, list) else value for key, value in meta([2]).items()}
     change(folder / "test_meta.json", **short)
-    with pytest.raises(CaptureError, match=r"test_meta\.json: has 2 frames, but train_meta\.json has 3"):
+    with pytest.raises(CaptureError, match=r"test_meta\.json has 2 frames, but train_meta\.json has 3"):
         open_capture(folder)
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (np.zeros((4, 5)), r"data must be \[P, 7\]"),
-        (np.zeros((0, 7)), r"data must be \[P, 7\]"),
+        (np.zeros((4, 5)), r"data must be a numeric array of shape \[P, 7\]"),
+        (np.zeros((0, 7)), r"data must be a numeric array of shape \[P, 7\]"),
         (np.full((4, 7), 200.0), "by 255"),
         (np.array([[0.0] * 7, [np.nan] + [0.0] * 6]), "NaN or infinity in row 1"),
         (np.array([[{}] * 7]), "without pickle"),
@@ -244,25 +247,25 @@ def test_test_cameras_must_have_the_same_frames(folder):
 )
 def test_faults_of_the_cloud_are_named(folder, data, message):
     np.savez(folder / "init_pt_cld.npz", data=data)
-    with pytest.raises(CaptureError, match=rf"init_pt_cld\.npz: .*{message}"):
+    with pytest.raises(CaptureError, match=rf"init_pt_cld\.npz.*{message}"):
         open_capture(folder)
 
 
 def test_a_cloud_that_is_no_npz_is_named(folder):
     (folder / "init_pt_cld.npz").write_bytes(b"PK\3\4 damaged")
-    with pytest.raises(CaptureError, match=r"init_pt_cld\.npz: is not an npz"):
+    with pytest.raises(CaptureError, match=r"init_pt_cld\.npz cannot be read as an npz"):
         open_capture(folder)
     np.savez(folder / "init_pt_cld.npz", points=np.zeros((4, 7)))
-    with pytest.raises(CaptureError, match=r"has no array .*needed: data"):
+    with pytest.raises(CaptureError, match=r"missing array .*required arrays: data"):
         open_capture(folder)
 
 
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"points": np.zeros((2, 2, 3))}, r"points must be finite \[T=3, P, 3\]"),
-        ({"part_id": np.zeros(3)}, r"part_id must be \[P=2\]"),
-        ({"visible": np.zeros((3, 4, 5), bool)}, "visible must be"),
+        ({"points": np.zeros((2, 2, 3))}, r"points must be finite with shape \[T=3, P, 3\]"),
+        ({"part_id": np.zeros(3)}, r"part_id must have shape \[P=2\]"),
+        ({"visible": np.zeros((3, 4, 5), bool)}, "visible must have shape"),
     ],
 )
 def test_faults_of_the_tracks_are_named(folder, arrays, message):
@@ -275,22 +278,22 @@ def test_faults_of_the_tracks_are_named(folder, arrays, message):
 def test_faults_of_parts_labels_and_extent_are_named(folder):
     scene = json.loads((folder / "scene.json").read_text())
     change(folder / "scene.json", parts=[scene["parts"][0] | {"pose": [[1, 2]]}])
-    with pytest.raises(CaptureError, match=r"parts\[0\]\.pose must be \[T=3, 4, 4\]"):
+    with pytest.raises(CaptureError, match=r"parts\[0\]\.pose must have shape \[T=3, 4, 4\]"):
         open_capture(folder)
     change(folder / "scene.json", parts=[{"id": 3}])
-    with pytest.raises(CaptureError, match=r"parts\[0\] is not a part"):
+    with pytest.raises(CaptureError, match=r"parts\[0\] is not a valid part"):
         open_capture(folder)
     change(folder / "scene.json", parts=[], extent=-1)
-    with pytest.raises(CaptureError, match="extent -1 must be a positive number"):
+    with pytest.raises(CaptureError, match="extent must be a positive number; got -1"):
         open_capture(folder)
     change(folder / "scene.json", extent=1)
     (folder / "gt_parts/2/000001.png").unlink()
-    with pytest.raises(CaptureError, match=r"000001\.png: no such file; label every frame of camera 2 or none"):
+    with pytest.raises(CaptureError, match=r"000001\.png: no such file; label all frames of camera 2, or none"):
         open_capture(folder)
 
 
 def test_options_are_checked(folder):
-    with pytest.raises(CaptureError, match="fps 0"):
+    with pytest.raises(CaptureError, match=r"fps must be .* got 0"):
         open_capture(folder, fps=0)
     with pytest.raises(ImageError, match="image_scale"):
         open_capture(folder, image_scale=-1)

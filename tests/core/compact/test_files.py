@@ -261,7 +261,7 @@ def test_a_lost_or_exchanged_record_is_noticed(file: Path, tmp_path: Path) -> No
     pieces[place], pieces[place + 1] = pieces[place + 1], pieces[place]
     exchanged.write_bytes(b"".join(pieces))
     with CompactReader(exchanged) as reader:
-        assert "frame 8 follows frame 9" in str(reader.damage)
+        assert "unexpected frame 8 after frame 9" in str(reader.damage)
         near(reader, 7)
 
 
@@ -317,9 +317,12 @@ def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
         (b"\xff", "invalid header"),
         (
             json.dumps(json.loads(HEAD.text()) | {"version": 99}).encode(),
-            "version 99; this scas4d reads version 1: use",
+            "version 99, but this version of scas4d reads version 1; use",
         ),
-        (json.dumps(json.loads(HEAD.text()) | {"version": 0}).encode(), "version 0; this scas4d reads version 1: use"),
+        (
+            json.dumps(json.loads(HEAD.text()) | {"version": 0}).encode(),
+            "version 0, but this version .* reads version 1",
+        ),
         (json.dumps(json.loads(HEAD.text()) | {"world": {"origin": [0, 0], "metres_per_unit": 1}}).encode(), "invalid"),
         (
             json.dumps(json.loads(HEAD.text()) | {"world": {"origin": [0] * 3, "metres_per_unit": 0}}).encode(),
@@ -341,7 +344,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     for data in (b"", b"ply\nformat", b"s4dR", b"s4dR" + bytes(200)):
         path = tmp_path / "a.s4d"
         path.write_bytes(data)
-        with pytest.raises(FileError, match=r"a\.s4d: "):
+        with pytest.raises(FileError, match=r"a\.s4d(: | is not)"):
             CompactReader(path)
     with pytest.raises(FileNotFoundError):
         CompactReader(tmp_path / "none.s4d")
@@ -361,7 +364,7 @@ def test_frames_that_cannot_follow_are_refused(tmp_path: Path) -> None:
     size = (tmp_path / "a.s4d").stat().st_size
     with pytest.raises(FileError, match="frame 6 cannot follow frame 6"):
         writer.add(6, time, state)
-    with pytest.raises(FileError, match="different Gaussians from frame 6; do not remove any"):
+    with pytest.raises(FileError, match="lacks Gaussians of frame 6; do not remove or reorder any"):
         writer.add(7, time, state.rows(np.arange(100)))
     broken = state.means.copy()
     broken[4] = np.nan
@@ -372,10 +375,10 @@ def test_frames_that_cannot_follow_are_refused(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(FileExistsError):
         CompactWriter(tmp_path / "a.s4d", HEAD)
-    with pytest.raises(FileError, match="give 1 or more"):
+    with pytest.raises(FileError, match="key_every must be at least 1; got 0"):
         CompactWriter(tmp_path / "b.s4d", HEAD, key_every=0)
     with (
-        pytest.raises(FileError, match="frame 99 is not in the file; it has frames 0 to 7"),
+        pytest.raises(FileError, match="frame 99 is not in the file; available frames: 0 to 7"),
         CompactReader(tmp_path / "a.s4d") as reader,
     ):
         reader.state(99)

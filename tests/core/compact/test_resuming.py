@@ -48,7 +48,7 @@ def test_a_file_cut_anywhere_is_gone_on_with_to_the_same_bytes(whole: Path, tmp_
 
 
 def test_what_has_no_state_or_is_whole_or_damaged_is_not_gone_on_with(whole: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="start another file"):
+    with pytest.raises(FileError, match="start a new file"):
         CompactWriter.resume(whole)
     head = tmp_path / "head.s4d"
     CompactWriter(head, HEAD).close()
@@ -89,7 +89,7 @@ def test_a_copy_is_gone_on_with_and_a_copy_of_nothing_refused(whole: Path, tmp_p
     path = tmp_path / "copy.s4d"
     with CompactReader(whole) as reader, path.open("wb") as file:
         reader.copy_records(10, 12, file)
-        with pytest.raises(FileError, match="no frame from 3 to 4"):
+        with pytest.raises(FileError, match="no frames from 3 to 4"):
             reader.copy_records(3, 4, file)
     with CompactWriter.resume(path) as writer:
         writer.add(13, *TRUE[13])

@@ -57,5 +57,5 @@ def test_the_example_works_and_is_nothing_when_off(drag: str) -> None:
 
 def test_the_example_can_be_pinned_off(drag: str) -> None:
     assert not first_switches(Settings(effects={drag: "off"}), 0)[drag].on
-    with pytest.raises(ValueError, match=f"{drag}s is not an effect"):
+    with pytest.raises(ValueError, match=f"unknown effect '{drag}s'"):
         Settings(effects={f"{drag}s": "off"})

@@ -99,9 +99,9 @@ def test_a_scene_without_a_floor_has_no_floor_term() -> None:
         (
             {"effects": {"rigidity": "on"}, "update": {"weights": {"rigidity": 0}}},
             "effects.rigidity cannot be 'on': update.weights.rigidity is 0",
-            "set a weight above 0",
+            "use a weight above 0",
         ),
-        ({"effects": {"flour": "off"}}, "flour is not an effect", "did you mean floor?"),
+        ({"effects": {"flour": "off"}}, "unknown effect 'flour'", "did you mean floor?"),
         ({"effects": {"floor": "maybe"}}, "Input should be 'auto', 'on' or 'off'", ""),
     ],
 )

@@ -26,7 +26,7 @@ def test_inside_a_plane_tells_metres_below_it() -> None:
 
 
 def test_a_plane_without_a_direction_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"floor \(0, 0, 0, 1\) has no direction; give"):
+    with pytest.raises(ValueError, match=r"floor \(0, 0, 0, 1\) has a zero normal; use"):
         floor_inside((0, 0, 0, 1), WORLD)
 
 

@@ -59,7 +59,7 @@ def test_with_a_driver_the_number_of_gpus_decides(devices: int, monkeypatch) -> 
     monkeypatch.setattr(warp, "get_cuda_device_count", lambda: devices)
     assert resolve_device("auto") == ("gpu" if devices else "cpu")
     if not devices:
-        with pytest.raises(DeviceError, match="the driver is older than"):
+        with pytest.raises(DeviceError, match="the driver is too old"):
             resolve_device("gpu")
 
 

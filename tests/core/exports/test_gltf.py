@@ -122,7 +122,7 @@ def test_chunks_are_whole_words(tmp_path):
 
 def test_too_large_or_unwritable(tmp_path, monkeypatch):
     monkeypatch.setattr("scas4d_core.exports.glb.LONGEST", 100)
-    with pytest.raises(InputError, match=r"bytes, but \.glb allows 4 GiB; export as ply"):
+    with pytest.raises(InputError, match=r"bytes, but a \.glb file can have at most 4 GiB; export as ply"):
         write_glb(tmp_path / "a.glb", corner.state(), corner.WORLD)
     monkeypatch.undo()
     with pytest.raises(InputError, match=r"out '.*' cannot be written"):

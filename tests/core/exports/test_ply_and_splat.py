@@ -79,9 +79,9 @@ def test_splat_of_gloss_has_the_mean_colour_and_none_of_the_retired(tmp_path):
 
 def test_splat_that_cannot_be_read_or_written(tmp_path):
     (tmp_path / "cut.splat").write_bytes(bytes(40))
-    with pytest.raises(InputError, match=r"cut\.splat: not a \.splat file \(40 bytes"):
+    with pytest.raises(InputError, match=r"cut\.splat is not a \.splat file \(40 bytes"):
         read_splat(tmp_path / "cut.splat")
-    with pytest.raises(InputError, match=r"none\.splat: not a \.splat file \(No such file"):
+    with pytest.raises(InputError, match=r"none\.splat is not a \.splat file \(No such file"):
         read_splat(tmp_path / "none.splat")
     with pytest.raises(InputError, match=r"out '.*a\.splat' cannot be written"):
         write_splat(tmp_path / "no" / "a.splat", corner.state(), corner.WORLD)

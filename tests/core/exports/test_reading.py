@@ -102,7 +102,7 @@ def test_numbered_ply_comes_back_where_all_files_have_the_same(tmp_path):
         assert back.ids.tolist() == list(range(len(truth)))
         corner.assert_same(found(back, read), corner.wanted(truth), **limits)
     other = open_export(written(tmp_path / "other", "ply", sequence(changes=True)), RATE)
-    with pytest.raises(InputError, match=r"frame_000006.ply has different Gaussians from frame_000005.ply"):
+    with pytest.raises(InputError, match=r"frame_000006.ply does not have the same Gaussians as frame_000005.ply"):
         list(other.states())
 
 
@@ -245,5 +245,5 @@ def test_zips_that_hide_their_size_and_files_of_one_frame_are_refused(tmp_path, 
     with pytest.raises(InputError, match="at most 200000"):
         open_export(path)
     shutil.copy(folder / f"frame_{FIRST:06d}.glb", folder / f"frame_{FIRST}.glb")
-    with pytest.raises(InputError, match="several files of one frame"):
+    with pytest.raises(InputError, match="several files for one frame"):
         open_export(folder)

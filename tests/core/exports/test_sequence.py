@@ -131,7 +131,7 @@ def test_an_error_leaves_nothing_half_written(tmp_path, format, zipped):
 def test_an_empty_range(tmp_path, format):
     each = FORMATS[format]
     out = tmp_path / ("out" if each.numbered else f"a{each.suffixes[0]}")
-    with pytest.raises(InputError, match="states has no frames; give a range that contains at least one"):
+    with pytest.raises(InputError, match="states has no frames; use a range that contains at least one"):
         exported(out, format, [])
     assert not list(tmp_path.iterdir())
 
@@ -144,30 +144,32 @@ def test_an_output_that_cannot_be_written(tmp_path, format):
     if each.numbered:
         outs = [tmp_path / "file", tmp_path / "file" / "a.zip"]
     for out in outs:
-        with pytest.raises(InputError, match=r"out '.*file.*' cannot be written \(.*\); give a path in a folder"):
+        with pytest.raises(
+            InputError, match=r"out '.*file.*' cannot be written \(.*\); use a path in an existing, writable folder"
+        ):
             exported(out, format)
     assert names(tmp_path) == ["file"]
 
 
 def test_what_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"format 'obj' is not known; give one of ply, splat, spz, .*poses"):
+    with pytest.raises(InputError, match=r"unknown format 'obj'; choose from ply, splat, spz, .*poses"):
         exported(tmp_path, "obj")
     for format in ("glb-parts", "poses"):
-        with pytest.raises(InputError, match=f"parts is None, but format '{format}' requires parts; give one label"):
+        with pytest.raises(InputError, match=f"format '{format}' requires parts, but parts is None; pass one label"):
             export_sequence(states(), format, tmp_path / "a.glb", world=corner.WORLD)
     with pytest.raises(InputError, match=r"out '.*a\.glb' has the wrong suffix for format 'usd'; use \.usdc"):
         exported(tmp_path / "a.glb", "usd")
-    with pytest.raises(InputError, match=r"frames_per_second is 0; give a positive number, or None"):
+    with pytest.raises(InputError, match=r"invalid frames_per_second 0; use a positive number or None"):
         exported(tmp_path / "a.usda", "usd", frames_per_second=0)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "gsply", None)
-    with pytest.raises(InputError, match=r"format 'spz' needs the package gsply.*'.\[exports\]'"):
+    with pytest.raises(InputError, match=r"format 'spz' requires the package gsply.*'.\[exports\]'"):
         exported(tmp_path, "spz")
     monkeypatch.setitem(__import__("sys").modules, "pxr.Usd", None)
-    with pytest.raises(InputError, match=r"format 'usd' needs the package pxr\.Usd, which is not installed"):
+    with pytest.raises(InputError, match=r"format 'usd' requires the package pxr\.Usd, which is not installed"):
         exported(tmp_path / "a.usda", "usd")
 
 

@@ -108,14 +108,14 @@ def test_positions_take_as_many_bits_as_fit(tmp_path):
     truth = corner.wanted(far, corner.Y_UP, metres=True)
     assert np.abs(found.means - truth.means).max() <= 0.5 / 2**bits * 1.3
     beyond = corner.state().replace(means=corner.state().means * np.float32(1e7))
-    with pytest.raises(InputError, match=r"m from the origin .*limit of SPZ is 4,194,304 m; move the origin"):
+    with pytest.raises(InputError, match=r"m from the origin .*SPZ allows at most 4,194,304 m; move the origin"):
         write_spz(tmp_path / "b.spz", beyond, corner.WORLD)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"]
 
 
 def test_what_cannot_be_read(tmp_path):
     (tmp_path / "a.spz").write_bytes(b"hello")
-    with pytest.raises(InputError, match=r"a\.spz: not an SPZ file"):
+    with pytest.raises(InputError, match=r"a\.spz is not an SPZ file"):
         read_spz(tmp_path / "a.spz")
-    with pytest.raises(InputError, match="SPZ version 2 is not supported; give 3 or 4"):
+    with pytest.raises(InputError, match="SPZ version 2 is not supported; use 3 or 4"):
         write_spz(tmp_path / "b.spz", corner.state(), corner.WORLD, version=2)

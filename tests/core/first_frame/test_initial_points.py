@@ -112,10 +112,10 @@ def test_with_time_enough_the_points_are_those_without_a_limit(box, cloud):
 @pytest.mark.parametrize(
     ("tick", "said"),
     [
-        (0.3, ["stereo on images at most 320 pixels wide, 2 rounds"]),
+        (0.3, ["stereo on images at most 320 pixels wide, with 2 rounds"]),
         (0.6, ["no stereo"]),
-        (1.4, ["features from images downscaled to 1/2", "features matched in", "no stereo"]),
-        (4.0, ["features from images downscaled to 1/4", "features matched in", "no stereo"]),
+        (1.4, ["features extracted from images downscaled to 1/2", "features matched in", "no stereo"]),
+        (4.0, ["features extracted from images downscaled to 1/4", "features matched in", "no stereo"]),
     ],
 )
 def test_the_shorter_the_time_the_less_finely_points_are_looked_for(scene, box, cloud, tick, said):

@@ -82,7 +82,7 @@ def test_pictures_of_other_rooms_agree_on_no_plane(views):
         PosedPicture(view.camera, rng.integers(0, 255, (12, 12, 3), np.uint8).repeat(8, 0).repeat(8, 1))
         for view in views
     ]
-    with pytest.raises(InitialPointsError, match="no plane"):
+    with pytest.raises(InitialPointsError, match="do not agree on any plane"):
         plane_points(strange)
 
 

@@ -172,7 +172,7 @@ def test_an_empty_cloud_is_refused() -> None:
     factory = ViewFactory(RIG)
     views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
-    with pytest.raises(ValueError, match="has no points; give points"):
+    with pytest.raises(ValueError, match="is empty; provide points"):
         fit_static_scene(factory, views, *nothing, None, SceneSettings(), SETTINGS)
 
 

@@ -200,7 +200,7 @@ def test_a_few_iterations_fewer_are_figures_and_no_warning(
     assert report["planned"][-1] == [made, made]
     assert [f"{made} of 200 iterations" in text for text in report["shortened"]] == [True] * said
     assert scene.report is not None
-    told = [text for text in scene.report.warnings if "too little time" in text]
+    told = [text for text in scene.report.warnings if "not have enough time" in text]
     assert len(told) == said
     assert first_warnings(report) == scene.report.warnings
 

@@ -164,7 +164,7 @@ def test_labels_are_matched_by_weight_as_a_whole():
 
 def test_refusals():
     history, _ = bodies(frames=2, n=4)
-    with pytest.raises(ValueError, match="count 99 must be between 1 and 12, the number of moving"):
+    with pytest.raises(ValueError, match="count 99 is not between 1 and 12, the number of moving"):
         parts(history, 99)
     with pytest.raises(ValueError, match="history is empty"):
         parts(History(), 2)
@@ -173,7 +173,7 @@ def test_refusals():
     still.append(0, 0.0, theta.replace(foreground=np.zeros(len(theta), np.float32)))
     with pytest.raises(ValueError, match="no Gaussian moves"):
         parts(still, 2)
-    with pytest.raises(ValueError, match=r"previous labels \(3,\) must be \[12\]"):
+    with pytest.raises(ValueError, match=r"previous labels must have shape \[12\], one per Gaussian; got \(3,\)"):
         parts(history, 2, previous=np.zeros(3))
 
 

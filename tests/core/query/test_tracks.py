@@ -220,7 +220,7 @@ def test_tracks_of_ids_are_the_means():
     history, rest = rigid_history()
     tracks = tracks_of_ids(history, WORLD, np.array([30, 0]), [4, 2])
     np.testing.assert_allclose(tracks.positions, truth(rest[[10, 0]])[[4, 2]], atol=1e-4)
-    with pytest.raises(ValueError, match=r"ids \[31\] do not exist"):
+    with pytest.raises(ValueError, match=r"unknown Gaussian ids \[31\]"):
         tracks_of_ids(history, WORLD, np.array([31]), [0])
 
 
@@ -228,7 +228,7 @@ def test_refusals():
     history, _ = rigid_history(10)
     with pytest.raises(ValueError, match=r"points \[1\] contain NaN"):
         tracks_of_points(history, WORLD, np.array([[0, 0, 0], [np.nan, 0, 0]]), 0, FRAMES)
-    with pytest.raises(ValueError, match=r"give \[Q, 3\]"):
+    with pytest.raises(ValueError, match=r"expected \[Q, 3\]"):
         tracks_of_points(history, WORLD, np.zeros(3), 0, FRAMES)
     with pytest.raises(HistoryError, match="frame 9"):
         tracks_of_points(history, WORLD, np.zeros((1, 3)), 0, [9])

@@ -33,7 +33,7 @@ def missed(one: Reconstruction, truth: np.ndarray) -> float:
 def test_the_first_update_is_longer_and_the_next_is_not() -> None:
     short, iteration_factor = scene(cold_start_iterations=1.0), scene()
     reports = [one.step(take_frame(1, 0.1, FAR, RIG)) for one in (short, iteration_factor)]
-    assert [report.attempts for report in reports] == [["as set"], ["as set, the best of 3 orders"]]
+    assert [report.attempts for report in reports] == [["as set"], ["as set, best of 3 view orders"]]
     assert [(report.iterations, report.outcome) for report in reports] == [
         (15, FrameOutcome.UPDATED),
         (45, FrameOutcome.UPDATED),

@@ -140,7 +140,7 @@ def test_where_no_rung_holds_the_state_stays_and_says_why() -> None:
     assert outcome.gaussians is BEFORE
     assert outcome.motion is MOTION
     assert outcome.outcome is FrameOutcome.REJECTED_IMPLAUSIBLE
-    assert "not finite" in outcome.reason
+    assert "non-finite" in outcome.reason
     assert (after.rejected, after.updates) == (PAST.rejected + 1, PAST.updates)
 
 
@@ -216,7 +216,7 @@ def test_what_was_lost_is_not_sought_longer_than_the_budget(left: float, tries: 
     outcome, _ = solve(fake, replace(given(), end=perf_counter() + left, iteration_seconds=0.01))
     assert len(fake.options) == tries
     assert (not outcome.outcome.rejected) == (tries > 1)
-    assert any("the budget is spent" in attempt for attempt in outcome.attempts) == (tries == 1)
+    assert any("the time budget is used up" in attempt for attempt in outcome.attempts) == (tries == 1)
 
 
 def test_what_is_sought_for_a_moment_has_to_meet_its_frame_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -142,7 +142,7 @@ def test_stacked_is_nan_where_one_is_not_born(tmp_path: Path) -> None:
 
 def test_what_is_refused() -> None:
     history = fill(History())
-    with pytest.raises(HistoryError, match="new Gaussians have ids"):
+    with pytest.raises(HistoryError, match="new Gaussians must have id"):
         history.append(20, 1.0, grown(1, history.newest, 1).replace(retired=None, ids=np.arange(100, 113)))
     with pytest.raises(HistoryError, match="differ from those of the first"):
         history.append(20, 1.0, history.newest.rows(np.arange(11)))

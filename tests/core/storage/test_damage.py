@@ -87,13 +87,13 @@ def test_a_file_without_checksums_is_refused(tmp_path):
         np.savez(opened, **small_state())
     for read in (verify, read_npz):
         with pytest.raises(
-            ValueError, match=r"^file\.npz is damaged or not an npz file \(ValueError: the file has no checksums"
+            ValueError, match=r"^file\.npz is damaged or is not an npz file \(ValueError: the file has no checksums"
         ):
             read(file)
 
 
 def test_more_arrays_than_have_room_for_checksums_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="2000 arrays are too many for one file"):
+    with pytest.raises(ValueError, match="too many arrays for one file"):
         write_npz(tmp_path / "file.npz", {f"{'array' * 10}-{k}": np.zeros(1) for k in range(2000)})
     assert not list(tmp_path.iterdir())
 

@@ -46,8 +46,8 @@ def with_format(folder: Path, written: int | None) -> None:
 @pytest.mark.parametrize("frames", [0, FRAMES])
 @pytest.mark.parametrize(
     ("format_", "said"),
-    [(7, "states, a folder of states, has format 7; this version reads format 1: use the version"),
-     (None, "states, a folder of states, has no format number; this version reads format 1: use the version")],
+    [(7, "state folder states has format 7, but this version of scas4d reads format 1; use the version"),
+     (None, "state folder states has no format number, but this version of scas4d reads format 1; use the version")],
 )  # fmt: skip
 def test_a_folder_of_states_of_another_format(format_: int | None, said: str, frames: int, tmp_path: Path) -> None:
     folder = tmp_path / "states"
@@ -109,7 +109,9 @@ def test_a_compact_file_of_another_version_among_states(tmp_path: Path, monkeypa
             writer.add(1, 0.1, make_box())
         assert json.loads(FileHeader(WorldFrame(np.zeros(3))).text())["version"] == 4
     before = contents(folder)
-    with pytest.raises(OtherFormatError, match=r"states_000001\.s4d.* version 4; this scas4d reads version 1: use"):
+    with pytest.raises(
+        OtherFormatError, match=r"states_000001\.s4d.* version 4, but this version of scas4d reads version 1; use"
+    ):
         History.load(folder)
     assert contents(folder) == before
     shutil.rmtree(folder)
@@ -123,5 +125,5 @@ def test_a_compact_file_of_another_version_is_not_opened(tmp_path: Path, monkeyp
         patched.setattr(head_module, "VERSION", 4)
         with CompactWriter(path, FileHeader(WorldFrame(np.zeros(3)))) as writer:
             writer.add(0, 0.0, make_box())
-    with pytest.raises(FormatError, match=r"states\.s4d: a compact 4D file of version 4"):
+    with pytest.raises(FormatError, match=r"states\.s4d has compact 4D format version 4"):
         CompactReader(path)

@@ -80,7 +80,7 @@ def test_refusals_name_what_is_wrong(tmp_path):
         history.append(2, 0.0, state(2))
     with pytest.raises(HistoryError, match="ids differ"):
         history.append(3, 0.0, state(3).replace(ids=np.arange(7)))
-    with pytest.raises(HistoryError, match="means has 6 rows; give 7"):
+    with pytest.raises(HistoryError, match="means has 6 rows; expected 7"):
         history.append(3, 0.0, state(3).replace(means=np.zeros((6, 3), np.float32)))
     with pytest.raises(HistoryError, match="frame 7 is not in the history; committed frames: 0 to 2"):
         history.gaussians(7)
@@ -199,7 +199,7 @@ def test_retention_by_number_and_size(tmp_path, on_disk):
     assert history.retain(size_bytes=sum(size for size, _ in sizes.values()) - sizes[2][0] - 1) == [2, 4]
     history.append(99, 9.0, state(9))
     for wrong in ({"last": 0}, {"size_bytes": -5}):
-        with pytest.raises(HistoryError, match="keep at least 1, or give None"):
+        with pytest.raises(HistoryError, match="must be at least 1, or None to keep all"):
             history.retain(**wrong)
     if on_disk:
         assert History.load(tmp_path / "size").indices == [0, *range(6, 16, 2), 99]

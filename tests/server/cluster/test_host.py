@@ -75,4 +75,4 @@ def test_a_node_with_a_folder_of_its_own_is_named(tmp_path: Path, monkeypatch: p
     started = asyncio.run(ProcessHost(None, tmp_path, "mine").start(echo, "scene"))
     assert started.pid is None
     assert started.fault is not None
-    assert started.fault.endswith(f"does not see the data folder {tmp_path}; mount it there")
+    assert started.fault.endswith(f"cannot see the data folder {tmp_path}; mount it on that node")

@@ -87,7 +87,7 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
         asyncio.run(test())
     told = [record.message for record in caplog.records]
     assert len([line for line in told if "does not respond" in line]) == 1
-    assert told[-1] == "the head of the Ray cluster responds again"
+    assert told[-1] == "the Ray head node is responding again"
     assert cluster.events == ["joined"]
 
 

@@ -178,7 +178,7 @@ def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes)
         late = next(id for id in waiting() if service.status(id).error)
         said = service.status(late)
         assert said.degraded
-        assert "its worker is waiting for a node with 1 CPU and" in str(said.error)
+        assert "the worker is waiting for a node with 1 CPU and" in str(said.error)
         sent(service, late, range(1))
         for id in ids:
             if id not in waiting():
@@ -265,8 +265,8 @@ def test_a_scene_goes_on_when_the_node_of_its_service_is_lost(service: Service, 
 @pytest.mark.parametrize(
     ("placement", "words"),
     [
-        ("ray=127.0.0.1:1", "there is no Ray cluster at 127.0.0.1:1"),
-        ("kubernetes", "give local, ray, or ray=HOST:PORT"),
+        ("ray=127.0.0.1:1", "no Ray cluster found at 127.0.0.1:1"),
+        ("kubernetes", "placement must be local, ray or ray=HOST:PORT"),
     ],
 )
 def test_what_is_no_cluster_is_one_line(placement: str, words: str, tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def test_ready_says_how_long_the_kernels_took(tmp_path, monkeypatch):
         while "kernels" not in early.json():  # until the process beside has told how far it is
             early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
         assert (early.json()["kernels_compiled"], early.json()["kernels"]) == (1, 3)
-        assert early.json()["detail"].endswith("they are compiled: 1 of 3")
+        assert early.json()["detail"].endswith("on the first start (1 of 3 done)")
         until.touch()
         answer = waited(running)
         assert answer.json()["ready_after"] > 0

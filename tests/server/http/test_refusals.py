@@ -47,9 +47,9 @@ QUERIES = {
     "tracks": ("ids", "none", "exactly one of"),
     "parts?cont=3": ("cont", "3", "'count'"),
     "parts?count=900": ("query.count", "900", "at most 254"),
-    "parts?count=x": ("query.count", "x", "whole number"),
+    "parts?count=x": ("query.count", "x", "an integer"),
     "frames?last=3": ("last", "3", "first, limit"),
-    "frames/abc": ("path.n", "abc", "whole number"),
+    "frames/abc": ("path.n", "abc", "an integer"),
     "frames/-1": ("path.n", "-1", "at least 0"),
     "frames/0?x=": ("x", "", "no parameters"),
     "rig?x=1": ("x", "1", "no parameters"),
@@ -77,7 +77,7 @@ DEFINITIONS = {
         {"settings": {"scene": {"metres_per_unit": -1}}},
         "settings.scene.metres_per_unit",
         "-1",
-        "above 0",
+        "greater than 0",
     ),
     "no object": ({"settings": {"update": "fast"}}, "settings.update", "fast", "an object"),
     "null": ({"settings": {"scene": {"image_scale": None}}}, "settings.scene.image_scale", "null", "a number"),
@@ -109,9 +109,9 @@ def test_broken_json_is_shown_where_it_breaks(http):
 
 
 PICTURES = {
-    "missing": ({"c0": picture()}, "c1", "nothing", "add one"),
-    "cut": ({"c0": picture(), "c1": CUT_JPEG}, "c1", f"{len(CUT_JPEG)} bytes", "its source"),
-    "cut PNG": ({"c0": picture(), "c1": CUT_PNG}, "c1", f"{len(CUT_PNG)} bytes", "its source"),
+    "missing": ({"c0": picture()}, "c1", "nothing", "add it"),
+    "cut": ({"c0": picture(), "c1": CUT_JPEG}, "c1", f"{len(CUT_JPEG)} bytes", "original file"),
+    "cut PNG": ({"c0": picture(), "c1": CUT_PNG}, "c1", f"{len(CUT_PNG)} bytes", "original file"),
     "empty": ({"c0": picture(), "c1": b""}, "c1", "0 bytes", "as JPEG, PNG or WebP"),
     "another kind": ({"c0": picture(), "c1": b"BM" + bytes(60)}, "c1", "62 bytes", "encode"),
 }
@@ -136,7 +136,7 @@ def test_a_device_without_an_engine_is_refused_with_the_reason(http):
     document = problem(http.post("/v1/scenes", json=body(settings={"device": "cuda"})), 422)
     assert (document["field"], document["value"]) == ("settings.device", "cuda")
     assert "is not supported" in document["detail"]
-    assert document["remedy"] == "give 'auto', 'cpu' or 'gpu'"
+    assert document["remedy"] == "choose 'auto', 'cpu' or 'gpu'"
     assert http.get("/v1/scenes").json() == before
 
 
@@ -145,8 +145,8 @@ def test_a_gpu_that_is_not_there_is_refused_with_the_reason(http):
     before = http.get("/v1/scenes").json()
     document = problem(http.post("/v1/scenes", json=body(settings={"device": "gpu"})), 422)
     assert (document["field"], document["value"]) == ("settings.device", "gpu")
-    assert document["detail"] == f"no GPU can be used: {gpu_fault()}"
-    assert document["remedy"] == "give 'auto' or 'cpu', or see docs/gpu.md"
+    assert document["detail"] == f"no usable GPU: {gpu_fault()}"
+    assert document["remedy"] == "use 'auto' or 'cpu', or see docs/gpu.md"
     assert http.get("/v1/scenes").json() == before
 
 

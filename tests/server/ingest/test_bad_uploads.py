@@ -29,16 +29,16 @@ def animated_webp():
 
 
 BAD = {
-    "truncated JPEG": (lambda: picture(format="JPEG")[:-5], "bytes", "again from its source"),
-    "truncated PNG": (lambda: picture()[:-5], "bytes", "again from its source"),
-    "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "again from its source"),
+    "truncated JPEG": (lambda: picture(format="JPEG")[:-5], "bytes", "the original file again"),
+    "truncated PNG": (lambda: picture()[:-5], "bytes", "the original file again"),
+    "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "the original file again"),
     "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "for which the camera was"),
-    "16 bits": (sixteen_bits, "16 bits", "convert the picture to 8 bits"),
+    "16 bits": (sixteen_bits, "16 bits", "convert the image to 8 bits"),
     "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send 8-bit RGB"),
-    "animated PNG": (animated, "animated", "one picture per file"),
-    "animated WebP": (animated_webp, "animated", "one picture per file"),
+    "animated PNG": (animated, "animated", "a single still image"),
+    "animated WebP": (animated_webp, "animated", "a single still image"),
     "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "for which the camera was"),
-    "no picture": (lambda: b"GIF89a or so", "bytes", "encode the picture"),
+    "no picture": (lambda: b"GIF89a or so", "bytes", "encode the image"),
 }
 
 
@@ -93,7 +93,7 @@ def test_a_wrong_camera_is_refused(http, quiet_scene, door):
         answer = http.put(f"{url}/cameras/c9", content=picture())
     document = problem(answer, 422)
     assert document["value"] == "c9"
-    assert "the cameras are c0, c1" in document["remedy"]
+    assert "use one of c0, c1" in document["remedy"]
 
 
 CAMERAS = {

@@ -336,7 +336,7 @@ def test_a_query_whose_reader_is_lost_with_its_machine_goes_to_the_next(monkeypa
         for number in range(1, times + 1):
             while len(placement.started) < number or not placement.started[-1].asked:
                 await asyncio.sleep(0.005)
-            placement.started[-1].on_end(ProcessExit(None, "the node of its views is lost", lost=lost))
+            placement.started[-1].on_end(ProcessExit(None, "the node of the reader process was lost", lost=lost))
         if status is None:
             while len(placement.started) < 2 or not placement.started[-1].asked:
                 await asyncio.sleep(0.005)

@@ -347,7 +347,7 @@ def test_where_the_report_alone_is_damaged_the_state_stays(tmp_path, restart):
         flip(file, whole.index(b'"psnr"') + 2)
         if restart:
             http.get(f"/v1/scenes/{id}/frames/2")  # reads the report
-        status_with(http, id, "its report is lost" if restart else "nothing is lost")
+        status_with(http, id, "the report is lost" if restart else "nothing was lost")
         after = http.get(f"/v1/scenes/{id}/frames/2").json()
         assert after["recomputed"] is False
         assert after["psnr"] == (None if restart else before["psnr"])

@@ -221,8 +221,8 @@ def test_bad_points_are_refused_by_name(http, quiet_scene, monkeypatch, name):
 def test_a_left_handed_rig_is_told_the_way_out(http):
     change, _ = BAD["left-handed"]
     document = problem(http.post("/v1/scenes", json=edited(change)), 422)
-    assert "determinant -1: a left-handed frame" in document["detail"]
-    assert "mirror one axis" in document["remedy"]
+    assert "determinant -1 (left-handed)" in document["detail"]
+    assert "flip one axis" in document["remedy"]
 
 
 def beside_one_another(count):
@@ -266,7 +266,7 @@ def test_cameras_at_one_place_need_points(http, sdk, parts):
             answer = http.put(f"/v1/scenes/{id}/frames/0", **put_frame(id, 0, pictures()).arguments)
         document = problem(answer, 422)
         assert (document["field"], document["value"]) == ("points", "nothing")
-        assert "all 2 cameras are at one place, and no points" in document["detail"]
+        assert "all 2 cameras are at the same position" in document["detail"]
         assert sdk.scene(id).next_frame == 0
         sdk.put_points(id, InitialPoints(np.array([[0, 0, 2.0]]), np.zeros((1, 3), np.float32)))
         sdk.put_frame(id, 0, pictures())

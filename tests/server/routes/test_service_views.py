@@ -199,9 +199,9 @@ def test_a_scene_is_exported_by_the_command(service, finished, tmp_path, monkeyp
     assert poses.exit_code == 0, poses.output
     assert len((tmp_path / "a.csv").read_text().splitlines()) == 1 + 3 * 2
     for wrong, says in (
-        (("--format", "obj"), "is not known"),
+        (("--format", "obj"), "unknown format"),
         (("--format", "ply", "--frames", "7:9"), "7"),
-        (("--format", "ply", "--frames", "x"), "not a range"),
+        (("--format", "ply", "--frames", "x"), "not a valid range"),
         (("--format", "ply", "--id", "3"), "leave --id out"),
         (("--format", "usd", "--out", "a.ply"), ".usdc"),
     ):

@@ -200,7 +200,7 @@ def test_pictures_that_are_deleted_cannot_be_begun_with(http, sdk, make):
         sdk.wait(id, index)
     wait_for(lambda: status(http, id)["frames_kept"] == 2)
     refused = problem(begin(http, id, 1, discard=True), 409)
-    assert (refused["detail"], refused["expected"]) == ("the pictures of frame 0 were deleted", 4)
+    assert (refused["detail"], refused["expected"]) == ("the images of frame 0 were deleted", 4)
     assert "start with frame 4" in refused["remedy"]
     begun(http, id, 1, discard=True, frame=4)
     sdk.wait(id, 5)

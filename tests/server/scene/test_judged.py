@@ -99,7 +99,7 @@ def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served)
         assert np.array_equal(array, after.arrays()[name]), name
     status = sdk.scene(id)
     assert status.degraded
-    assert f"frame {index} was previous state kept" in status.error
+    assert f"frame {index} was rejected; previous state kept" in status.error
     assert metric(sdk, 'scas4d_degraded_frames_total{how="rejected"}') == held + 1
     good = put(sdk, id, index + 1)
     assert good.degraded is None

@@ -28,7 +28,7 @@ class Machines(Placement):
 
     def start(self, entry, spec, on_message, on_end):
         def lost(why):
-            on_end(ProcessExit(None, "the node of its worker is lost", lost=True) if entry is worker.main else why)
+            on_end(ProcessExit(None, "the worker's node was lost", lost=True) if entry is worker.main else why)
 
         return super().start(entry, spec, on_message, lost)
 

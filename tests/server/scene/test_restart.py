@@ -85,7 +85,7 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
         said = sdk.scene(id).warnings
         assert said[0].startswith("frame 0 is a guess")
         assert "restart the reconstruction with points" in said[0]
-        assert said[1].startswith("frame 0 had too little time: no stereo; ")
+        assert said[1].startswith("frame 0 did not have enough time: no stereo; ")
         assert said[2].startswith("grayscale cameras among colour ones: c1; ")
         assert len(said) == 3
         assert sdk.frame(id, 0).grey == ["c1"]
@@ -215,7 +215,7 @@ def test_states_of_another_format_are_no_damage(tmp_path):
     before = contents(folder)
     with serving(tmp_path) as (http, _):
         document = problem(http.get(f"/v1/scenes/{id}"), 404)
-        assert "states, a folder of states, has format 99" in document["detail"]
+        assert "state folder states has format 99" in document["detail"]
         assert http.get("/v1/scenes").json()["scenes"] == []
     assert contents(folder) == before
 

@@ -42,7 +42,7 @@ def test_what_does_not_hold_or_raises_is_told() -> None:
     broken = run.run_case(HardCase("b", "", "", (1,), breaks), 1, ["cpu"])
     assert broken.violations == ["raised RuntimeError: cannot be made"]
     page = run.page([wrong, broken], {"half_turn": ["w"]}, "a machine", "a day")
-    assert "2 do not hold" in page
+    assert "2 failures" in page
     assert "1 of 1 removals make a case fail" in page
 
 

@@ -121,16 +121,16 @@ def test_the_page_says_what_was_measured():
         **kernels.update_figures([{"seconds": 3.5, "stages": stages}] * 3),
     }
     text = kernels.page(row)
-    assert "| rasterizer on frame 0 over arithmetic | 2.00 | × | ≤ 2 × | reached |" in text
-    assert "| rasterizer on cloud over arithmetic | 2.01 | × | ≤ 2 × | **missed** |" in text
-    assert "| update over passes | 3.50 | × | ≤ 3 × | **missed** |" in text
-    assert "| peak memory of the run | 1500 | MB | < 1500 MB | **missed** |" in text
-    assert "448 Gaussians, 2 pictures of 48×48" in text
-    assert "(A Processor, 2 cores, 1 thread used; sources of the core 0123abcd)" in text
+    assert "| rasterizer-to-arithmetic ratio, frame 0 | 2.00 | × | ≤ 2 × | reached |" in text
+    assert "| rasterizer-to-arithmetic ratio, cloud | 2.01 | × | ≤ 2 × | **missed** |" in text
+    assert "| update-to-rasterizer ratio | 3.50 | × | ≤ 3 × | **missed** |" in text
+    assert "| peak memory | 1500 | MB | < 1500 MB | **missed** |" in text
+    assert "448 Gaussians, 2 images of 48×48" in text
+    assert "(A Processor, 2 cores, 1 thread used; source version of the core: 0123abcd)" in text
 
 
 def test_too_short_a_run_is_refused(tmp_path):
     from studies.quality.settings import settings_of
 
-    with pytest.raises(ValueError, match="frames is 2; give at least 3"):
+    with pytest.raises(ValueError, match=r"frames must be at least 3, .* got 2"):
         kernels.study(tmp_path, settings_of("scas4d"), tmp_path, frames=2)

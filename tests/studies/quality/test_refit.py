@@ -40,5 +40,5 @@ def test_other_settings_have_no_figure_beside(rows):
 
 
 def test_a_frame_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"robot has no frame 99; give one of 0 to \d+"):
+    with pytest.raises(ValueError, match=r"robot has no frame 99; use 0 to \d+"):
         refit.run([SAMPLE], tmp_path, frame=99, points=True, report=lambda _: None)

@@ -62,7 +62,7 @@ def test_a_bar_is_compared_as_measured_not_as_rounded():
     assert updates.reached is False
     assert updates.updates == "2 of 4"
     text = target_table([frame_0, updates]).splitlines()
-    assert text[2] == "| frame 0, test cameras | robot | ≥ 36.00 dB | 36.00 | reached | frame 0 |"
+    assert text[2] == "| frame 0 PSNR | robot | ≥ 36.00 dB | 36.00 | reached | frame 0 |"
     assert text[3] == "| updates | robot | ≥ 31.00 dB | 31.00 | **missed** | 2 of 4 |"
 
 
@@ -76,11 +76,11 @@ def test_a_difference_is_over_the_updates_that_both_have():
     assert verdict.value == pytest.approx(1.5)  # over all updates it would be behind
     assert verdict.reached is True
     assert verdict.updates == "2 of 4"
-    assert "| +1.50 (30.50 against 29.00) | reached | 2 of 4 |" in target_table([verdict])
+    assert "| +1.50 (30.50 vs. 29.00) | reached | 2 of 4 |" in target_table([verdict])
 
 
 def test_it_is_the_best_of_the_others_that_counts_and_all_must_be_there():
-    target = the_one(compare({}), "three layers over the best single one (64, 320, 1280)", "cloth").target
+    target = the_one(compare({}), "three layers − best single layer (64, 320, 1280)", "cloth").target
     rows = {("scas4d", "cloth"): made_row("scas4d", "cloth", [30.0, 29.0])}
     for name, psnr in (("clusters-64", 27.0), ("clusters-320", 29.5), ("clusters-1280", 28.0)):
         verdict = next(v for v in compare(rows, [target]) if v.capture == "cloth")
@@ -106,21 +106,21 @@ def test_a_mean_needs_every_capture_and_weighs_them_alike():
 def test_losses_are_against_frame_0_of_the_same_row():
     row = made_row("scas4d", "basketball", [29.0, 28.9, 28.2, 28.6], psnr_changed=21.5)
     verdicts = compare({("scas4d", "basketball"): row})
-    mean = the_one(verdicts, "mean loss of the updates against frame 0")
-    worst = the_one(verdicts, "worst loss of an update against frame 0")
+    mean = the_one(verdicts, "mean PSNR loss relative to frame 0")
+    worst = the_one(verdicts, "worst PSNR loss relative to frame 0")
     assert mean.value == pytest.approx(29.0 - (28.9 + 28.2 + 28.6) / 3)
     assert worst.value == pytest.approx(0.8)
     assert mean.reached
     assert worst.reached
-    reported = the_one(verdicts, "pixels that changed since frame 0")
+    reported = the_one(verdicts, "PSNR over pixels changed since frame 0")
     assert (reported.value, reported.reached, reported.word) == (21.5, None, "")
 
 
 def test_frame_0_alone_says_nothing_of_updates():
     rows = {("scas4d", "robot"): made_row("scas4d", "robot", [36.5])}
     verdicts = compare(rows)
-    assert the_one(verdicts, "frame 0, test cameras", "robot").reached is True
-    assert the_one(verdicts, "updates", "robot").word == "not measured"
+    assert the_one(verdicts, "frame 0 PSNR", "robot").reached is True
+    assert the_one(verdicts, "update PSNR", "robot").word == "not measured"
     assert the_one(verdicts, "3D tracks, median error", "robot").word == "not measured"
 
 
@@ -176,7 +176,7 @@ def test_the_runs_are_measured_where_captures_are(tmp_path, monkeypatch):
         ("robot", (64,), 4),
     ]
     assert len(lines) == len(CAPTURES) - 1
-    with pytest.raises(ValueError, match="run 'scas' is unknown"):
+    with pytest.raises(ValueError, match="unknown run 'scas'"):
         measure_runs(tmp_path, tmp_path / "out", ["scas"])
     with pytest.raises(ValueError, match="capture 'robots' has no targets"):
         measure_runs(tmp_path, tmp_path / "out", only=["robots"])
@@ -204,9 +204,9 @@ def test_the_command_writes_the_page(tmp_path):
     text = (tmp_path / "docs" / "quality.md").read_text()
     assert text == page(read_study(study))
     assert "- Measured: 2026-01-02." in text
-    assert "- On: A Processor, 2 cores, 1 thread used, 8 GB, Linux." in text
-    assert "| updates | robot | ≥ 31.00 dB | 31.38 | reached | 2 of 4 |" in text
-    assert "| update over its rasterizer passes | robot | ≤ 3.00 × | 3.25 | **missed** | – |" in text
+    assert "- Machine: A Processor, 2 cores, 1 thread used, 8 GB RAM, Linux." in text
+    assert "| update PSNR | robot | ≥ 31.00 dB | 31.38 | reached | 2 of 4 |" in text
+    assert "| update-to-rasterizer ratio | robot | ≤ 3.00 × | 3.25 | **missed** | – |" in text
     assert "| robot | scas4d | 100 | – | 20,000 | 2 | 36.00 | 31.38 |" in text
 
 

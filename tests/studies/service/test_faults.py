@@ -75,5 +75,5 @@ def test_kills_with_the_method_itself(tmp_path):
 def test_a_lost_frame_and_another_state_are_noticed():
     assert of.compare({0: "a", 1: "b"}, {0: "a", 1: "c", 2: "d"}) == [
         "frames [2] are not committed",
-        "states [1] are not bit-identical: b in place of c",
+        "states [1] are not bit-identical: got b, expected c",
     ]

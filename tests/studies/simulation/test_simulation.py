@@ -88,7 +88,7 @@ def test_slow_places_and_untold_reasons_are_found(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(process.SimulatedProcess, "_explain", lambda self: None)
     found = missed(simulate(SMALL))
     assert "workers placed within 10 s while a node has room" in found
-    assert "workers without a place for 3 s whose scene was not given a reason" in found
+    assert "workers unplaced for 3 s whose scene reports no reason" in found
 
 
 def test_the_clock_jumps() -> None:

@@ -62,9 +62,7 @@ def test_a_model_without_points_and_with_folders(tmp_path):
 def test_other_models_are_refused_by_name(tmp_path, name, binary):
     count = len(pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1).params)
     model(lenses("PINHOLE"), tmp_path, name, binary, parameters=[200.0] * count)
-    with pytest.raises(
-        CaptureError, match=rf"model {name}, which is not supported; calibrate with one of SIMPLE_PINHOLE"
-    ):
+    with pytest.raises(CaptureError, match=rf"unsupported model {name}; calibrate with one of SIMPLE_PINHOLE"):
         read_colmap(tmp_path)
 
 
@@ -74,7 +72,7 @@ def test_a_binary_file_cut_anywhere_says_so(tmp_path, file):
     for length in range(len(whole)):
         (tmp_path / file).write_bytes(whole[:length])
         with pytest.raises(
-            CaptureError, match=rf"{file}: (ends after {length} bytes|the name of .* is not terminated)"
+            CaptureError, match=rf"{file}(: | is )(truncated after {length} bytes|the name of .* is not terminated)"
         ):
             read_colmap(tmp_path)
 
@@ -82,7 +80,7 @@ def test_a_binary_file_cut_anywhere_says_so(tmp_path, file):
 def test_a_count_that_cannot_be_ends_at_once(tmp_path):
     model(lenses(), tmp_path, "OPENCV", True)
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 2**63))
-    with pytest.raises(CaptureError, match=r"ends after 8 bytes"):
+    with pytest.raises(CaptureError, match=r"truncated after 8 bytes"):
         read_colmap(tmp_path)
 
 
@@ -109,10 +107,10 @@ def test_parts_that_do_not_fit_each_other_are_named(tmp_path):
     folder = model(lenses(), tmp_path / "a", "OPENCV", False)
     cameras = (folder / "cameras.txt").read_text().splitlines()
     (folder / "cameras.txt").write_text("\n".join(cameras[:-1]))
-    with pytest.raises(CaptureError, match=r"image .* has camera 3, which cameras.txt lacks"):
+    with pytest.raises(CaptureError, match=r"image .* refers to camera 3, which is not in cameras.txt"):
         read_colmap(folder)
     (folder / "cameras.txt").write_text("\n".join([*cameras[:-1], cameras[-1].rpartition(" ")[0]]))
-    with pytest.raises(CaptureError, match=r"camera 3 has 7 parameters; OPENCV needs 8: fx, fy"):
+    with pytest.raises(CaptureError, match=r"camera 3 has 7 parameters, but OPENCV requires 8: fx, fy"):
         read_colmap(folder)
     shutil.rmtree(folder)
     model(lenses(), folder, "OPENCV", False)
@@ -120,7 +118,7 @@ def test_parts_that_do_not_fit_each_other_are_named(tmp_path):
     with pytest.raises(CaptureError, match=r"no images were registered"):
         read_colmap(folder)
     (folder / "images.txt").write_text("1 2 0 0 0 0 0 0 1 cam1.jpg\n\n")
-    with pytest.raises(CaptureError, match=r"cam1.jpg has an invalid pose .*length 1"):
+    with pytest.raises(CaptureError, match=r"cam1.jpg has an invalid pose .*unit quaternion"):
         read_colmap(folder)
     (folder / "images.txt").unlink()
     with pytest.raises(CaptureError, match=r"images.txt: no such file"):
@@ -131,5 +129,5 @@ def test_a_camera_of_several_pictures_must_stand_still(tmp_path):
     rig = lenses()
     moved = {f"cam1/{name}": lens for name, lens in rig.items()} | {"cam2/a": rig["cam2"]}
     model(moved, tmp_path, "OPENCV", True)
-    with pytest.raises(CaptureError, match=r"camera 'cam1' has a different world_to_camera.*one image per camera"):
+    with pytest.raises(CaptureError, match=r"world_to_camera of camera 'cam1' differs.*one image per camera"):
         read_colmap(tmp_path)

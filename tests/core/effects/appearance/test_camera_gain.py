@@ -96,7 +96,7 @@ def test_cameras_that_are_alike_leave_it_off_and_others_switch_it_on() -> None:
     assert NAME not in alike._prepared.carried.effects
     assert other._prepared.carried.switches[NAME].on
     assert found(other).std(axis=0).min() > 0.05
-    assert other._prepared.carried.switches[NAME].text.startswith("colour gains of the cameras differ by ")
+    assert other._prepared.carried.switches[NAME].text.startswith("colour gains differ by ")
 
 
 def test_off_changes_no_bit() -> None:

@@ -80,7 +80,7 @@ def test_a_glossy_ball_is_found_in_frame_0_and_a_dull_one_is_fitted_as_if_nobody
     for result, on in ((glossy, True), (dull, False)):
         switch = first_switches(Settings(), 0, result.evidence or {})["direction"]
         assert (switch.on, switch.since) == (on, 0)
-        assert switch.text.startswith("explains ")
+        assert switch.text.startswith("view-dependent colour explains ")
     without = fitted(sphere(), "off")
     assert np.mean(glossy.psnr[-24:]) > np.mean(without.psnr[-24:]) + 0.5
 
@@ -200,7 +200,7 @@ def test_an_update_learns_it_and_says_so() -> None:
     state, evidence = after(before, truth, effects)
     assert evidence is not None
     assert evidence.share > 0.05
-    assert evidence.text == f"explains {100 * evidence.share:.0f} % of the residual"
+    assert evidence.text == f"view-dependent colour explains {100 * evidence.share:.0f} % of the residual"
     assert state.gloss is not None
     assert before.gloss is not None
     assert not np.array_equal(state.gloss, before.gloss)

@@ -92,7 +92,7 @@ def same(one: Reconstruction, other: Reconstruction) -> bool:
 def test_a_camera_that_is_knocked_is_found_and_the_others_stay() -> None:
     scene = play(started("auto"), range(1, 15), OFF)
     assert scene._prepared.carried.switches[NAME].on
-    assert scene._prepared.carried.switches[NAME].text.startswith("camera c2 is off by 0.")
+    assert scene._prepared.carried.switches[NAME].text.startswith("camera c2 is misaligned by 0.")
     np.testing.assert_allclose(off_by(scene, "c2"), OFF["c2"], atol=0.25)  # the box had taken on a part
     rows = np.flatnonzero(arrays(scene)["twists"].any(axis=1))
     assert [RIG.names[row] for row in rows] == ["c2"]

@@ -144,14 +144,14 @@ def test_without_prediction_an_update_starts_where_the_frame_before_ended(kind: 
 @pytest.mark.parametrize(
     ("given", "setting", "value", "words"),
     [
-        ({"effects": dict.fromkeys(MOVES, "off")}, "cluster_rotation", "off", "leave one of cluster_rotation, "),
+        ({"effects": dict.fromkeys(MOVES, "off")}, "cluster_rotation", "off", "set at least one of cluster_rotation, "),
         (
             {"effects": dict.fromkeys(MOVES[3:], "off"), "update": {"clusters": ()}},
             "own_position",
             "off",
             "no effect could move clusters or Gaussians",
         ),
-        ({"effects": {"own_scale": "on"}, "update": {"rate_scale": 0}}, "own_scale", "on", "set a rate above 0"),
+        ({"effects": {"own_scale": "on"}, "update": {"rate_scale": 0}}, "own_scale", "on", "use a rate above 0"),
         (
             {"effects": {"cluster_scaling": "on"}, "update": {"clusters": ()}},
             "cluster_scaling",

@@ -165,5 +165,5 @@ def test_a_long_attempt_is_logged_whole(monkeypatch) -> None:
 
 def test_more_views_than_it_has_room_for_are_refused() -> None:
     engine = loaded(WarpEngine(DEVICE), case())
-    with pytest.raises(ValueError, match=r"update.views: 65 views per iteration; this engine has room for 64"):
+    with pytest.raises(ValueError, match=r"update.views: 65 views per iteration, but this engine supports at most 64"):
         engine.iterate([0] * 65, step())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -126,3 +128,17 @@ def test_pictures_that_are_there_are_not_sent_again_and_exposures_are() -> None:
     assert not loss.load([other])  # fewer views need no more room
     assert np.array_equal(loss.targets.numpy()[0], other.target)
     assert loss.load([view, shot(40, 16)[0]])
+
+
+def test_images_of_8_bits_become_the_same_targets() -> None:
+    rng = np.random.default_rng(0)
+    levels = rng.integers(0, 256, (4, 21, 33)).astype(np.uint8)
+    levels[3] %= 2
+    target = np.concatenate([levels[:3] * np.float32(1 / 255), levels[3:].astype(np.float32)])
+    made = PictureLoss(DEVICE, 1.0, 1.0)
+    plain = view_of(target, camera(33, 21))
+    made.load([replace(plain, target=target, levels=levels), replace(plain, target=target.copy())])
+    targets, moments = made.targets.numpy(), made.target_means.numpy()
+    assert np.array_equal(targets[0, :, :21, :33], target)
+    assert np.array_equal(targets[0], targets[1])
+    assert np.array_equal(moments[0], moments[1])
