@@ -233,7 +233,7 @@ accurate one are omitted. Cells show the lead of `scas4d` in dB and both PSNR va
 {score_table(iterations, default)}
 
 With 10 iterations, updates miss motion. Examining and fitting it as new objects takes longer than the iterations saved
-(stage *presence*; repeated on *robot*, 2026-11-27).
+(*rest* in the plot of stages; repeated on *robot*, 2026-11-27).
 
 {_spreads(points, captures)}
 

@@ -65,9 +65,9 @@ rows.{_elsewhere(captures, there)}
 {summary([outcome for outcomes_of_variant in outcomes.values() for outcome in outcomes_of_variant], outcomes)}
 
 The gain is the first setting's mean minus the second's, over the captures that both cover. Two gains agree in size if
-they are within a factor of {FACTOR:g}. Small gains (before rounding, below
-{", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) count as zero:
-they agree with each other, whatever their signs, but not with a larger gain. If the paper shows only an image, its
+they are within a factor of {FACTOR:g}. Two small gains (before rounding, below
+{", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well,
+whatever their signs. Otherwise, a small gain does not agree with a larger one. If the paper shows only an image, its
 claim is the sign of the gain. The last column counts the captures whose own gain agrees with the claim, at least in
 sign. SSIM appears only in this table.
 

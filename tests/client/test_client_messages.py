@@ -114,11 +114,11 @@ def test_a_setting_that_cannot_be_is_named_with_its_value(capture_folder, tmp_pa
 
 def test_an_address_without_its_scheme(capture_folder):
     for command in (["push", capture_folder], ["scenes"], ["watch", "some"]):
-        assert "write http://localhost:8000\n" in refused(*command, "--url", "localhost:8000")
+        assert "use http://localhost:8000\n" in refused(*command, "--url", "localhost:8000")
 
 
 def test_a_setting_of_the_service_is_named_with_its_value():
-    assert "setting port is 'abc'" in refused("serve", SCAS4D_PORT="abc")
+    assert "setting port has the invalid value 'abc'" in refused("serve", SCAS4D_PORT="abc")
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(capture_folder, tmp_path):
