@@ -63,7 +63,7 @@ class FrameOutcome(StrEnum):
 
     @property
     def learnt(self) -> bool:
-        """Whether the state was updated to the frame's images."""
+        """Whether the state was updated to fit the frame's images."""
         return not self.rejected and self is not self.UNCHANGED
 
 

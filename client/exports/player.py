@@ -53,7 +53,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
             size = sum(file.stat().st_size for file in files)
             if size > LARGEST:
                 raise InputError(
-                    f"the frames take {size / 1e6:.0f} MB, which is more than browsers can open in one page",
+                    f"the frames take {size / 1e6:.0f} MB, which is more than a browser can load in one page",
                     "export fewer with --frames A:B",
                 )
             folder = given.beside.resolve().name  # `scas4d reconstruct` always uses the same file name

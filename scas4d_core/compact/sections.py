@@ -170,7 +170,7 @@ def _sized(data: bytes) -> bytes:
 def _read_sized(body: bytes, offset: int, size: int) -> tuple[bytes, int]:
     """Decompresses a block of ``size`` bytes; also returns the offset of the block's end."""
     if len(body) < offset + 4:
-        raise PlaneError(f"unexpected end of data at byte {len(body)}, inside a size")
+        raise PlaneError(f"unexpected end of data at byte {len(body)} while reading a size field")
     (length,) = struct.unpack_from("<I", body, offset)
     if len(body) < offset + 4 + length:
         raise PlaneError(

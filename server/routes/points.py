@@ -126,7 +126,7 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
     except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:
         raise Problem(
             422,
-            f"cannot read the body as an npz file without pickled objects ({error})",
+            f"cannot read the body as an npz file (pickled objects are not allowed): {error}",
             field="points",
             value=count_noun(len(body), "byte"),
             remedy="send the output of numpy.savez(positions=…, colours=…, foreground=…) with numeric arrays",

@@ -141,7 +141,7 @@ def distances(scenes: dict[Device, Reconstruction], index: int) -> NDArray[np.fl
 
 
 def table(rows: Sequence[DeviceRow]) -> str:
-    """Formats rows of any captures as a Markdown table, with one line per capture."""
+    """Formats the rows of one or more captures as a Markdown table, with one line per capture."""
     lines = [
         "| capture | updates | PSNR on the CPU | GPU minus CPU: mean, worst frame | distance, % of the extent | "
         "track error, % of the extent: CPU, GPU | seconds per update: CPU, GPU |",

@@ -152,4 +152,4 @@ class Service:
             if status.state == "failed":
                 raise StudyError(f"the scene failed: {status.error}")
             time.sleep(every)
-        raise StudyError(f"frames were not finished within {PATIENCE_S:g} s")
+        raise StudyError(f"timed out after {PATIENCE_S:g} s while waiting for frames to finish")

@@ -117,7 +117,7 @@ class SimulatedProcess:
         if not self.over:
             self._times.hit(self.needs.scene, "node", self.node.failed_at, self._kind)
             began = self.work is not None
-            why = "the node of its worker is lost" if began else "the actor of its worker ended: its node is lost"
+            why = "the worker's node was lost" if began else "the worker's actor exited: its node was lost"
             self._cluster.later(TOLD_S, lambda: self._tell_end(ProcessExit(None, why, lost=began)))
 
     def die(self) -> None:
@@ -180,7 +180,7 @@ class SimulatedProcess:
 
     def _explain(self) -> None:
         if not self.over and self.work is None:
-            self._on_message(WaitsForNode(f"its worker is not placed on a node yet; it needs {self.needs.describe()}"))
+            self._on_message(WaitsForNode(f"the worker is waiting for a node with {self.needs.describe()}"))
 
     def _tell_end(self, why: ProcessExit) -> None:
         if not self.over:

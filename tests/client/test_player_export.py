@@ -79,6 +79,6 @@ def test_modules_that_cannot_be_linked_are_refused(tmp_path):
 
 def test_too_much_for_a_browser_is_refused(file, tmp_path, monkeypatch):
     monkeypatch.setattr("client.exports.player.LARGEST", 1000)
-    with pytest.raises(InputError, match="more than browsers can open"):
+    with pytest.raises(InputError, match="more than a browser can load"):
         export_player(str(file), tmp_path / "out.html", **NOWHERE)
     assert list(tmp_path.iterdir()) == []

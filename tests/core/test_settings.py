@@ -135,7 +135,7 @@ def test_changes_go_over_the_preset_later_ones_over_earlier_ones() -> None:
     [
         ({"update": {"iteration": 4}}, "update.iteration", 4, "did you mean update.iterations?"),
         ({"update": {"iterations": 0}}, "update.iterations", 0, "greater than or equal to 1"),
-        ({"update": {"clusters": [64, 8]}}, "update.clusters", [64, 8], "are not ascending"),
+        ({"update": {"clusters": [64, 8]}}, "update.clusters", [64, 8], "must be in ascending order"),
         ({"upd": {"seed": 1}}, "upd", {"seed": 1}, "no such setting"),
         ({"update": 4}, "update", 4, "UpdateSettings"),
         ({"scene": {"background": 2}}, "scene.background", 2, "a valid tupleBackground colour, RGB in 0…1"),

@@ -148,7 +148,7 @@ def test_fewer_cameras_than_the_minimum_set_the_frame_aside(http, make):
     report = finished(http, id, 0)
     assert (report["state"], report["error"]) == (
         "failed",
-        "usable pictures: 1, but the scene requires at least 2",
+        "usable images: 1 (the scene requires at least 2)",
     )
     assert put(http, id, 1).status_code == 202  # and the next one starts the scene
     assert finished(http, id, 1)["state"] == "committed"

@@ -213,7 +213,7 @@ def test_limits_are_told(ran, service, monkeypatch, http):
     sdk, id = ran
     monkeypatch.setattr(rules, "MAX_PER_SCENE", 1)
     done = over(sdk, id, sdk.begin_export(id, "ply").id)
-    with pytest.raises(Conflict, match="1 export, the maximum"):
+    with pytest.raises(Conflict, match="the maximum of 1 export"):
         sdk.begin_export(id, "ply")
     monkeypatch.setattr(rules, "MAX_WAITING", 0)
     assert problem(http.post(f"/v1/scenes/{id}/exports", json={"format": "ply"}), 429)["remedy"]
