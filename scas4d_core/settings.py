@@ -258,7 +258,8 @@ class UpdateSettings(SettingsModel):
     def _ascend(cls, clusters: tuple[int, ...]) -> tuple[int, ...]:
         if list(clusters) != sorted(set(clusters)):
             raise InputError(
-                f"clusters must be in ascending order; got {clusters}", "list the coarsest layer first and the finest last"
+                f"clusters must be in ascending order; got {clusters}",
+                "list the coarsest layer first and the finest last",
             )
         return clusters
 

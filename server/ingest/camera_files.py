@@ -165,7 +165,7 @@ def _only_camera(head: FrameHead, camera: str | None) -> str:
     if len(names) != 1 or camera not in (None, names[0]):
         raise Problem(
             422,
-            f"expected files from a single camera, got files from {count_noun(len(names), 'camera')}: {', '.join(names)}",
+            f"expected files from one camera, got files from {count_noun(len(names), 'camera')}: {', '.join(names)}",
             field="head.files",
             value=", ".join(names),
             remedy="send only files from one camera" + ("" if camera is None else f", {camera!r}, as in the URL"),

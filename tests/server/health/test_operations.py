@@ -108,7 +108,7 @@ def test_every_line_of_its_log_is_json_and_none_holds_the_token(tmp_path):
         text = log.read_text()
     entries = [json.loads(line) for line in text.splitlines()]
     assert {"scas4d.access", "scas4d.server"} <= {entry["logger"] for entry in entries}
-    assert any("SCAS4D_TOKKEN is not a setting" in entry["message"] for entry in entries)
+    assert any("ignoring unknown setting SCAS4D_TOKKEN" in entry["message"] for entry in entries)
     assert TOKEN not in text
     assert ticket["ticket"] not in text
 
