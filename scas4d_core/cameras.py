@@ -75,7 +75,7 @@ class Camera:
         if k[0, 0] <= 0 or k[1, 1] <= 0:
             raise CameraError(
                 f"camera {self.name!r}: focal lengths must be positive, got {k[0, 0]:g} and {k[1, 1]:g}",
-                "specify them in pixels",
+                "specify the focal lengths in pixels",
             )
         if abs(k[0, 1]) + abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) > 1e-6:
             raise CameraError(

@@ -61,9 +61,9 @@ class FrameReady:
 
 @dataclass(frozen=True)
 class RepairFiles:
-    """Request to the worker to check damaged or missing files of the states folder and to rewrite them if possible.
+    """Request to the worker to check damaged or missing files in the states folder and rewrite them if possible.
 
-    `times` and `reports` have entries for the frames that the service still has in memory.
+    `times` and `reports` cover only the frames whose data the service still has in memory.
     """
 
     names: tuple[str, ...]
@@ -218,7 +218,7 @@ class DamageFound:
 class ReplaySpec:
     """Specification of a replay, which repeats the updates of `frames` in memory for each entry of `iterations`.
 
-    `base` is the committed frame before them, and `first` is the scene's first frame, which every update needs.
+    `base` is the committed frame that precedes them, and `first` is the scene's first frame, which every update needs.
     """
 
     scene: SceneSpec
@@ -273,7 +273,7 @@ class ExportSpec:
 
 @dataclass(frozen=True)
 class ExportProgressed:
-    """Progress of an export: `done` frames have been written, and its folder takes `size` bytes."""
+    """Progress of an export: `done` frames have been written, and its folder occupies `size` bytes."""
 
     done: int
     size: int

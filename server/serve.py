@@ -89,7 +89,7 @@ def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placeme
     """Returns the placement of the scenes' processes.
 
     Raises:
-        RuntimeError: the placement is a Ray cluster, but Ray is not installed.
+        RuntimeError: the settings select a Ray cluster, but Ray is not installed.
     """
     if settings.placement == "local":
         return Placement(prepare)

@@ -1,6 +1,6 @@
 """Settings of the service, from arguments, the environment (SCAS4D_<NAME>), a TOML file (SCAS4D_CONFIG) and defaults.
 
-Earlier sources take precedence. docs/service-settings.md has a table generated from this module.
+Earlier sources take precedence. docs/service-settings.md contains a table generated from this module.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Names = Annotated[tuple[str, ...], NoDecode]
 
 
 class SettingsError(ValueError):
-    """Error for an invalid setting; the message has its name, remedy, and value unless that may be a secret."""
+    """Error for an invalid setting; the message contains its name, a remedy and, if it cannot be secret, its value."""
 
 
 class ServerSettings(BaseSettings):
@@ -276,7 +276,7 @@ class ServerSettings(BaseSettings):
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] | None = None, **given: object) -> ServerSettings:
-        """Reads the settings: defaults, overridden by the file, the environment and arguments that are not None.
+        """Returns the defaults, overridden in turn by the file, the environment, and arguments other than None.
 
         Raises:
             SettingsError: a setting is invalid; the message includes its name and the remedy.

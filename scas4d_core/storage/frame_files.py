@@ -118,7 +118,7 @@ class FrameFiles:
         return _stamp(file.stat())
 
     def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
-        """Writes the arrays shared by all frames and both of their copies, before the first frame (``index``) is committed."""
+        """Writes the arrays shared by all frames, and both of their copies, before the first frame is committed."""
         write_npz(self.fixed, with_format(arrays))
         write_npz(self.fixed_copy, with_format(arrays))
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})

@@ -17,13 +17,13 @@ VISIBLE_S = 10.0
 
 
 def write_marker(data: Path, word: str) -> None:
-    """Writes the marker of the service identified by `word` to the data folder. Blocking."""
+    """Writes the marker of the service identified by `word` to the data folder. Blocks."""
     with open_atomically(data / MARKER_NAME, data / f"{MARKER_NAME}{PART}") as file:
         file.write(word.encode())
 
 
 def has_marker(data: Path, word: str) -> bool:
-    """Returns whether this machine sees the marker of the service identified by `word`. Blocking.
+    """Returns whether this machine sees the marker of the service identified by `word`. Blocks.
 
     Waits up to `VISIBLE_S` for the marker to become visible.
     """
@@ -31,7 +31,7 @@ def has_marker(data: Path, word: str) -> bool:
 
 
 def wait_for_content(path: Path, word: str) -> bool:
-    """Returns whether a file's content is `word`, waiting up to `VISIBLE_S` for it to become visible. Blocking."""
+    """Returns whether a file's content is `word`, waiting up to `VISIBLE_S` for it to become visible. Blocks."""
     until = time.monotonic() + VISIBLE_S
     while True:
         try:

@@ -51,7 +51,7 @@ class Membership:
         """Dedicated thread for calls to the head node that may block indefinitely."""
 
     def join(self) -> None:
-        """Joins the cluster unless this process is already a member. Blocking.
+        """Joins the cluster unless this process is already a member. Blocks.
 
         Raises:
             RuntimeError: there is no cluster, or this machine has no node in it.
@@ -96,7 +96,7 @@ class Membership:
                 announced = await self._is_done(on_return)
 
     def leave(self) -> None:
-        """Leaves the cluster after any pending attempt to join, which ends the remaining actors. Blocking.
+        """Leaves the cluster, which ends the remaining actors; a pending attempt to join finishes first. Blocks.
 
         If Ray does not shut down in time, this process exits immediately, because the interpreter would otherwise wait
         for Ray's threads.

@@ -25,14 +25,14 @@ EXPECTED_REASON = (1, 4)
 
 
 class NodeWatch:
-    """Latest node list from the head node, and the recently lost nodes. For use on the event loop.
+    """Tracks the node list of the head node and the recently lost nodes. Use it only on the event loop.
 
     Args:
-        ask: requests the list of all current and former nodes, in Ray's format, from the head, and returns a future.
+        ask: function that requests the list of all current and former nodes, in Ray's format, and returns a future.
         now: monotonic clock that returns seconds.
 
     Attributes:
-        nodes: node list in the latest answer.
+        nodes: latest node list received.
         head_responds: whether the head node answered the latest request within `TIMEOUT_S`.
     """
 
@@ -52,7 +52,7 @@ class NodeWatch:
         return [id for id, when in self._lost.items() if when >= since]
 
     async def poll(self) -> None:
-        """Requests the node list unless it was just requested, and waits for it for up to `TIMEOUT_S`."""
+        """Requests the node list, at most once per `POLL_S`, and waits up to `TIMEOUT_S` for the response."""
         now = self._now()
         if self._answer is None and now - self._asked >= POLL_S:
             self._asked = now

@@ -35,18 +35,18 @@ class PlacedProcess:
 
 
 def all_nodes() -> list[dict[str, Any]]:
-    """Returns all current and former nodes in Ray's format. Blocking."""
+    """Returns all current and former nodes in Ray's format. Blocks."""
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     return nodes
 
 
 def living_nodes() -> list[dict[str, Any]]:
-    """Returns the live nodes in Ray's format. Blocking."""
+    """Returns the live nodes in Ray's format. Blocks."""
     return [node for node in all_nodes() if node["Alive"]]
 
 
 def is_lost(id: str) -> bool:
-    """Returns whether a node is lost. Blocking.
+    """Returns whether a node is lost. Blocks.
 
     A node is lost if it is dead, nothing listens at its address, or the head node does not respond. The address is
     checked because the head node takes several seconds to notice a dead node, whereas the loss of an actor is noticed
@@ -62,10 +62,10 @@ def is_lost(id: str) -> bool:
 
 
 def own_node_is_lost() -> bool:
-    """Returns whether the head node reports this machine's node as dead. Blocking.
+    """Returns whether the head node reports this machine's node as dead. Blocks.
 
     Raises:
-        Exception: any exception that Ray raises if its head does not respond.
+        Exception: any exception that Ray raises if the head node does not respond.
     """
     return not _includes_own_node(living_nodes())
 
@@ -105,7 +105,7 @@ def describe_cluster(
 ) -> Cluster:
     """Returns a description of the cluster: its nodes with their resources, and the processes waiting for a node.
 
-    It includes the nodes that are alive, were lost recently, or run a process of this service.
+    The description includes all nodes that are alive, were recently lost, or run a process of this service.
 
     Args:
         nodes: nodes in Ray's format.

@@ -40,11 +40,11 @@ class UnexpectedExit:
 
 @dataclass(frozen=True)
 class ProcessScheduling:
-    """Thread count and niceness that processes have on every node, equal to those on the service's machine.
+    """Thread count and niceness applied to processes on every node, equal to those on the service's machine.
 
     Attributes:
-        threads: value of OMP_NUM_THREADS, which Ray would set to the number of CPUs of the actor.
-        nice: niceness, which Ray would raise by 15, making a worker yield to every other process on its node.
+        threads: value of OMP_NUM_THREADS, which Ray would otherwise set to the actor's number of CPUs.
+        nice: niceness, which Ray would otherwise raise by 15, so that a worker yields to all other processes on its node.
     """
 
     threads: str | None = None

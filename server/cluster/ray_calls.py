@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class RayCalls:
-    """Runs blocking calls to Ray in threads. For use on the event loop.
+    """Runs blocking calls to Ray in threads. Use it only on the event loop.
 
     Calls can be suspended, because Ray ends the process if a call overlaps with `ray.shutdown` ("the core worker has
     already been shutdown").

@@ -176,7 +176,7 @@ class RayPlacement(Placement):
         return process
 
     def create_actor(self, name: str, needs: ResourceNeeds) -> Any:
-        """Creates the actor of a process. Blocking, since the head node registers the actor's name."""
+        """Creates the actor of a process. Blocks, since the head node registers the actor's name."""
         made: Any = ray.remote(ProcessHost)
         return made.options(name=name, **needs.actor_options()).remote(
             self.prepare, self._server.data.resolve(), self._token, ProcessScheduling.current()
@@ -186,7 +186,7 @@ class RayPlacement(Placement):
 class RayProcess:
     """Scene process on a cluster node; messages are exchanged through its actor.
 
-    For use on the event loop, which never waits for Ray.
+    All methods run on the event loop, which never waits for Ray.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class RayProcess:
             self._give_up(f"the {role} process was abandoned: {type(error).__name__}: {error}")
 
     async def _begin(self, entry: Entry, spec: Any) -> None:
-        """Starts the process; a worker without a node after `WAIT_S` reports the resources that it needs."""
+        """Starts the process; if a worker has no node after `WAIT_S`, reports the resources that the worker needs."""
         self._actor = await asyncio.shield(self._making)
         starting = self._start_task(self._result(self._actor.start.remote(entry, spec)))
         starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # avoids a warning after `stop`
@@ -354,7 +354,7 @@ class RayProcess:
 
 
 def _first_line(error: BaseException) -> str:
-    """Returns the first line of an error message; the rest of Ray's messages is for cluster operators, in the log."""
+    """Returns the first line of an error message; Ray's full message, meant for cluster operators, is in the log."""
     return str(error).strip().partition("\n")[0]
 
 

@@ -43,7 +43,7 @@ class ServiceAddress:
 
 
 def register_service(word: str, host: str, port: int) -> Any:
-    """Announces this service and returns its actor, which ends with this process. Blocking.
+    """Announces this service and returns its actor, which ends with this process. Blocks.
 
     Args:
         word: identifier of this service.
@@ -72,7 +72,7 @@ def _authority(host: str, port: int) -> str:
 
 
 def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
-    """Returns the addresses of the other services, keyed by the names of their actors. Blocking.
+    """Returns the addresses of the other services, keyed by the names of their actors. Blocks.
 
     For a service that does not respond because it is starting or stopping, the name of its actor is used as a
     placeholder. Requests to a placeholder always fail.
@@ -98,7 +98,7 @@ def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]
 
 
 def _fetch_addresses(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
-    """Returns the addresses of services; for a service that does not respond, the name stands for the address."""
+    """Returns the addresses of services, or the actor name in place of an address if a service does not respond."""
     addresses: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
     asked: dict[Any, str] = {}
     for name in names:

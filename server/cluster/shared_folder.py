@@ -61,9 +61,9 @@ def check_folder(data: Path) -> None:
 
 
 def probe_from_node(data: Path, word: str, id: str) -> str | None:
-    """Checks the folder on this node; returns None, or a fault to be appended to the node's name.
+    """Checks the folder on this node; returns None, or a fault description to append to the node's name.
 
-    Blocking.
+    Blocks.
     """
     try:
         if not wait_for_content(data / f"{PROBE_NAME}-{word}", word):

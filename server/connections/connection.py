@@ -39,7 +39,7 @@ DROPPED_BYTES = 1 << 20
 class GuardedConnection(HttpToolsProtocol):
     """HTTP connection of uvicorn with limits, and without the two copies that uvicorn makes of each body.
 
-    A frame has about 30 MB, and copying it takes as long as reading it.
+    A frame is about 30 MB, and copying it takes as long as reading it.
 
     Attributes:
         guard: the service's connection guard, set by `server.connections.config`.
@@ -137,7 +137,7 @@ class GuardedConnection(HttpToolsProtocol):
         return Refusal.URL_SIZE if 2 * len(self.url or b"") > self.guard.limits.header_bytes else Refusal.HEAD_SIZE
 
     def on_message_begin(self) -> None:
-        """Starts a request, possibly in the piece that also ended the previous request."""
+        """Starts a request, which may begin in the same piece of data in which the previous request ended."""
         super().on_message_begin()
         if self._record.phase is not Phase.HEAD:
             self._begin_head()

@@ -75,7 +75,7 @@ class OpenConnection:
         entered: loop time at which the phase began.
         body: body bytes received in the current window, or in all windows if the body is being discarded.
         dropped: value of `body` at the start of the current window if the body is being discarded.
-        moved: whether `PROGRESS_BYTES` of the current body have arrived in one window.
+        moved: whether `PROGRESS_BYTES` of the current body have arrived within a single window.
         received: bytes received since the last sweep.
         served: whether at least one request was answered.
         write_paused: whether the unsent data exceeds the high-water mark of the transport.
@@ -106,7 +106,7 @@ class OpenConnection:
 
     @property
     def is_begun(self) -> bool:
-        """Whether every window so far received less than `PROGRESS_BYTES`, or the body is being discarded."""
+        """Whether no window so far has received `PROGRESS_BYTES`, or the body is being discarded."""
         return self.phase is Phase.LINGER or not self.moved
 
     @property
@@ -117,7 +117,7 @@ class OpenConnection:
 
 @dataclass(eq=False, slots=True)
 class Peer:
-    """Connections of one address; those that may be closed to make room are in queues, oldest first."""
+    """Connections from one address; those that may be closed to make room are kept in queues, oldest first."""
 
     address: str
     proxy: bool

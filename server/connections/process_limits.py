@@ -1,4 +1,4 @@
-"""Process-wide limits for many connections: memory that is retained after use, and open files."""
+"""Process-wide limits adjusted for many connections: retained freed memory, and open files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def retain_freed_memory() -> None:
 
 
 def raise_open_file_limit(asked: int) -> int:
-    """Raises the limit on open files for `asked` connections, as far as the system permits.
+    """Raises the limit on open files to allow `asked` connections, as far as the system permits.
 
     Returns:
         The number of connections that the limit allows, at most `asked`. A service that has run out of file descriptors

@@ -86,7 +86,7 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
     def handle_cont(self, event: Frame) -> None:
         """Appends a fragment of a message.
 
-        Small fragments are joined, because an object for each would take up to forty times its size.
+        Small fragments are joined, because a separate object for each would take up to forty times its size.
         """
         if event.fin or len(event.data) > SMALL_FRAGMENT:
             super().handle_cont(event)

@@ -58,7 +58,7 @@ def machine_mb() -> float:
 
 
 def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: float | None = None) -> SceneEstimate:
-    """Returns the estimate for a scene with this rig and these settings; `scale` overrides `scene.image_scale`."""
+    """Returns the memory and disk estimate of a scene; `scale` overrides `scene.image_scale`."""
     scale = settings.scene.image_scale if scale is None else scale
     sizes = [camera.width * camera.height for camera in rig.cameras]
     pixels = sum(sizes)
@@ -92,7 +92,7 @@ def refuse_if_too_large(rig: RigModel, settings: Settings, server: ServerSetting
     """Refuses a scene whose estimated memory exceeds the limit.
 
     Raises:
-        Problem: 422 if it does; the remedy suggests an image scale that fits, if there is one.
+        Problem: 422 if the scene is refused; the remedy suggests an image scale that fits, if there is one.
     """
     needed = estimate(rig, settings, server)
     if needed.memory_mb <= needed.limit_mb:

@@ -24,7 +24,7 @@ def redact(text: str) -> str:
 
 
 class JsonFormatter(logging.Formatter):
-    """JSON formatter with time, level, logger, message, process id, `extra` fields and traceback, if any."""
+    """Formatter that writes time, level, logger, message, process ID, `extra` fields and any traceback as JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Returns the record as one line of JSON."""
@@ -42,7 +42,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Formatter for human readers, with time of day, message, and the level if it is warning or higher."""
+    """Formatter for human readers, with the time of day, the message and, for warnings and above, the level."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")

@@ -1,4 +1,4 @@
-"""Count of the processes killed by the kernel's out-of-memory killer."""
+"""Number of processes killed by the kernel's out-of-memory killer."""
 
 from __future__ import annotations
 

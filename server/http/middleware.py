@@ -27,7 +27,7 @@ COMPRESSED_TYPES = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream",
 class AccessLog:
     """Middleware that logs one line per request and per WebSocket.
 
-    A line has the method, path, status, duration, sizes and client address, but neither the query nor the headers.
+    Each line contains the method, path, status, duration, sizes and client address, but no query or headers.
     """
 
     def __init__(self, app: ASGIApp) -> None:

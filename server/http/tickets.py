@@ -33,7 +33,7 @@ class Tickets:
 
     Args:
         secret: the service's token. If None, only this service accepts its tickets.
-        clock: returns the time in seconds since the epoch; the clocks of a cluster must agree to within a few seconds.
+        clock: function that returns the time in seconds since the epoch; clocks in a cluster must agree within seconds.
     """
 
     def __init__(self, secret: str | None = None, clock: Callable[[], float] = time.time) -> None:

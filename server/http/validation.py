@@ -57,7 +57,7 @@ def validation_problem(
             relative to it.
         prefix: prefix for the problem's field name.
         others: number of further errors.
-        text: text that was sent, if it may be malformed JSON.
+        text: request text, if the error may be due to malformed JSON.
         schema: hint in the remedy about where all fields are listed.
     """
     loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))

@@ -49,7 +49,7 @@ class IngestRules:
 
     Attributes:
         rig: the scene's rig.
-        frames_per_second: frame rate used to compute the time of a frame if the client sends none.
+        frames_per_second: frame rate used to compute the time of a frame if the client does not send it.
         queue_frames: maximum number of acknowledged but unfinished frames.
         when_full: whether a full queue refuses the next frame or skips the waiting frames.
         minimum_cameras: minimum number of cameras per frame.
@@ -87,7 +87,7 @@ class Ingest:
         rules: rules for accepting frames.
         updates: scheduler of the scene's updates, triggered when a frame is accepted.
         publisher: publisher of the scene's events.
-        can_begin: called before the first frame is accepted; raises `Problem` if the scene cannot start.
+        can_begin: function called before the first frame is accepted; raises `Problem` if the scene cannot start.
     """
 
     def __init__(
@@ -197,7 +197,7 @@ class Ingest:
         return receipt
 
     async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
-        """Journals a frame and the frames that are skipped for it; the caller must hold the log's lock.
+        """Journals a frame and any frames skipped to make room for it; the caller must hold the log's lock.
 
         Raises:
             Problem: 507 if the disk is full.
@@ -214,13 +214,13 @@ class Ingest:
         return receipt
 
     def publish_ended(self, index: int) -> None:
-        """Publishes a frame that finished without an update: skipped, missing or before the first frame."""
+        """Publishes a frame that ended without an update: skipped, missing, or before the reconstruction's first frame."""
         self._publisher.publish_frame(self.ledger.frames[index].report)
 
     # Rules. These methods do not change any state.
 
     def time_of(self, index: int, time: float | None) -> float:
-        """Returns `time` if it is given, otherwise the time in seconds that follows from the scene's frame rate."""
+        """Returns `time` if given, otherwise the frame's time in seconds computed from the scene's frame rate."""
         return index / self.rules.frames_per_second if time is None else time
 
     def admit(self, index: int, seconds: float) -> None:

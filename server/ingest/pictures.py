@@ -162,7 +162,7 @@ class StructureError(InputError):
     Attributes:
         fault: description of the fault.
         remedy: advice on what to send instead.
-        value: invalid property, or None if the whole file is invalid.
+        value: unsupported property of the image, or None if the file as a whole is invalid.
     """
 
     def __init__(self, fault: str, remedy: str, value: str | None = None) -> None:
@@ -188,8 +188,8 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
         data: contents of the file in one contiguous buffer, which is not copied.
 
     Raises:
-        StructureError: the file has another format, is truncated, damaged, CMYK or animated, or has an unsupported bit
-            depth.
+        StructureError: the file is not in an accepted format, is truncated, damaged, CMYK or animated, or has an
+            unsupported bit depth.
     """
     data = memoryview(data)
     start = bytes(data[:12])
@@ -259,7 +259,7 @@ def _jpeg(data: memoryview) -> ImageHeader:
 def _end_of_scan(data: memoryview, at: int) -> int:
     """Returns the end of the entropy-coded data after `at`.
 
-    It is the position of the next marker other than a restart marker; a stuffed zero byte is not a marker.
+    The end is the position of the next marker other than a restart marker. A stuffed zero byte is not a marker.
     """
     end = _SCAN_END.search(data, at)
     if end is None:

@@ -42,7 +42,7 @@ class FrameReceiver:
         folder: frame log folder.
         head: frame header, with the names and sizes of the files.
         seconds: time of the frame in seconds, or None if it is not known yet.
-        check: called with each file and its contents.
+        check: function called with each file and its contents.
         keep: whether to write the files; if False, they are only checked and hashed.
 
     Attributes:
@@ -150,7 +150,7 @@ async def read_framed(
 
     Args:
         chunks: chunks of the body as they arrive.
-        begin: called with the header; raises `Problem` or returns the receiver.
+        begin: function called with the header; returns the receiver or raises `Problem`.
         total: announced number of bytes, or None.
 
     Raises:

@@ -43,10 +43,10 @@ log = logging.getLogger("scas4d.server")
 
 
 class Peers:
-    """Other services of the cluster and the scenes that they own. For use on the event loop.
+    """Other services of the cluster and the scenes that they own. Use it only on the event loop.
 
     Args:
-        listed: returns the addresses of the peers, such as `http://10.0.0.2:8000`; it may be slow.
+        listed: function, possibly slow, that returns the addresses of the peers, such as `http://10.0.0.2:8000`.
         secret: token shared by all services in the cluster; None if there is no token.
         client: HTTP client; None creates one.
 
@@ -135,7 +135,7 @@ class Peers:
         return None
 
     def forget(self, scene: str) -> None:
-        """Forgets the owner of a scene, because it no longer owns the scene."""
+        """Forgets the recorded owner of a scene, because that peer no longer owns the scene."""
         self._owners.pop(scene, None)
 
     async def check(self, owner: str, scene: str) -> None:

@@ -49,8 +49,8 @@ class ProxyMiddleware:
 
     Args:
         app: next application in the middleware stack.
-        peers: returns the peers; called only after the service has started.
-        has: returns whether this service owns a scene.
+        peers: function that returns the peers; called only after the service has started.
+        has: function that returns whether this service owns a scene.
         most_bytes: maximum size in bytes of a WebSocket message from a client.
     """
 

@@ -31,14 +31,14 @@ def resize_labels(labels: NDArray[Any], count: int) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class StoredLabels:
-    """Part labels [N] and the index of the newest frame from which they were computed."""
+    """Part labels [N] and the index of the newest frame used to compute them."""
 
     labels: NDArray[np.int64]
     frame: int
 
 
 class PartLabels:
-    """Part labels of one scene for each number of parts; None stands for the automatically chosen number.
+    """Part labels of one scene for each number of parts; None means that the number is chosen automatically.
 
     Args:
         folder: folder of the label files; created on demand.

@@ -236,8 +236,8 @@ class Placement:
         Args:
             entry: module-level function that runs in the process.
             spec: first argument of `entry`; it must be picklable.
-            on_message: called on the event loop with every message that the process sends.
-            on_end: called once on the event loop with the reason if the process exits without being asked to.
+            on_message: callback that receives each message from the process; called on the event loop.
+            on_end: callback that receives the reason if the process exits unasked; called once, on the event loop.
         """
         return LocalProcess(entry, spec, on_message, on_end, self.prepare)
 

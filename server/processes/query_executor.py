@@ -57,9 +57,9 @@ class QueryExecutor:
     Args:
         entry: process entry point.
         spec: scene specification.
-        placement: starts the process.
+        placement: placement used to start the process.
         grace: time in seconds that the process may spend on a cancelled query before it is stopped.
-        damaged: called with a mapping from the name of each damaged file to the reason.
+        damaged: callback for damaged files; receives the reason for each, keyed by file name.
 
     Attributes:
         process: handle of the process; None before the first query and while the process is not running.

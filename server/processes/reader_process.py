@@ -217,7 +217,7 @@ class QueryReader:
                 )
 
     def _file(self, number: int, write: Callable[[Path], dict[str, str] | None]) -> Answer:
-        """Returns an answer with the contents of a temporary file, which `write` fills; `write` may return headers."""
+        """Returns an answer with the contents of a temporary file written by `write`, which may also return headers."""
         file = self.spec.folder.export(secrets.token_hex(4))
         try:
             headers = write(file) or {}
@@ -227,7 +227,7 @@ class QueryReader:
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
-    """Concatenates arrays [H, W] or [H, W, 3] along the channels and returns little-endian float32 bytes and headers.
+    """Concatenates [H, W] or [H, W, 3] arrays along the channel axis; returns little-endian float32 bytes and headers.
 
     X-Shape is "H,W,C", X-Channels lists the names of the C channels, and X-Dtype is "<f4". Rows are stored from top to
     bottom, and channels vary fastest.

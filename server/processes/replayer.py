@@ -1,4 +1,4 @@
-"""Replay process, which repeats a scene's latest updates at low priority to measure other numbers of iterations."""
+"""Replay process, which repeats a scene's latest updates at low priority with different numbers of iterations."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class StateCompactor:
 
         Args:
             history: the scene's committed states.
-            waits: returns whether a message is waiting.
+            waits: function that returns whether a message is waiting.
         """
         exact = self._rules.exact_states
         if self._failed or exact is None:

@@ -38,7 +38,7 @@ log = logging.getLogger("scas4d.server")
 
 
 class DamageKind(StrEnum):
-    """Kinds of damaged files."""
+    """Kind of a damaged file."""
 
     STATE = "state"
     CHECKPOINT = "checkpoint"
@@ -93,11 +93,11 @@ class RepairQueue:
         damage: the scene's damage messages.
         background: the scene's background tasks.
         to_worker: function that sends a message to the worker; returns False if no worker can receive it.
-        recompute: frames whose states were found damaged during recovery, with the reason.
+        recompute: maps each frame whose state was found damaged during recovery to the reason.
 
     Attributes:
         at_work: frame whose state the worker is recomputing, or None.
-        waiting: frames whose states must be recomputed, with the reason. Their images must be kept.
+        waiting: maps each frame whose state must be recomputed to the reason. The images of these frames must be kept.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class RepairQueue:
         """Asks the worker to check unreadable files in the states folder.
 
         Args:
-            files: names of the files, with a description of the fault.
+            files: description of the fault of each file, keyed by file name.
         """
         new = {}
         for name, reason in files.items():
@@ -172,7 +172,7 @@ class RepairQueue:
             self._to_worker(RepairFiles(message, times, known))
 
     def begin(self) -> float:
-        """Sends the next waiting state to an idle worker for recomputation.
+        """Asks the worker, if it is idle, to recompute the next waiting state.
 
         Returns:
             The delay in seconds before the next call of this method if the disk was full, otherwise 0.

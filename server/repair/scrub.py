@@ -105,7 +105,7 @@ class Scrub:
         await self._scrub_frames()
 
     async def _read(self, pieces: Iterator[int], weight: int = 1) -> str | None:
-        """Reads a file to its end and returns its fault, `GONE` if it is missing, or None."""
+        """Reads a file to its end; returns a description of its fault, `GONE` if the file is missing, or None if it is intact."""
         try:
             while (size := await asyncio.to_thread(next, pieces, None)) is not None:
                 counters.SCRUBBED.inc(size)
@@ -177,7 +177,7 @@ class Scrub:
         return False
 
     async def _state(self, path: Path, expected: Callable[[], bool]) -> None:
-        """Scrubs one file of the states; `expected` returns whether a missing file counts as damage."""
+        """Scrubs one state file; `expected` returns whether the file's absence counts as damage."""
         fault = await self._read(iter_verified(path))
         if fault == GONE and await asyncio.to_thread(expected):
             self._repair_queue.report_damage({path.name: f"{path.name} is missing"})

@@ -117,7 +117,7 @@ class Exports:
 
     Args:
         scenes: the service's scene registry.
-        placement: starts the export processes.
+        placement: placement used to start the export processes.
     """
 
     def __init__(self, scenes: Scenes, placement: Placement) -> None:

@@ -27,8 +27,8 @@ class Replays:
     Args:
         spec: scene specification.
         ledger: the scene's ledger.
-        placement: starts the replay processes.
-        damaged: called with a mapping from the name of each unreadable file to the reason.
+        placement: placement used to start the replay processes.
+        damaged: callback for unreadable files; receives the reason for each, keyed by file name.
         background: the scene's background tasks.
 
     Attributes:

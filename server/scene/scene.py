@@ -54,8 +54,8 @@ class Scene:
     Args:
         found: the scene as stored in its folder; a new scene also has a folder.
         server: service settings.
-        placement: starts the scene's processes.
-        hub: publishes the scene's events.
+        placement: placement used to start the scene's processes.
+        hub: hub through which the scene publishes its events.
 
     Attributes:
         has_place: whether the scene has a slot and may have processes; otherwise, it is asleep.

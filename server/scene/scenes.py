@@ -1,4 +1,4 @@
-"""Registry of all scenes, which creates, wakes, restarts and deletes them; a power failure at any point is safe."""
+"""Registry of all scenes; it creates, wakes, restarts and deletes them so that a power failure does no harm."""
 
 from __future__ import annotations
 
@@ -314,7 +314,7 @@ class Scenes:
         """Raises the `Problem` for a scene that does not exist or is not available yet.
 
         Raises:
-            Problem: 404; 503 if scenes are still being recovered.
+            Problem: 503 if the scene may still be in recovery, otherwise 404.
         """
         self.recovering.check(id)
         reason = f": {self.unreadable[id]}" if id in self.unreadable else ""

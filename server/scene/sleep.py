@@ -82,7 +82,7 @@ def was_awake(used: float, settings: ServerSettings) -> bool:
 def status_if_still_asleep(folder: SceneFolder, settings: ServerSettings) -> SceneStatus | None:
     """Returns the cached status of a scene that should stay asleep after a restart of the service, otherwise None.
 
-    Blocking.
+    Blocks.
     """
     if folder.journal.exists() and was_awake(folder.journal.stat().st_mtime, settings):
         return None

@@ -17,7 +17,7 @@ class StartupRecovery:
 
     Args:
         data: the service's data folder.
-        read: loads a scene from its folder; must not raise.
+        read: function that loads a scene from its folder; must not raise.
     """
 
     def __init__(self, data: DataFolder, read: Callable[[SceneFolder], Awaitable[object]]) -> None:

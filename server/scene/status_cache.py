@@ -20,7 +20,7 @@ from server.storage.layout import EXPORT, SceneFolder
 
 
 def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
-    """Writes the status cache of a sleeping scene, ignoring disk errors. Blocking.
+    """Writes the status cache of a sleeping scene, ignoring disk errors. Blocks.
 
     A damaged scene gets no cache, so that every startup checks it again.
 
@@ -39,7 +39,7 @@ def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
 
 
 def read_status_cache(folder: SceneFolder) -> SceneStatus | None:
-    """Returns a scene's status from its cache, or None if the cache is missing or invalid. Blocking."""
+    """Returns a scene's status from its cache, or None if the cache is missing or invalid. Blocks."""
     try:
         data = json.loads(folder.status_cache.read_bytes())
         if blake3(data["card"].encode()).hexdigest() != data["blake3"]:

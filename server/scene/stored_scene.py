@@ -93,11 +93,11 @@ async def create_folder(folder: SceneFolder, definition: Definition) -> StoredSc
 def read_stored_scene(
     folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequence[str] = ()
 ) -> StoredScene:
-    """Loads a scene from its folder. Blocking.
+    """Loads a scene from its folder. Blocks.
 
     Args:
         folder: scene folder.
-        bury: moves a file or folder that is no longer needed to the `deleted` folder under the given name.
+        bury: function that moves an unneeded file or folder to the `deleted` folder under the given name.
         said: messages about damage that was found earlier.
 
     Raises:

@@ -22,8 +22,8 @@ NEAR = 0.1
 def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
     """Returns the reports of the updates whose duration is a valid measurement.
 
-    These were fully committed at the first attempt. The first frame is excluded, and so is the first update, because
-    it runs several times.
+    These updates were fully committed at the first attempt. The first frame is excluded. The first update is also
+    excluded, because it runs several times.
     """
     return [
         report
@@ -45,7 +45,7 @@ def commit_milliseconds(reports: Iterable[FrameReportModel]) -> float:
 
 
 def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
-    """Returns one point for each number of iterations, rounded to two significant digits, and number of threads."""
+    """Returns one point per pair of iteration count, rounded to two significant digits, and thread count."""
     write = commit_milliseconds(reports)
     points = []
     for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
@@ -87,7 +87,7 @@ def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
 def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
     """Fits a time model that is linear in the number of iterations; returns None if there are no loss curves.
 
-    The slope is fitted to the times within each update, and the remaining time is constant.
+    The slope is fitted to the times within each update; the remaining time is assumed to be constant.
     """
     slopes = []
     for report in reports:
@@ -106,7 +106,7 @@ def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
 def extrapolated_points(
     model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None
 ) -> list[TradeoffPoint]:
-    """Returns points with a time but no accuracy for iterations not yet measured with this number of threads."""
+    """Returns points with a time but no accuracy for iteration counts not yet measured with this number of threads."""
     if model is None:
         return []
     there = [point.iterations for point in known if point.threads == threads]

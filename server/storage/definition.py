@@ -132,7 +132,7 @@ def read_definition(folder: SceneFolder) -> tuple[Definition, str | None]:
 
 
 def check_definition(folder: SceneFolder) -> str | None:
-    """Checks `scene.json` and returns a description of its fault, or None."""
+    """Checks `scene.json` and returns a description of its fault, or None if it is intact."""
     return _read_checked(folder)[1]
 
 

@@ -1,7 +1,7 @@
 """Fencing of workers with one state folder per epoch, so that writes of an abandoned worker are never read.
 
 A worker on another machine may hang, be presumed dead, and resume after another worker has taken over its scene. File
-locks do not work across machines, and a check before each write leaves a race. Every worker therefore commits to its
+locks do not work across machines, and checking before each write leaves a race condition. Every worker therefore commits to its
 own folder, `states.EPOCH`. Initially, it contains hard links to the files that the previous worker committed. The
 symbolic link `states` points to the folder of the current worker, and all readers follow it.
 

@@ -1,6 +1,6 @@
 """Frame log of a scene: images as they were uploaded, one record per file, written while they are received.
 
-A file gets its final name immediately and counts as debris until the journal references it. No frame is copied or
+A file gets its final name immediately and is treated as an orphan until the journal references it. No frame is copied or
 renamed, an interrupted write damages at most one record, and retention deletes whole files.
 """
 

@@ -1,4 +1,4 @@
-"""Columnar table of a scene's frames, without disk or clock access; a day at 30 fps has 2.6 million frames.
+"""Columnar table of a scene's frames, without disk or clock access; one day at 30 fps is 2.6 million frames.
 
 Each frame permanently takes 46 bytes. Rare properties (errors, frame log records, worker crashes) are stored in
 dictionaries. Commit records of the newest frames stay in memory; older ones are read from disk.
@@ -38,7 +38,7 @@ FEW_STATES = 32
 
 
 class FrameTable:
-    """Table of the frames of one scene, by index and without gaps.
+    """Table of one scene's frames, indexed without gaps.
 
     Attributes:
         counts: number of frames in each state.
@@ -91,11 +91,11 @@ class FrameTable:
         return (FrameEntry(self, index) for index in sorted(self._files))
 
     def states(self) -> NDArray[np.uint8]:
-        """Returns the state of each frame as an index into `STATES` [N]; a copy."""
+        """Returns a copy of the frame states [N], as indices into `STATES`."""
         return np.frombuffer(bytearray(self._states), np.uint8)
 
     def flagged(self, flag: int) -> NDArray[np.bool_]:
-        """Returns a mask [N] of the frames with the flag; a copy."""
+        """Returns a new mask [N] that is true for the frames with the flag set."""
         flags: NDArray[np.bool_] = (np.frombuffer(bytes(self._flags), np.uint8) & flag) != 0
         return flags
 
@@ -296,7 +296,7 @@ class FrameEntry:
 
     @property
     def receipt(self) -> FrameReceipt | None:
-        """Receipt that was sent to the sender, or None if the frame never arrived or the receipt is lost."""
+        """Receipt that was sent to the client, or None if the frame never arrived or the receipt is lost."""
         identity, time = self.identity, self.time
         if identity is None or time is None:
             return None

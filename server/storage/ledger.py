@@ -182,8 +182,8 @@ class Ledger:
 
         Args:
             indices: frame indices of the readable states, in ascending order.
-            damaged: frame indices of unreadable states, with the reason.
-            recompute: frame indices of damaged or missing states that will be recomputed; they give no events.
+            damaged: maps the frame index of each unreadable state to the reason.
+            recompute: frame indices of damaged or missing states that will be recomputed; they produce no events.
 
         Returns:
             Events that have been applied and must be appended to the journal. They record missing states, and frames

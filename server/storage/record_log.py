@@ -184,7 +184,7 @@ DECIDABLE_BYTES = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
 
 
 class Readable(Protocol):
-    """Protocol of a file that is read in pieces."""
+    """Interface of a file that is read in pieces."""
 
     def read(self, size: int, /) -> bytes:
         """Reads at most `size` bytes; returns no bytes at the end of the file."""

@@ -49,7 +49,7 @@ class Recovered:
         events: events that the journal lacks and that have been applied to the ledger.
         sizes: size in bytes of each record in the frame log, keyed by record name.
         damage: one sentence per fault that was found.
-        recompute: frames whose state is damaged or missing and whose images are stored, with the reason.
+        recompute: maps each frame whose state is damaged or missing, but whose images are stored, to the reason.
         first_report: report of the first readable committed frame; empty if there is none.
     """
 

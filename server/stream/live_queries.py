@@ -1,7 +1,7 @@
 """Live queries for views, tracks and parts; each has at most one query and one message in flight.
 
-A live query is issued only after the previous answer was sent, and requests the frame that is the newest then. Slow
-clients thus cause less load, and a dragged camera is rendered only at its current pose.
+A live query is issued only after the previous answer was sent, and requests whichever frame is newest at that time.
+Slow clients thus cause less load, and a dragged camera is rendered only at its current pose.
 """
 
 from __future__ import annotations

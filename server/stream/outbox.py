@@ -58,7 +58,7 @@ class Outbox:
 
         Args:
             id: id of the subscription.
-            make: builds the message when it is sent.
+            make: function that builds the message when it is sent.
             missed: number of messages that this message replaced before it was added.
             weight: number added to the `missed` count of the next message if this message is replaced before it is
                 sent.

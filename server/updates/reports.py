@@ -29,7 +29,7 @@ class FrameReports:
     Args:
         ledger: the scene's ledger.
         states: folder of the committed states.
-        damaged: called with a mapping from the name of each unreadable file to the reason.
+        damaged: callback for unreadable files; receives the reason for each, keyed by file name.
     """
 
     def __init__(self, ledger: Ledger, states: Path, damaged: Callable[[Mapping[str, str]], None]) -> None:
@@ -71,7 +71,7 @@ class FrameReports:
         return await asyncio.to_thread(self._read, index)
 
     def _read(self, index: int) -> dict[str, Any]:
-        """Reads a commit record. Blocking; see `record`."""
+        """Reads a commit record. Blocks; see `record`."""
         with self._turn:
             try:
                 if self._history is None:

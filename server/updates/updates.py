@@ -61,7 +61,7 @@ class Updates:
         first: initial value of the attribute `first`.
 
     Attributes:
-        clock: predicts when the current update ends.
+        clock: predictor of when the current update ends.
         worker: supervisor of the worker process.
         progress: progress of frame 0 while it is being reconstructed, otherwise None.
         first: facts about the first frame; see `first_frame_facts`.
@@ -131,7 +131,7 @@ class Updates:
         return [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
 
     def begin(self) -> None:
-        """Sends the next waiting frame to the worker if it is idle; call this whenever either may have changed."""
+        """Sends the next waiting frame to an idle worker; call this whenever the queue or the worker's state may change."""
         if self._stopped:
             return
         self._publisher.publish_status()

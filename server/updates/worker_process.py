@@ -93,7 +93,7 @@ class WorkerProcess:
 
     Args:
         spec: scene specification; a change takes effect at the next start.
-        placement: starts the process.
+        placement: placement used to start the process.
 
     Attributes:
         ready: whether the process has loaded the scene; set by the receiver of its `Ready` message.
@@ -122,8 +122,8 @@ class WorkerProcess:
         """Sets the callbacks; call this once, before the first start.
 
         Args:
-            received: called with every message from the process.
-            ended: called when the process exits unexpectedly; it must call `start_in` to start the next process.
+            received: callback that receives every message from the process.
+            ended: callback for an unexpected exit of the process; it must call `start_in` to start the next process.
         """
         self._received, self._ended = received, ended
 

@@ -45,12 +45,12 @@ def framed(head) -> bytes:
         (b"PK\3\4aaaaaaaa", "S4DF"),
         (PREFIX.pack(b"S4DF", MAX_HEAD + 1), "at most"),
         (framed([]), "head"),
-        (framed({"index": -1, "files": [{"camera": "a", "size": 0}]}), "head.index"),
-        (framed({"index": 0, "files": []}), "head.files"),
-        (framed({"index": 0, "files": [{"camera": "../a", "size": 0}]}), "head.files.0.camera"),
-        (framed({"index": 0, "files": [{"camera": "a", "size": -1}]}), "head.files.0.size"),
+        (framed({"index": -1, "files": [{"camera": "a", "size": 0}]}), "header field index"),
+        (framed({"index": 0, "files": []}), "header field files"),
+        (framed({"index": 0, "files": [{"camera": "../a", "size": 0}]}), "header field files.0.camera"),
+        (framed({"index": 0, "files": [{"camera": "a", "size": -1}]}), "header field files.0.size"),
         (framed({"index": 0, "time": float("nan"), "files": [{"camera": "a", "size": 0}]}), "head"),
-        (framed({"index": 0, "files": [{"camera": "a", "size": 0}], "more": 1}), "head.more"),
+        (framed({"index": 0, "files": [{"camera": "a", "size": 0}], "more": 1}), "header field more"),
     ],
 )
 def test_a_head_that_is_none_is_refused_by_name(data, match):

@@ -202,7 +202,7 @@ def test_a_scene_is_exported_by_the_command(service, finished, tmp_path, monkeyp
         (("--format", "obj"), "unknown format"),
         (("--format", "ply", "--frames", "7:9"), "7"),
         (("--format", "ply", "--frames", "x"), "not a valid range"),
-        (("--format", "ply", "--id", "3"), "leave --id out"),
+        (("--format", "ply", "--id", "3"), "omit --id"),
         (("--format", "usd", "--out", "a.ply"), ".usdc"),
     ):
         failed = run(*wrong)
