@@ -115,12 +115,12 @@ class Camera:
 
     @property
     def cx(self) -> float:
-        """Principal point in pixels from the left edge of the image."""
+        """Distance of the principal point from the left edge of the image, in pixels."""
         return float(self.intrinsics[0, 2])
 
     @property
     def cy(self) -> float:
-        """Principal point in pixels from the top edge of the image."""
+        """Distance of the principal point from the top edge of the image, in pixels."""
         return float(self.intrinsics[1, 2])
 
     @property

@@ -47,8 +47,9 @@ class CarryOver:
         motion: motion of the last update, or None if the next update is a cold start.
         labels: [N] bool, true for Gaussians that have moved at least once; None in scenes with masks, and before the
             first motion.
-        seen: views with which the next frame is compared, in scenes without masks: those of the last accepted frame.
-            Until the first motion is detected, the views of the first frame are kept, so that slow motion accumulates.
+        seen: views with which the next frame is compared, in scenes without masks. These are the views of the last
+            accepted frame. Until the first motion is detected, the views of the first frame are kept, so that slow
+            motion accumulates.
         structure: digest of the clusters and neighbours for which ``motion`` is valid.
         past: statistics of the scene and its cameras over the previous frames.
         shown: fingerprint of each camera's image in the last accepted frame (``robust.checks``).
@@ -191,7 +192,7 @@ class Checkpoints:
 
 
 def _packed(motion: Motion) -> dict[str, Any]:
-    """Returns the fields of a motion as named arrays: numbers, arrays and lists of arrays."""
+    """Returns the fields of a motion (numbers, arrays and lists of arrays) as named arrays."""
     packed: dict[str, Any] = {}
     for item in fields(motion):
         value = getattr(motion, item.name)
@@ -204,7 +205,7 @@ def _packed(motion: Motion) -> dict[str, Any]:
 
 
 def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
-    """Returns the arrays of the effects in a checkpoint, keyed by effect and array name."""
+    """Returns the effect arrays in a checkpoint, keyed by effect and array name."""
     effects: dict[str, Arrays] = {}
     for key, array in arrays.items():
         kind, _, rest = key.partition(".")

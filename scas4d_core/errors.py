@@ -1,4 +1,4 @@
-"""Errors that state a problem and its remedy, and error messages without local paths. Needs no third-party packages."""
+"""Errors that state a problem and its remedy, and error messages without local paths. No third-party dependencies."""
 
 from __future__ import annotations
 

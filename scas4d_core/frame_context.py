@@ -58,7 +58,7 @@ class FrameContext:
 
     Attributes:
         frame: the frame, with decoded images.
-        watch: stopwatch for the stages.
+        watch: stopwatch that times the stages.
         dropped: maps each camera excluded by the caller to the reason.
         notes: additional JSON data to commit.
         frame_input: measurements of the images, set by the "observe" stage.

@@ -12,11 +12,11 @@ REJECTED_TEXT = "previous state kept: "
 
 
 OTHER_ORDERS = "other orders"
-"""Name of the report stage for the time that a first update spends on discarded view orders."""
+"""Name of the report stage that measures the time a first update spends on discarded view orders."""
 
 
 class Candidate(StrEnum):
-    """Candidate for Θ_t; the one with the smallest error on the probe views is kept. Values are stored on disk."""
+    """Candidate for Θ_t; the candidate with the lowest error on the probe views is kept. Values are stored on disk."""
 
     END = "end"
     """The state at the end of the update."""
@@ -43,7 +43,7 @@ class FrameOutcome(StrEnum):
     RELOCATED = "relocated"
     """Committed after a longer search, because the regular update did not match the frame."""
     ACCEPTED = "accepted"
-    """Committed although it does not match the images, as the last of `max_rejected_frames` frames that did not fit."""
+    """Committed although it does not match the images, as the last of `max_rejected_frames` misfits in a row."""
     REJECTED_UNUSABLE = "rejected_unusable"
     """Θ_{t−1} is kept: the images are too dark or too bright to learn from."""
     REJECTED_IMPLAUSIBLE = "rejected_implausible"
@@ -73,7 +73,7 @@ class AlarmKind(StrEnum):
     CAMERA_LEFT_OUT = "camera_left_out"
     """Nothing was learnt from the camera: its image is missing or was excluded."""
     CAMERA_MISFIT = "camera_misfit"
-    """The camera's image fits worse than usual compared with the other cameras: it may have moved, be dirty or lag."""
+    """The camera's image fits worse than usual relative to the others: the camera may have moved, be dirty or lag."""
     CAMERA_COLOURS = "camera_colours"
     """The camera's colours (exposure or white balance) deviate from its earlier images and from the other cameras."""
     CAMERA_SHARPNESS = "camera_sharpness"
@@ -131,8 +131,8 @@ def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
 
 
 COVERS_LITTLE = 0.25
-"""Minimum fraction of the images covered by initial points that several cameras confirm. Below it, frame 0 is partly a
-guess; above it, no other methods are needed (``first_frame.initial_points``).
+"""Minimum fraction of the image area covered by initial points that several cameras confirm. Below it, frame 0 is
+partly a guess; above it, no other methods are needed (``first_frame.initial_points``).
 """
 
 
@@ -210,8 +210,8 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
     """Returns a list with a warning about cameras that are clearly out of step, or an empty list.
 
-    This is a lasting fault of the rig rather than of one frame. The scene status shows a constant message while the
-    fault lasts; the report has the figures, which change from frame to frame.
+    Being out of step is a lasting fault of the rig rather than of one frame. The scene status shows a constant message
+    while the fault lasts; the report has the figures, which change from frame to frame.
 
     Args:
         timing: ``timing`` entry of the newest report, or None if it has none.

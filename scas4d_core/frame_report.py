@@ -64,10 +64,10 @@ class FrameReport:
         seconds: duration of each stage in seconds; ``report`` covers compiling this report and writing the previous
             one.
         loss: weighted loss of each iteration; for frame 0, at most ``REPORTED_LOSSES`` means.
-        psnr: mean PSNR in dB over the views of the last iterations, as rendered at the time; NaN if not measured.
+        psnr: mean PSNR in dB over the views of the last iterations, as rendered at that time; NaN if not measured.
         moving: number of moving Gaussians.
         gaussians: number of present Gaussians.
-        cameras: quality of the match with each camera's image when last rendered, which reveals bumped cameras.
+        cameras: quality of the match with each camera's image when last rendered; reveals cameras that were bumped.
         used: cameras from which the update learnt; empty for a rejected or skipped frame.
         dropped: maps each excluded camera to the reason.
         outcome: outcome of the frame.
@@ -78,7 +78,7 @@ class FrameReport:
             colours.
         frozen: number of individual Gaussians that keep their previous state.
         guards: number of times each guard acted.
-        planned: (iteration, total iterations) each time the stopping rule or the time limit of frame 0 changes the
+        planned: (iteration, total iterations) for each time the stopping rule or the time limit of frame 0 changes the
             total.
         curve: loss curve of the last attempt.
         errors: mean image loss of each candidate on the probe views, for images without the ``exposure`` gain.
@@ -273,7 +273,7 @@ def means(values: list[float], most: int) -> list[float]:
 
 
 def curve(losses: list[float], moments: list[float]) -> list[CurvePoint]:
-    """Returns the loss curve of an update, given the loss and the end time in seconds of each iteration."""
+    """Returns the loss curve of an update, given each iteration's loss and its end time in seconds."""
     ends = np.unique(np.linspace(0, len(moments), CHECKPOINTS + 1).round().astype(int))
     return [
         CurvePoint(iterations=int(end), milliseconds=1000 * moments[end - 1], loss=float(np.mean(losses[begin:end])))

@@ -231,7 +231,7 @@ def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def moving_extent(gaussians: Gaussians) -> float:
-    """Returns the longest side, in metres, of the box with the central 98 % of the moving Gaussians along each axis.
+    """Returns the longest side, in metres, of the box spanned by the central 98 % of moving Gaussians along each axis.
 
     If no Gaussian is moving, all present Gaussians are used; if none is present, all Gaussians are used.
 

@@ -148,7 +148,7 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
     """Returns the visibility of points [P, 3] in each view; the points themselves are the occluders.
 
-    A point is hidden if it is more than four disc diameters behind the nearest one; see ``front_depth``. Surfaces
+    A point is hidden if it is more than four disc diameters behind the nearest point; see ``front_depth``. Surfaces
     seen at more than about 60 degrees from their normal may count as hidden, but their colour is unreliable anyway.
 
     Returns:

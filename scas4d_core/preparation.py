@@ -1,4 +1,4 @@
-"""Prepares the updates of a scene: clusters and neighbours of moving Gaussians, and the parts of active effects.
+"""Prepares the updates of a scene: clusters and neighbours of moving Gaussians, and the components of active effects.
 
 They are rebuilt when more Gaussians are found to move, when an effect is switched on or off, and when Gaussians are
 added or retired. They are built from the scene's *roots*: Θ_0 plus the Gaussians added since, at the positions they
@@ -129,7 +129,7 @@ class Preparation:
 
         Args:
             frame: frame at its original resolution.
-            fixed: [3, 2] colour gain and offset of each camera, as estimated in frame 0.
+            fixed: maps each camera to its [3, 2] colour gain and offset, as estimated in frame 0.
             prepared: current input of the next update.
 
         Raises:
@@ -141,7 +141,7 @@ class Preparation:
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
     def rebuild(self, roots: Gaussians, carried: CarryOver) -> PreparedUpdate:
-        """Rebuilds the next update; carried-over motion is dropped if the clusters have changed.
+        """Rebuilds the input of the next update; carried-over motion is dropped if the clusters have changed.
 
         Args:
             roots: Θ_0 plus all Gaussians added since.
@@ -213,7 +213,7 @@ class Preparation:
     def after_frame(
         self, prepared: PreparedUpdate, seen: FrameObservation, may_change_population: bool
     ) -> tuple[UpdateResult, PreparedUpdate]:
-        """Returns the result of a learnt frame, and the input of the next update.
+        """Returns the final result of a frame that was learnt, and the input of the next update.
 
         Args:
             prepared: input of the update that produced the result.
@@ -285,7 +285,7 @@ def _with_changed_rows(
 
 
 def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: UpdateResult) -> PreparedUpdate:
-    """Adds the motion between the previous and the new state, in the clusters of the updater."""
+    """Adds the motion from the previous to the new state, expressed per cluster of the updater."""
     if seen.result.motion is None:
         return prepared
     before, now, hierarchy = seen.result.gaussians, result.gaussians, prepared.updater.hierarchy
@@ -311,7 +311,7 @@ def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
 
 
 def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
-    """Returns an array of an effect, extended by the added Gaussians if it has one row per Gaussian."""
+    """Returns an effect's array, with rows appended for added Gaussians if it has one row per Gaussian."""
     if parents is None or not array.ndim or len(array) != count:
         return array
     rows = array[np.maximum(parents, 0)]

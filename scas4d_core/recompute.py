@@ -1,7 +1,7 @@
 """Recomputes a committed state from the images of its frame after the state was damaged on disk.
 
-The recomputed state is a cold start from the previous state. It looks the same but is not bit-identical, and its report
-contains ``recomputed``. Later states were computed from the original state and do not change.
+The recomputed state comes from a cold start at the previous state. It looks like the original but is not bit-identical,
+and its report contains ``recomputed``. Later states were computed from the original state and do not change.
 """
 
 from __future__ import annotations

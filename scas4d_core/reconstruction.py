@@ -271,7 +271,7 @@ class Reconstruction(CommittedScene):
         notes: Mapping[str, Any] | None = None,
         started: float | None = None,
     ) -> FrameReport:
-        """Updates the state to a frame and commits it; a frame that does not fit is rejected entirely or in part.
+        """Updates the state to fit a frame and commits it; a frame that does not fit is rejected entirely or in part.
 
         Args:
             frame: next frame, later than the last one, with an image of at least one camera.
@@ -340,7 +340,7 @@ class Reconstruction(CommittedScene):
         )
 
     def _solve(self, context: FrameContext) -> None:
-        """Updates Θ_{t−1} to the frame; a rejected frame changes nothing."""
+        """Updates Θ_{t−1} to fit the frame; a rejected frame changes nothing."""
         solver = FrameSolver(context.prepared.updater, self._factory, self._renderer, self._update)
         result, context.past = solver.run(context.update_input)
         context.check_seconds = solver.check_seconds

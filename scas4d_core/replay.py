@@ -83,7 +83,7 @@ def replay(
 
 
 def summary(iterations: int, reports: Sequence[FrameReport]) -> ReplayResult:
-    """Summarizes reports; retried or degraded frames count only if all frames are retried or degraded."""
+    """Summarizes reports; retried or degraded frames are included only if there are no others."""
     clean = [report for report in reports if report.degraded is None and len(report.attempts) <= 1] or reports
     errors = [report.errors[report.candidate] for report in clean if report.candidate in report.errors]
     return ReplayResult(

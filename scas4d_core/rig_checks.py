@@ -20,7 +20,7 @@ SMALLEST_SIDE = 11
 """
 FOCAL_LENGTHS = (0.05, 1000.0)
 """Range of focal lengths as multiples of the longer image side, for fields of view from 169° to 0.06°. Only
-near-orthographic lenses are excluded; a rig that films flies has 17."""
+near-orthographic lenses are excluded; a rig that films flies reaches 17."""
 RADII = (1e-6, 1e9)
 """Range of rig radii in metres; outside it, the unit is wrong, and float32 is too coarse for the scene."""
 
@@ -28,8 +28,9 @@ FEW_SEE, MAX_SEE = 0.25, 0.9
 """Fractions of cameras that see the common point of all viewing axes. Poses are suspect if few cameras see it with the
 given poses, but nearly all would see it with inverted poses."""
 POINTS_SEEN = 0.2
-"""Minimum fraction of camera–point pairs in view with inverted poses; with the given poses, it must be at most
-``FEW_SEE`` times as large. Point clouds of rooms extend beyond the images: a third of `basketball` is in view."""
+"""Minimum fraction of camera–point pairs in view with inverted poses for a warning. With the given poses, the fraction
+must be at most ``FEW_SEE`` times as large. Point clouds of rooms extend beyond the images: a third of `basketball` is
+in view."""
 LEAST_CAMERAS = 3
 """Minimum number of cameras for a check without points, because any two axes come close to each other somewhere."""
 NOT_PARALLEL = 1e-3
@@ -51,7 +52,7 @@ USUAL_RADIUS = 60.0
 
 
 class RigError(CameraError):
-    """Raised if a rig, or its settings, are unusable.
+    """Raised if a rig or its settings are unusable.
 
     Attributes:
         field: dotted name of the field, as in a request to the service.
@@ -245,7 +246,7 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
-    """Returns warnings about poses that appear to be inverted (camera to world), or an empty list without evidence.
+    """Returns warnings about poses that appear to be inverted (camera to world), or an empty list if none do.
 
     With points, the evidence is that few of them are in view, but many would be with inverted poses. Without points,
     the evidence is that the viewing axes meet neither in front of nor behind the cameras, but would meet in nearly all

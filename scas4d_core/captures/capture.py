@@ -1,4 +1,4 @@
-"""`Capture`, a sequence of images from one rig that are decoded lazily on access."""
+"""`Capture`, a sequence of frames from one rig whose images are decoded lazily on access."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Capture:
         return self._frame(index, self.full_rig)
 
     def test_frame(self, index: int) -> Frame:
-        """Returns the test images of one frame, with any masks. They must only be used for evaluation.
+        """Returns the test images of one frame, and their masks if available. Only use them for evaluation.
 
         Raises:
             IndexError: if the frame does not exist.
@@ -144,7 +144,7 @@ class Capture:
         return replace(self, image_scale=image_scale, ground_truth=truth)
 
     def with_held_out(self, names: Collection[str]) -> Capture:
-        """Returns the capture with the named cameras moved from the training to the test cameras.
+        """Returns a copy of the capture in which the named cameras are test cameras instead of training cameras.
 
         Raises:
             CaptureError: if a camera does not exist, or no training camera would be left.

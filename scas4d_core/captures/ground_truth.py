@@ -45,7 +45,7 @@ class GroundTruth:
         visible: [T, C, P] bool, whether each point is inside the image and not occluded.
         cameras: camera names along axis C, both training and test cameras.
         parts: parts of the scene; empty if the capture lists none.
-        label_files: maps each camera name to its label images of all frames; empty if the capture has none.
+        label_files: maps each camera name to the paths of its label images, one per frame; empty if there are none.
         image_size: maps each camera name to its full and scaled (width, height); labels are resized from full to
             scaled.
 
@@ -67,7 +67,7 @@ class GroundTruth:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[P] bool, whether each point moves from its position in frame 0.
+        """[P] bool, whether each point ever leaves its position in frame 0.
 
         Displacements of up to 10⁻⁶ of the longest side of the bounding box of all points are ignored.
         """
@@ -92,7 +92,7 @@ class GroundTruth:
         return tuple(self.label_files)
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint8]:
-        """Returns the part id of each pixel in a frame, [H, W] uint8, with 0 for no part.
+        """Returns the part id of each pixel in a frame, [H, W] uint8, or 0 where there is no part.
 
         Labels are resized by sampling, not averaging.
 

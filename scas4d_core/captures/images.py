@@ -1,6 +1,6 @@
 """Decodes and resizes images and masks. Requires only NumPy and Pillow.
 
-How the content of an image file is handled:
+Image files are handled as follows:
 
 ======================  ====================================================================================
 EXIF orientation ≠ 1    rejected: intrinsics are valid for one orientation of the pixels only, and the file
@@ -57,7 +57,7 @@ def decode_image(
     Args:
         source: image file, as bytes or as a path.
         size: required (width, height) of the file in pixels, before scaling; not checked if None.
-        image_scale: scale factor; the image is resized by area averaging to the size of `Camera.scaled`.
+        image_scale: scale factor; the image is resized by area averaging to the size given by `Camera.scaled`.
         name: name of the image in error messages; defaults to the path.
 
     Returns:
@@ -242,7 +242,7 @@ def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
     """Returns the names of cameras with greyscale images if others have colour images. Ignores images without contrast.
 
     Args:
-        images: maps each camera name to its image [H, W, 3]. Because of sensor noise, an image from a colour camera is
+        images: maps each camera name to its image [H, W, 3]. Sensor noise ensures that an image from a colour camera is
             never grey in every pixel.
 
     >>> grey = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)[..., :1].repeat(3, axis=2)

@@ -62,7 +62,7 @@ class FileReader:
 
     Args:
         images: one mapping per frame, from camera name to image file.
-        masks: one mapping per frame, from camera name to mask file; a frame may lack masks of some cameras.
+        masks: one mapping per frame, from camera name to mask file; a frame may lack masks for some cameras.
         sizes: maps each camera name to the required (width, height) of its files.
     """
 

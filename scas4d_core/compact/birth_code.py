@@ -49,7 +49,7 @@ SHORTEST = 1e-30
 TINIEST, LARGEST_SIZE = 1e-18, 1e18
 """Range of quantizable sizes, in metres; Gaussians outside it are coded exactly."""
 OPAQUE = 1e-4
-"""Minimum distance of a decoded opacity from 0 and 1."""
+"""Minimum margin between a decoded opacity and the limits 0 and 1."""
 COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3, "labels": 1, "opacities": 1}
 
 
@@ -120,7 +120,7 @@ def _axis_step(bounds: Bounds) -> float:
 
 
 def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
-    """Returns each attribute as [P, N] quantization steps, which may still be non-finite or too large."""
+    """Returns each attribute [P, N] in quantization steps, including non-finite and too large values."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         factors = state.factors.astype(np.float64).reshape(3, 3, -1)
         lengths = np.rint(OCTAVE * np.log2(np.maximum(np.sqrt(np.square(factors).sum(axis=0)), SHORTEST)))

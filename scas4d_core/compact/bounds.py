@@ -64,4 +64,4 @@ class Bounds:
 LEAST = 1e-6
 """Smallest allowed bound; finer steps would exceed float32 precision."""
 MIN_ROTATION = 0.002
-"""Smallest allowed rotation bound; with smaller steps, a half turn would exceed the integer range of a plane."""
+"""Smallest allowed rotation bound; with a smaller one, a half turn would exceed the integer range of a plane."""

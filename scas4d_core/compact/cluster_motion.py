@@ -31,7 +31,7 @@ ROUNDS, SAMPLE = 5, 20_000
 NO_CLUSTER = 0
 """Label of Gaussians without a cluster; clusters are numbered from 1."""
 SMALLEST = 1e-9
-"""Lower limit on sizes in metres when computing weights, so that tiny Gaussians do not dominate."""
+"""Lower limit on the sizes used to compute weights, in metres; prevents tiny Gaussians from dominating."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 """The identity quaternion."""
 RIDGE = 1e-3
@@ -59,7 +59,7 @@ class Clusters:
         return int(self.labels.max(initial=0))
 
     def sums(self, columns: Iterable[NDArray[Any]]) -> Float:
-        """Sums each column [N] over each cluster; returns [P, count]."""
+        """Sums each of P columns [N] over each cluster; returns [P, count]."""
         totals = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
         return np.array(totals, np.float64)
 
@@ -73,7 +73,7 @@ class Clusters:
         return self.sums(columns) / self.sizes
 
     def spread(self, values: NDArray[Any], stands: float) -> Array:
-        """Expands cluster values [count] to the Gaussians, [N] float32; static Gaussians get ``stands``."""
+        """Maps values per cluster [count] to values per Gaussian, [N] float32; static Gaussians get ``stands``."""
         table = np.empty(self.count + 1, np.float32)
         table[NO_CLUSTER], table[1:] = stands, values
         return table[self.labels]

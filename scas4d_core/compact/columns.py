@@ -15,7 +15,7 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 LABELS = 64
-"""Number of quantization levels of the learnt label; the threshold for moving Gaussians, 0.5, is between two levels."""
+"""Number of quantization levels of the learnt label; the moving threshold, 0.5, lies between two levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Columns:
         factors: [9, N] entries of F in row-major order.
         rotations: [4, N] material rotations as quaternions (w, x, y, z).
         colours: [3, N] RGB colours.
-        foreground: [N] learnt labels; Gaussians above 0.5 move.
+        foreground: [N] learnt labels; a Gaussian moves if its label is above 0.5.
         ids: [N] Gaussian ids.
         opacities: [N] opacities; retired Gaussians keep their opacity.
         retired: [N] bool, whether each Gaussian is retired.
@@ -210,7 +210,7 @@ def relative_rotations(after: Array, before: Array) -> Float:
 
 
 def rotation_vectors(turns: NDArray[Any]) -> NDArray[Any]:
-    """Converts rotations [4, N] to vectors [3, N]: 2 tan(θ/2) times the axis, with length near θ for small angles."""
+    """Converts rotations [4, N] to vectors [3, N]: the axis times 2 tan(θ/2), which is close to θ for small angles."""
     w = turns[0]
     return np.asarray(turns[1:] * (2 * np.where(w < 0, -1, 1) / np.maximum(np.abs(w), 1e-6)))
 

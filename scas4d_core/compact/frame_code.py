@@ -1,4 +1,4 @@
-"""Encodes a state as cluster motion and per-Gaussian residuals, relative to a reference that the reader also has.
+"""Encodes a state as cluster motion and per-Gaussian residuals, relative to a reference known to the reader.
 
 The reference is a decoded state, so errors do not accumulate: each frame corrects the errors of the previous one.
 Requires only NumPy.
@@ -36,7 +36,7 @@ Float = NDArray[np.float64]
 MIN_VOLUME_RATIO = 0.1
 """Minimum ratio of decoded to true volume; its inverse is the maximum. Gaussians outside this range are coded exactly.
 
-This affects thin Gaussians whose axis error is as large as the axis: they would lose their volume or be inverted.
+This concerns thin Gaussians whose axis error is as large as the axis itself; they would otherwise collapse or invert.
 """
 SLACK = 1 + 1e-4
 """Factor by which bounds are relaxed to allow for float32 rounding."""
@@ -45,9 +45,9 @@ SHIFT_STEP = 0.5
 LARGEST_STEP = 1e90
 """Exclusive upper bound on valid steps; larger steps would produce non-finite states."""
 COARSEST = 0.01
-"""Maximum quantization step of A."""
+"""Maximum quantization step of A, the matrix of a cluster's affine map."""
 _STEPS = struct.Struct("<dd")
-"""Quantization steps of A and t."""
+"""Quantization steps of the matrix A and the translation t of a cluster's affine map."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class EncodedFrame:
 
 
 def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds) -> EncodedFrame:
-    """Encodes a state that has the same Gaussians as the reference.
+    """Encodes a state that consists of the same Gaussians as the reference.
 
     Args:
         reference: reference state of N Gaussians, as decoded by the reader.
@@ -130,8 +130,8 @@ class FrameDelta:
         steps: quantization steps of A and t.
         motion: [12, clusters] A and t of each cluster, in quantization steps.
         residuals: maps each attribute to its coded rows [R] and their quantized residuals [P, R].
-        rows, values: exactly coded rows [E] and their values [12, E].
-        retired, environment: new values, or None if unchanged.
+        rows, values: indices [E] of the exactly coded rows, and the values [12, E] in these rows.
+        retired, environment: new retired mask and environment map, each None if unchanged.
     """
 
     steps: tuple[float, float]
@@ -214,7 +214,7 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
 def apply_deltas(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[FrameDelta]) -> Columns:
     """Applies successive changes to the same Gaussians.
 
-    Only Gaussians in a cluster, or with coded shape changes, are processed for shape.
+    Shapes are computed only for Gaussians that belong to a cluster or have coded shape changes.
     """
     if _codes_all_rows(reference, clusters):
         for change in changes:
@@ -267,7 +267,7 @@ def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _codes_all_rows(reference: Columns, clusters: Clusters) -> bool:
-    """Returns whether to code all rows. If all move or there is gloss, searching for static rows would waste time."""
+    """Returns whether to code all rows without a search for static ones, because all of them move or there is gloss."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 
@@ -277,7 +277,8 @@ def _changing(
     """Finds the Gaussians whose shape or position must be coded because they move or exceed the bounds.
 
     Returns:
-        The rows of these Gaussians [E] (None for all rows), and the largest error of each attribute over all others.
+        The rows [E] of these Gaussians, or None for all rows, and the largest error of each attribute over all
+        other Gaussians.
     """
     if _codes_all_rows(reference, clusters):
         return None, {}
@@ -296,7 +297,7 @@ def _predict(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], 
 
 
 def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[float, float]:
-    """Returns the quantization steps of A and t. One step moves a Gaussian by a fraction of its own position step."""
+    """Returns the quantization steps of A and t; one step moves a Gaussian by a fraction of its own position step."""
     moving = clusters.labels > 0
     if not moving.any():
         return 1.0, 1.0
@@ -337,7 +338,7 @@ def apply_exact(
 
     Args:
         state: state to change.
-        rows, values: rows [E], and their centres and axes [12, E], or None for no rows.
+        rows, values: row indices [E], and the centres and axes [12, E] of these rows, or None for no rows.
         retired, environment: new values; None keeps the current ones.
     """
     if rows is not None and values is not None and len(rows):

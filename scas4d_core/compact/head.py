@@ -64,7 +64,7 @@ class FileHeader:
 
         Args:
             text: serialized header.
-            name: name of the file, for messages.
+            name: name of the file, used in error messages.
 
         Raises:
             FileError: if the text is not a valid header.

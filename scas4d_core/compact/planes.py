@@ -19,7 +19,7 @@ Unsigned = NDArray[np.uint32]
 LEVEL = 3
 """Zstandard compression level; higher levels take several times as long and save one to two percent."""
 NARROW = (2, 4, 8)
-"""Possible numbers of bits per value; 0 marks an all-zero plane."""
+"""Supported numbers of bits per value; 0 marks an all-zero plane."""
 WIDE = 16
 """Mode of a plane that is split in two: the low bytes, and a plane of the remaining bits."""
 ESCAPE = 24
@@ -27,7 +27,7 @@ ESCAPE = 24
 MOST = 1 << 31
 """Exclusive upper bound on the absolute value of an encoded integer."""
 _HEAD = struct.Struct("<BII")
-"""Mode, number of escapes, and size in bytes of the data that follows (in a wide plane, of its low bytes)."""
+"""Mode, number of escapes, and size of the following data in bytes (for a wide plane, only of its low bytes)."""
 
 
 class PlaneError(ValueError):
@@ -74,7 +74,7 @@ def unpack(data: bytes | memoryview, count: int, offset: int = 0) -> tuple[Ints,
 
 
 def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> tuple[Unsigned, int]:
-    """Decodes unsigned values; ``wider`` limits how many more planes may be nested."""
+    """Decodes unsigned values; ``wider`` limits the number of nested planes."""
     if len(data) < offset + _HEAD.size:
         raise PlaneError(f"unexpected end of data at byte {len(data)}, inside a plane")
     bits, escapes, size = _HEAD.unpack_from(data, offset)
@@ -106,11 +106,10 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(data: bytes | memoryview, size: int) -> bytes:
-    """Decompresses a zstandard frame that contains exactly ``size`` bytes.
+    """Decompresses a zstandard frame that contains exactly ``size`` bytes, without allocating more than that.
 
     Raises:
-        PlaneError: if the frame contains a different number of bytes, or is damaged. At most ``size`` bytes are
-            allocated.
+        PlaneError: if the frame contains a different number of bytes, or is damaged.
     """
     try:
         if zstandard.frame_content_size(data) != size:
@@ -124,7 +123,7 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
 
 
 def _bits(unsigned: Unsigned) -> int:
-    """Returns the packing with the smallest size, estimated from the entropy of the values and the cost of escapes."""
+    """Returns the packing mode with the smallest size, estimated from the values' entropy and the cost of escapes."""
     count = len(unsigned)
     below = np.bincount(np.minimum(unsigned, 256), minlength=257)
     costs = []

@@ -40,7 +40,7 @@ STATES = (RecordKind.KEY, RecordKind.DELTA)
 AT_ONCE = 8
 """Maximum number of states decoded together."""
 MAX_PER_BYTE = 4
-"""Maximum plausible number of Gaussians per byte, so that a corrupt count cannot exhaust memory."""
+"""Maximum plausible number of Gaussians per byte; prevents a corrupt count from exhausting memory."""
 
 
 class CompactReader:
@@ -212,7 +212,7 @@ class CompactReader:
         return copied
 
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
-        """Returns the part labels [N] (−1 for none) most recently stored up to a frame, or None if there are none."""
+        """Returns the latest part labels [N] stored up to a frame (−1 for no part), or None if there are none."""
         records = [record for record in self._parts if index is None or record.frame <= index]
         if not records:
             return None
@@ -231,7 +231,7 @@ class CompactReader:
         return self._whole
 
     def encoder_state(self) -> EncoderState:
-        """Returns the state that a writer needs to append to the file, which must contain a state."""
+        """Returns the state that a writer needs to append to the file; the file must contain at least one frame."""
         place = len(self._states) - 1
         self.state(self._frames[place])
         record, columns = self._states[place], self._last
@@ -248,7 +248,7 @@ class CompactReader:
         return [(one.frame, one.end - before, one.checksum) for one, before in zip(self._states, ends, strict=False)]
 
     def end_before(self, index: int) -> int:
-        """Returns the number of bytes before the records of a frame."""
+        """Returns the file offset at which the records of a frame begin."""
         return min(one.offset - HEAD_SIZE for one in self._records if one.frame >= index)
 
     def note(self, index: int) -> dict[str, Any]:

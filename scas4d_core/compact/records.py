@@ -1,4 +1,4 @@
-"""Records of a compact file: a checksummed header, which suffices to list the records, and a body.
+"""Records of a compact file, each with a checksummed header and a body; the headers suffice to list the records.
 
 A file can be read while it is being written: an incomplete record at its end is ignored. Any other damage is reported
 with its offset.
@@ -25,16 +25,16 @@ _CHECKSUM = struct.Struct("<I")
 HEAD_SIZE = _HEAD.size + _CHECKSUM.size
 COUNT_BYTES = 4
 LONGEST = 1 << 24
-"""Maximum size of a note's text in bytes, so that a damaged file cannot exhaust memory."""
+"""Maximum size of a note's text, in bytes; prevents a damaged file from exhausting memory."""
 
 
 class RecordKind(IntEnum):
-    """Kinds of records, which determine the content of the body."""
+    """Kind of a record, which determines the content of its body."""
 
     HEAD = 1
     """JSON: version, world, bounds."""
     BORN = 2
-    """Gaussians coded without a reference, either the first frame's Gaussians or newborn ones."""
+    """Gaussians coded without a reference, either those of the first frame or newborn ones."""
     KEY = 3
     """A key state, coded relative to the birth records of its Gaussians."""
     DELTA = 4
@@ -81,7 +81,7 @@ class Record:
 
     @property
     def end(self) -> int:
-        """Offset of the end of the body in the file."""
+        """File offset of the end of the body."""
         return self.offset + self.size
 
     def at(self, offset: int) -> Record:
@@ -103,7 +103,7 @@ def record_bytes(kind: RecordKind, body: bytes, frame: int = -1, time: float = 0
 
 
 def checksum_bytes(record: Record) -> bytes:
-    """Returns the checksum of a record's body as bytes; a delta begins with the checksum of the previous state."""
+    """Returns the checksum of a record's body as bytes; a delta's body begins with that of the previous state."""
     return _CHECKSUM.pack(record.checksum)
 
 
@@ -111,12 +111,12 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
     """Yields the complete records from an offset onwards; an incomplete record at the end is ignored.
 
     Args:
-        file: the open file.
+        file: open file to read from.
         offset: offset of the first record to read.
-        name: name of the file, for messages.
+        name: name of the file, used in error messages.
 
     Raises:
-        DamagedFileError: if there is no valid record where one should begin.
+        DamagedFileError: if there is no valid record at an offset where one is expected.
     """
     file.seek(0, 2)
     size = file.tell()
@@ -133,7 +133,7 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
 
 
 def _is_zero(file: BinaryIO) -> bool:
-    """Returns whether the rest of the file contains only zeros."""
+    """Returns whether the rest of the file consists only of zero bytes."""
     while piece := file.read(1 << 20):
         if any(piece):
             return False
@@ -188,10 +188,10 @@ def read_body(file: BinaryIO, record: Record, name: str) -> bytes:
 
 
 def note_bytes(note: Mapping[str, Any]) -> bytes:
-    """Returns the body of a note: text size as u32, then the text as a zstandard frame.
+    """Serializes a note to a record body: the text size as u32, followed by the text as a zstandard frame.
 
     Args:
-        note: JSON values of the note.
+        note: content of the note, as JSON values.
 
     Raises:
         ValueError: if the note is not valid JSON, or is longer than 16 MB.

@@ -28,22 +28,22 @@ from scas4d_core.gaussians import rotation_rows
 Array = NDArray[np.float32]
 
 SCALE_STEP = 0.08
-"""Quantization step of logarithmic sizes. Decoded sizes, which scale other steps, are within 4 % of the true sizes."""
+"""Quantization step of log sizes. Other steps scale with the decoded sizes, which are within 4 % of the true sizes."""
 MARGIN = 0.95
-"""Safety factor on steps that are relative to a size, to cover the size's own quantization error."""
+"""Safety factor for steps that are relative to a size; it accounts for the quantization error of the size itself."""
 LARGEST = 1 << 30
-"""Limit in quantization steps; centres and axes with larger or non-finite residuals are coded exactly."""
+"""Limit on residuals, in quantization steps; centres and axes with larger or non-finite residuals are coded exactly."""
 SHAPE = ("sizes", "rotations", "factors", "means")
 """Attributes that are coded first, in this order; each improves the prediction of the next."""
 
 
 def appearance_attributes(state: Columns) -> tuple[str, ...]:
-    """Returns the attributes that are coded after the shape, independently of each other."""
+    """Returns the names of the attributes that are coded after the shape, independently of each other."""
     return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
 
 
 def coded_shape(state: Columns, name: str) -> tuple[int, int]:
-    """Returns the number of coded components and rows of an attribute."""
+    """Returns the number of components and the number of rows that are coded for an attribute."""
     if name == "gloss" and state.gloss is not None:
         return 3, state.gloss.shape[1]
     return {"sizes": 1, "factors": 9, "foreground": 1}.get(name, 3), len(state)
@@ -51,7 +51,7 @@ def coded_shape(state: Columns, name: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class DecodedState:
-    """A partially decoded state: the clusters' prediction, refined one attribute at a time.
+    """A partially decoded state, which starts as the clusters' prediction and is refined one attribute at a time.
 
     Earlier attributes refine the prediction of later ones: axes are rotated by the decoded rotation, and steps scale
     with the decoded size.
@@ -64,7 +64,7 @@ class DecodedState:
 
     @classmethod
     def of(cls, bounds: Bounds, state: Columns) -> DecodedState:
-        """Returns the prediction by the clusters, before any residual is applied."""
+        """Starts decoding from the clusters' prediction ``state``, with no residuals applied yet."""
         return cls(bounds, state, state.sizes())
 
     def _step(self, name: str) -> Array | np.float32:
@@ -77,7 +77,7 @@ class DecodedState:
         return np.float32(2 * (bounds.colour if name == "colours" else bounds.gloss))
 
     def residual(self, name: str, state: Columns) -> NDArray[Any]:
-        """Returns the residual [P, N] of a state with respect to the prediction, in quantization steps."""
+        """Returns an attribute's residual [P, N] relative to the prediction, in quantization steps."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             if name == "sizes":
                 steps = np.rint(np.log(state.sizes() / self.sizes) / SCALE_STEP)
@@ -120,9 +120,9 @@ class DecodedState:
 
 
 def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
-    """Rounds residuals [P, N] to int32 and marks rows [N] with values that are not finite or too large.
+    """Converts residuals [P, N] to int32, and returns a mask [N] of rows with non-finite or too large values.
 
-    Such values are set to 0.
+    In the result, such values are replaced by 0.
     """
     outside = ~(np.abs(found) < LARGEST)
     return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)

@@ -1,4 +1,4 @@
-"""Sections of a coded state: residuals, masks and exact arrays. Decoding allocates only as much as the rows need."""
+"""Sections of a coded state: residuals, masks and exact arrays. Decoding allocates only what the rows need."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float32]
 SPARSE = 0.6
 """Fraction of changed rows below which only these rows are coded, with a mask."""
 NONE, ALL, SOME = 0, 1, 2
-"""First byte of a section: values for no rows, for all rows, or for the rows in a mask."""
+"""First byte of a section: whether it has values for no rows, for all rows, or only for the rows in a mask."""
 LARGEST_ARRAY = 1 << 24
 """Maximum size of an exact array in bytes."""
 
@@ -54,7 +54,7 @@ def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tupl
 
 
 def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
-    """Expands residuals [P, R] of some rows, in increasing order, to [P, total]; other rows are 0.
+    """Expands the residuals [P, R] of some rows, listed in increasing order, to all rows, [P, total]; the others are 0.
 
     >>> scattered(np.array([1, 3]), np.array([[7, 9]]), 4)
     array([[0, 7, 0, 9]], dtype=int32)
@@ -67,7 +67,7 @@ def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
 
 
 def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tuple[NDArray[np.intp], Ints, int]:
-    """Decodes a section to its coded rows [R], their residuals [components, R], and the offset of its end.
+    """Decodes a section; returns its coded rows [R], their residuals [components, R], and the offset of its end.
 
     Raises:
         PlaneError: if the bytes are not a valid section.
@@ -136,7 +136,7 @@ def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
 
 
 def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray[np.intp], Floats, int]:
-    """Decodes exactly coded rows, each below ``most``, and their values; also returns the end offset."""
+    """Decodes the indices of exactly coded rows, each below ``most``, and their values; also returns the end offset."""
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return np.zeros(0, np.intp), np.zeros((width, 0), np.float32), offset

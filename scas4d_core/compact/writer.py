@@ -35,7 +35,7 @@ from scas4d_core.gaussians import Gaussians
 ERRORS = "errors"
 """Key under which a note stores the largest errors of its frame."""
 KEY_EVERY = 8
-"""Interval between key frames; a reader decodes at most this many states to access one frame."""
+"""Interval between key frames, and thus the maximum number of states decoded to access one frame."""
 
 
 class CompactWriter:
@@ -140,7 +140,7 @@ class CompactWriter:
             index: frame index, greater than all previous ones.
             time: time in seconds.
             state: Gaussians of the previous frame in the same order, followed by newborn ones with new ids.
-            note: JSON values about the frame, which are written before its state together with its ``errors``.
+            note: JSON values about the frame, written before its state along with the frame's ``errors``.
 
         Raises:
             FileError: if the frame cannot follow the previous frames.

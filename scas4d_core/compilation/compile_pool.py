@@ -30,7 +30,7 @@ NICE = 10
 GC_THRESHOLDS = (200_000, 20, 1000)
 """Thresholds of Python's garbage collector, tuned for a compiler with millions of long-lived objects.
 
-With the default thresholds, collection takes a tenth of the time; disabling it increases memory use by half.
+With the default thresholds, collection takes a tenth of the time; disabling collection increases memory use by half.
 """
 POLL_S = 0.05
 PARENT_EVERY_S = 0.5
@@ -100,7 +100,7 @@ def wait_for_kernels(
     Args:
         wanted: groups to wait for.
         then: groups that the same processes compile afterwards; this function does not wait for them.
-        on_progress: called at the start if any kernels are missing, and whenever more kernels have been compiled.
+        on_progress: function called at the start if kernels are missing, and whenever more kernels have been compiled.
 
     Returns:
         True if the kernels are cached. False if they could not be compiled in advance; each is then compiled when it

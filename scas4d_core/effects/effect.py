@@ -1,6 +1,6 @@
 """Interface of an effect: its user-facing texts, its part of an update, and the evidence for it.
 
-Effect modules must not import Numba or torch at import time, because settings are validated with them.
+Effect modules must not import Numba or torch at import time, because the validation of settings imports them.
 """
 
 from __future__ import annotations

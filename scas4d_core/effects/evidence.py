@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for an effect, from the frames so far.
+    """Evidence for an effect, from the frames processed so far.
 
     Attributes:
         share: share (0…1) that the effect explains or would explain; compared with the effect's thresholds.
@@ -29,12 +29,12 @@ class Evidence:
 
 @dataclass(eq=False)
 class FitTime:
-    """Time limit and time spent for fitting the Gaussians added in a frame, outside the update.
+    """Time limit for fitting the Gaussians added in a frame, outside the update, and the time spent on it.
 
     Attributes:
         end: ``perf_counter`` value at which fits must end, or None if there is no limit.
         spent: time spent on fits, in seconds.
-        postponed: descriptions of fits for which there was no time; the next frame detects them again.
+        postponed: descriptions of fits for which there was no time; the next frame detects their objects again.
     """
 
     end: float | None = None

@@ -17,15 +17,15 @@ from scas4d_core.engines.renderer import Renderer
 Device = Literal["cpu", "gpu"]
 
 WARP_DEVICE = "SCAS4D_WARP_DEVICE"
-"""Environment variable that selects the Warp device for device "gpu". For tests, "cpu" runs the same kernels (slowly)
-without a GPU."""
+"""Environment variable that selects the Warp device used for device "gpu". In tests, the value "cpu" runs the same
+kernels, slowly, without a GPU."""
 
 
 class DeviceError(ValueError):
-    """Raised if a scene requires a GPU, but none can be used.
+    """Raised if a scene requires a GPU but none can be used.
 
     Args:
-        reason: reason why no GPU can be used.
+        reason: explanation of why no GPU can be used.
 
     >>> print(DeviceError("NVIDIA Warp is not installed"))
     device 'gpu' cannot be used: NVIDIA Warp is not installed; see docs/gpu.md, or choose device 'cpu' or 'auto'
@@ -36,7 +36,7 @@ class DeviceError(ValueError):
 
 
 def gpu_fault() -> str | None:
-    """Returns the reason why device "gpu" cannot be used, or None if it can be used."""
+    """Returns the reason why device "gpu" cannot be used, or None if it can."""
     if importlib.util.find_spec("warp") is None:
         return "NVIDIA Warp is not installed (extra gpu)"
     return None if WARP_DEVICE in os.environ else _hardware_fault()
@@ -44,7 +44,7 @@ def gpu_fault() -> str | None:
 
 @cache
 def _hardware_fault() -> str | None:
-    """Returns the (cached) reason why no GPU can be used, or None; only imports NVIDIA Warp if there is a driver."""
+    """Returns the reason why no GPU can be used, or None. NVIDIA Warp is only imported if a driver is installed."""
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -57,13 +57,15 @@ def _hardware_fault() -> str | None:
 
 
 def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
-    """Returns the device for a setting. "auto" selects the GPU if one can be used, otherwise the CPU.
+    """Resolves the setting ``device`` to a device.
+
+    "auto" selects the GPU if one can be used and ``WARP_DEVICE`` is not set, otherwise the CPU.
 
     Args:
         device: value of the setting ``device``.
 
     Raises:
-        DeviceError: if the setting requires a GPU, but none can be used.
+        DeviceError: if the setting requires a GPU but none can be used.
 
     >>> resolve_device("cpu")
     'cpu'
@@ -113,7 +115,7 @@ def renderer_of(device: Device, background: tuple[float, float, float], limits: 
 
 
 def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
-    """Returns a new engine for one fit, with its own buffers but the renderer's device, background and limits.
+    """Returns a new engine for one fit, with its own buffers and the renderer's device, background and limits.
 
     Args:
         renderer: renderer that determines the device, background and limits.

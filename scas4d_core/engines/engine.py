@@ -38,9 +38,10 @@ Array = NDArray[np.float32]
 GAINS_MISSING = "begin was called without gains; enable UpdatePlan.camera_gains to estimate them"
 """Error message of ``UpdateEngine.gains`` if gains are not estimated."""
 REPORT = "report"
-"""Name of the stage in which an update compiles its report. It includes timings, colour shifts, I/O and publishing."""
+"""Name of the stage in which an update compiles its report. The stage includes timings, colour shifts, I/O and
+publishing."""
 KEPT_PICTURES = 8
-"""Number of most recent views whose renderings are kept in the log, where effects can evaluate them."""
+"""Number of most recent views whose renderings are kept in the log for evaluation by effects."""
 KEPT_ROWS = 128
 """Approximate height of the renderings in the log; larger renderings are subsampled."""
 
@@ -101,7 +102,7 @@ class AttemptStart:
             ``StepScalars.sample`` selects one.
         gains: [cameras, 3] initial camera gains, in the plan's camera order, or None if gains are not estimated.
         curve: whether to compute terms that only affect the reported loss, not the state.
-        lap: callback that is called with the name of each stage when it ends. Only engines that synchronize after
+        lap: callback that receives the name of each stage when the stage ends. Only engines that synchronize after
             every stage call it.
     """
 
@@ -156,7 +157,7 @@ class StepScalars:
 
 
 def kept_step(height: int, width: int) -> int:
-    """Returns the subsampling factor of a kept rendering.
+    """Returns the subsampling factor for a rendering that is kept in the log.
 
     >>> kept_step(720, 1280)
     5
@@ -177,7 +178,7 @@ class Thinned(NamedTuple):
 
     @classmethod
     def of(cls, features: Array, transmittance: Array) -> Thinned:
-        """Subsamples a rendering: features [4, H, W] and remaining transmittance [H, W]."""
+        """Subsamples a rendering, given its features [4, H, W] and remaining transmittance [H, W]."""
         every = kept_step(*transmittance.shape)
         return cls(every, np.concatenate([features[:, ::every, ::every], transmittance[None, ::every, ::every]]))
 
@@ -202,7 +203,7 @@ class IterationLog:
     """Log of all iterations since ``begin``.
 
     Attributes:
-        losses: weighted sum of the loss terms of each iteration.
+        losses: total weighted loss of each iteration.
         rendered: records of all renderings, in order.
         pictures: maps view indices to their most recent subsampled renderings, oldest first.
         guards: maps the name of each guard (see ``guards.GUARDS``) to the number of times it was triggered.
@@ -256,7 +257,7 @@ class UpdateEngine(Protocol):
         """Sets the parameters of the deformation."""
 
     def begin(self, start: AttemptStart) -> None:
-        """Prepares the iterations of an attempt, with zero Adam moments and an empty log."""
+        """Starts an attempt, with zero Adam moments and an empty log."""
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
         """Runs one iteration: deform, render, compare, backward, Adam step.

@@ -21,22 +21,23 @@ MIDDLE = np.float32(0.5)
 LOOKED_AT = 4096
 """Approximate number of pixels sampled per image on a regular grid; more pixels do not change the median."""
 DARK, SATURATED = 0.05, 0.985
-"""Range of pixel values in 0…1 used to measure a gain. Darker pixels are noisy and on the linear segment."""
+"""Range of pixel values in 0…1 used to measure a gain. Darker pixels are noisy and lie on the linear segment."""
 PIXELS = 100
 """Minimum number of usable pixels per channel; with fewer, the camera's gain is not updated."""
 SHARE = 0.5
 """Fraction of the difference between measured and current gains that is applied per round. An update of 100 iterations
-has three to eight rounds. This is enough to follow a drift, while a single outlier round has little effect."""
+has three to eight rounds, which is enough to follow a drift. A single outlier round has little effect."""
 LARGEST = 2.0
 """Maximum gain a; the minimum is its inverse. A gain of 2 corresponds to about 5 times the light."""
 CAMERAS = 4
-"""Minimum number of measured cameras. With fewer, gains are indistinguishable from colours that few cameras see."""
+"""Minimum number of measured cameras. With fewer, gains cannot be distinguished from colours that only a few cameras
+see."""
 ENOUGH = 0.5
 """Minimum fraction of the rig's cameras needed to update the gains; with few cameras, local errors bias the gains."""
 
 
 def gain_to_exposure(gain: Array) -> Array:
-    """Converts a gain per channel [3] to an exposure, a gain and offset for pixel values [3, 2].
+    """Converts per-channel gains [3] to an exposure [3, 2], i.e. a gain and offset for pixel values.
 
     >>> gain_to_exposure(np.ones(3, np.float32))[0]
     array([1., 0.], dtype=float32)
@@ -63,10 +64,10 @@ def measured_gain(picture: Array, shown: Array) -> Array:
 
 
 def update_gains(gains: Array, measured: dict[int, Array], cameras: int) -> Array | None:
-    """Returns the gains after a round over the cameras, or None if there are too few measurements.
+    """Returns the updated gains after a round over the cameras, or None if there are too few measurements.
 
-    Each gain changes by ``SHARE`` of the difference from its measured value. The mean logarithm of the gains is
-    preserved, because a change common to all cameras is a change in lighting.
+    Each gain moves towards its measured value by the fraction ``SHARE`` of their difference. The mean logarithm of the
+    gains is preserved, because a change common to all cameras is a change in lighting.
 
     Args:
         gains: [cameras of the rig, 3] current gains.

@@ -63,7 +63,7 @@ class FitGloss(Protocol):
     environment: Array
 
     def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Self:
-        """Returns the gloss of ``rows`` with their moments, followed by copies of ``parents`` with zero moments."""
+        """Returns the gloss and moments of ``rows``, followed by copies of ``parents`` with zero moments."""
 
 
 @dataclass(eq=False)
@@ -127,15 +127,15 @@ class FitEngine(Protocol):
 
     @property
     def renderer(self) -> Renderer:
-        """Returns a renderer for states; it shares its buffers with the iterations."""
+        """Returns a renderer for states that shares its buffers with the iterations."""
 
     def load_views(self, views: Sequence[TrainingView], fixed: Sequence[Gaussians] = ()) -> None:
         """Loads the training images of the fit. Each iteration reads the current exposure of its view.
 
         Args:
             views: training views; ``iterate`` refers to them by index.
-            fixed: Gaussians of each view that are rendered with the fitted ones but not updated; empty if there are
-                none.
+            fixed: Gaussians that are rendered together with the fitted ones but not updated, for each view; empty if
+                there are none.
         """
 
     def load_table(self, table: FitTable) -> None:

@@ -15,7 +15,7 @@ class Limits(NamedTuple):
     Attributes:
         alpha_floor: minimum alpha. A Gaussian covers exactly the pixels where its alpha is at least this value; lower
             values are invisible in 8-bit images. Culling to this support is therefore exact.
-        alpha_cap: upper bound of a Gaussian's alpha, which bounds 1/(1 − alpha) in the backward pass.
+        alpha_cap: upper bound on a Gaussian's alpha, which bounds 1/(1 − alpha) in the backward pass.
         transmittance_stop: blending of a pixel stops before its transmittance would fall below this value.
         low_pass: value added to the diagonal of the projected covariance so that a Gaussian covers at least about one
             pixel, in pixels².

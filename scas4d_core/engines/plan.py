@@ -39,7 +39,7 @@ class ColourPlan:
 
 @dataclass(eq=False)
 class UpdatePlan:
-    """Loss terms, free parameters and options of a scene's updates.
+    """Loss terms, free parameters and options for a scene's updates.
 
     A term that no effect requests has weight 0 (or value None) and is not computed.
 
@@ -106,7 +106,7 @@ class Structure:
 
     Attributes:
         hierarchy: cluster hierarchy of the M moving Gaussians.
-        neighbours: neighbour graph, or None if no term needs it.
+        neighbours: neighbour graph, or None if no loss term needs it.
         roots: [N, 3] positions of all Gaussians in frame 0, in metres.
         first_lengths: [M, 3] axis lengths of the moving Gaussians in frame 0, in metres.
     """
@@ -118,6 +118,6 @@ class Structure:
 
     @property
     def length_bounds(self) -> Array:
-        """[M, 3] axis lengths above which the scale loss applies, in metres."""
+        """Axis lengths [M, 3] above which the scale loss applies, in metres."""
         bounds: Array = np.maximum(self.first_lengths, np.float32(MAX_SCALE))
         return bounds

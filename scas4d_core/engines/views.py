@@ -42,7 +42,7 @@ class CameraArrays(NamedTuple):
 
     @property
     def centre(self) -> Array:
-        """[3] camera centre in internal world coordinates, in metres."""
+        """Camera centre [3] in internal world coordinates, in metres."""
         centre: Array = -(self.pose[:, :3].T @ self.pose[:, 3])
         return centre
 
@@ -56,7 +56,7 @@ class TrainingView:
         camera: camera in kernel format.
         target: [C, H, W] float32 image, RGB in 0…1, followed by the mask if the frame has one. C is 3 or 4.
         exposure: [C, 2] gain and offset of each channel; 1 and 0 for the mask.
-        levels: [C, H, W] uint8 image in 0…255 and mask in 0…1, if ``target`` was converted from them.
+        levels: [C, H, W] uint8 image in 0…255 and mask in 0…1 from which ``target`` was converted, or None.
     """
 
     name: str
@@ -67,12 +67,12 @@ class TrainingView:
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:
-        """[3] mean RGB of the image, in 0…1; computed on first access."""
+        """Mean RGB of the image [3], in 0…1; computed on first access."""
         return means(self.target[:3])
 
     @cached_property
     def squares(self) -> Array:
-        """[h, w, 3] mean colours of all complete ``SIDE``-pixel squares of the image; computed on first access."""
+        """Mean colours [h, w, 3] of all complete ``SIDE``-pixel squares of the image; computed on first access."""
         height, width = self.target.shape[1] // SIDE, self.target.shape[2] // SIDE
         part = self.target[:3, : height * SIDE, : width * SIDE]
         columns = part.reshape(3, height, SIDE, width * SIDE).sum(axis=2)  # five times faster with rows first
@@ -81,7 +81,7 @@ class TrainingView:
 
 
 def means(planes: Array) -> NDArray[np.float64]:
-    """Returns the mean [C] of each plane [C, H, W]. Rows are summed in float32, which is twice as fast."""
+    """Returns the mean [C] of each plane [C, H, W]. Rows are summed in float32 for speed (twice as fast)."""
     _, height, width = planes.shape
     result: NDArray[np.float64] = planes.sum(axis=2).sum(axis=1, dtype=np.float64) / (height * width)
     return result

@@ -80,7 +80,7 @@ class Binary:
         return len(self.accessors) - 1
 
     def write(self, path: Path | str, document: Mapping[str, Any]) -> None:
-        """Writes a document and these arrays atomically.
+        """Writes the document and the collected arrays to a file, atomically.
 
         Args:
             path: path of the file.

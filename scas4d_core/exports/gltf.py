@@ -1,4 +1,4 @@
-"""Writes a frame as ``.glb`` with KHR_gaussian_splatting, as ratified by Khronos (its README in KhronosGroup/glTF).
+"""Writes a frame as ``.glb`` with KHR_gaussian_splatting, as ratified by Khronos (see its README in KhronosGroup/glTF).
 
 Scale is linear and nonnegative, opacity linear in 0…1, rotation a unit quaternion (x, y, z, w), all float32. Harmonics
 have the signs and the order of 3DGS. Drafts of the extension used the logarithm of the scale.
@@ -8,7 +8,7 @@ by 180° about x and converted to metres *in the data*, and the node's transform
 that a reader SHOULD rotate harmonics with the node, so some readers will not. The half turn only changes signs, so it
 is lossless. ``asset.extras`` stores ``metres_per_unit`` for the inverse conversion.
 
-Readers without the extension show points with the colours ``COLOR_0`` (linear light, 16 bits). ``_ID`` contains the ids
+Readers without the extension show points coloured by ``COLOR_0`` (linear light, 16 bits). ``_ID`` contains the ids
 as float32, which is exact below 2²⁴; it is omitted if an id is larger.
 """
 

@@ -163,7 +163,7 @@ class PartAsset:
         )
 
     def discard(self) -> None:
-        """Discards the frames; nothing has been written."""
+        """Discards the collected frames; no file has been created yet."""
         self._first, self._motion, self._keys = None, None, {}
 
     def _residuals(self, keys: _Keyframes) -> dict[str, Any]:

@@ -107,7 +107,7 @@ class PartMotion:
         return part_poses
 
     def _mean_material_rotation(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
-        """Returns the weighted mean [3, 3] of material rotations since the first frame, only nearly a rotation."""
+        """Returns the weighted mean [3, 3] of material rotations since the first frame, which is nearly a rotation."""
         now = quaternions_to_matrices(gaussians.rotations[rows].astype(np.float64))
         then = quaternions_to_matrices(self._first_turns[rows].astype(np.float64))
         turn: Float = np.einsum("n,nik,njk->ij", weights, now, then)

@@ -1,4 +1,4 @@
-"""Writes and reads SPZ (Niantic, github.com/nianticlabs/spz), versions 3 (gzip) and 4 (zstd), with the package gsply.
+"""Writes and reads SPZ (Niantic, github.com/nianticlabs/spz), versions 3 (gzip) and 4 (zstd), using the gsply package.
 
 As SPZ's README states, axes are RUB: x right, y up, z backward, that is, the user's world rotated by 180° about x.
 gsply does not convert axes, so this module does. Lengths are in metres, for which the format's value ranges are
@@ -8,7 +8,7 @@ designed. Quantization, from gsply 0.4.6 and Niantic's ``load-spz.cc``:
 - scales: the logarithm in one byte, 16 steps per factor of e: ±3.2 %, clipped below 45 µm or above 379 m;
 - rotations: the smallest three components in 10 bits each, ±0.0007 per component;
 - opacity: one byte, linear, ±0.002; colour: one byte over −0.44…1.44, ±0.0037;
-- harmonics of degree 1 to 3: one byte over −1…1, ±0.004, clipped beyond.
+- harmonics of degree 1 to 3: one byte over −1…1, ±0.004, clipped outside this range.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
 
     Args:
         path: path of the file.
-        metres_per_unit: metres per unit of the result.
+        metres_per_unit: metres per length unit of the returned splats.
 
     Raises:
         InputError: if gsply is missing, or cannot read the file.

@@ -1,7 +1,7 @@
 """Writes tracks and part poses as CSV for spreadsheets and scripts, in the user's world, axes and units.
 
 Times are in seconds. Rows are ordered by frame; a Gaussian or part that is absent from a frame has no row for that
-frame. Coordinates have 12 significant digits, because the origin of a world may be far away.
+frame. Coordinates have 12 significant digits, because the world's origin may be far away.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class _Table:
 
 
 class TrackTable(_Table):
-    """Writes the means of Gaussians frame by frame; the column ``confidence`` is empty, because confidence is unknown.
+    """Writes the Gaussians' means frame by frame; the ``confidence`` column is empty, because it is unknown.
 
     Args:
         path: path of the file.

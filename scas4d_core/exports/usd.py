@@ -2,7 +2,7 @@
 
 ``/World/Gaussians`` contains one fixed set of Gaussians for all frames; opacity is 0 before birth and during
 retirement. As the schema requires, scales and opacities are linear, and harmonics are grouped by Gaussian. Colours are
-sRGB image values, which the schema cannot express; the ``colorSpace`` of the harmonics specifies it.
+sRGB image values, which the schema cannot express; they are declared by the ``colorSpace`` of the harmonics.
 ``primvars:scas4d:id`` and ``primvars:scas4d:part`` store the ids and part labels. ``/World/Parts/part_k`` are Xforms
 with the rigid motion of each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` shows
 the centres of up to ``MAX_TRACKS`` moving Gaussians as UsdGeomPoints with purpose guide. ``/World/Cameras`` contains
@@ -11,7 +11,7 @@ the cameras of the rig.
 The stage is y-up, that is, the user's world rotated by 180° about x. Its unit is the user's, given by
 ``metersPerUnit``. A time code is the number of seconds since the first frame times ``timeCodesPerSecond``.
 
-Frames are saved one by one, so memory use does not grow with their number. In return, a temporary copy next to the
+Frames are saved one by one, so memory use does not grow with their number. As a trade-off, a temporary copy next to the
 target doubles the disk space needed during the export.
 """
 

@@ -18,7 +18,7 @@ from scas4d_core.exports.cloud import HALF_TURN
 Array = NDArray[Any]
 
 FOCAL_LENGTH = 50.0
-"""Focal length of every camera, in tenths of the stage's unit as USD defines it. Apertures scale with it."""
+"""Focal length of every camera, in tenths of a stage unit, as defined by USD. Apertures scale with it."""
 NEAREST, FARTHEST = 0.01, 1000.0
 """Clipping range of cameras in metres."""
 

@@ -1,4 +1,4 @@
-"""Fits frame 0, and collects the data of frame 0 that every update needs."""
+"""Fits frame 0, and collects the data from it that every update needs."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ Colour = tuple[float, float, float]
 def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
     """Returns the settings with the background 'auto' replaced by a colour from the images.
 
-    This is the colour of a plain backdrop if there is one, otherwise the mean colour. A background colour that is not
-    in the images, such as black in a bright room, causes dark seams, and black holes in regions that no camera sees.
+    A plain backdrop's colour is used if there is one, otherwise the mean colour of the images. A background colour that
+    does not occur in the images, such as black in a bright room, causes dark seams. It also causes black holes in
+    regions that no camera sees.
 
     Args:
         settings: settings of the scene.
@@ -77,11 +78,11 @@ def with_recorded_background(settings: Settings, history: History) -> Settings:
 
 @dataclass(frozen=True, eq=False)
 class FirstFrame:
-    """The data of frame 0 that every update needs.
+    """Data from frame 0 that every update needs.
 
     Attributes:
         masked: whether frame 0 has masks.
-        exposures: [3, 2] gain and offset of each colour channel, keyed by camera name.
+        exposures: maps each camera name to a [3, 2] array, the gain and offset of each colour channel.
         lengths: [N, 3] axis lengths of the Gaussians, in metres.
         background: background colour, RGB in 0…1.
     """
@@ -92,7 +93,7 @@ class FirstFrame:
     background: Colour
 
     def record(self) -> dict[str, Any]:
-        """Returns the data that the state of frame 0 does not contain, as JSON values for the report of frame 0."""
+        """Returns the data not stored in the state of frame 0, as JSON values to be included in frame 0's report."""
         return {
             "masked": self.masked,
             "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
@@ -105,7 +106,7 @@ class FirstFrame:
 
         Raises:
             HistoryError: if the frame cannot be read.
-            KeyError: if the report of the frame is incomplete.
+            KeyError: if the frame's report is incomplete.
         """
         first = history.indices[0]
         report = history.report(first)
@@ -127,13 +128,13 @@ def fit_static_scene(
     """Fits Θ_0 to the views of frame 0, starting from a point cloud.
 
     Args:
-        factory: factory that creates the views of the scene.
+        factory: factory that creates the scene's views.
         views: views of frame 0; their exposures are learnt in place.
         positions: [P, 3] point positions in metres, in the internal world.
         colours: [P, 3] point colours in 0…1.
         foreground: [P] foreground label of each point in 0…1, or None.
         scene: settings of the scene.
-        settings: settings of frame 0.
+        settings: fit settings for frame 0.
         progress: function called after each iteration.
 
     Raises:
@@ -169,7 +170,7 @@ def fit_first_frame(
     Args:
         frame: images and masks of frame 0, at the image size of the factory's rig.
         points: initial point cloud in the user's world, or None to compute one.
-        factory: factory that creates the views of the scene.
+        factory: factory that creates the scene's views.
         settings: settings of the scene.
         world: transform from the user's world to the internal world.
         on_progress: function called with the progress of each stage.
@@ -204,12 +205,12 @@ def fit_first_frame(
 
 
 def _remaining_time(limit: TimeLimit) -> dict[str, float]:
-    """Returns the maximum remaining seconds of frame 0 for a progress report, or an empty dict without a limit."""
+    """Returns the maximum remaining time of frame 0 in seconds for a progress report, or {} if there is no limit."""
     return {"seconds_at_most": max(0.0, limit.seconds_left())} if limit.bounded else {}
 
 
 def _figures(now: FitProgress, limit: TimeLimit) -> dict[str, float]:
-    """Returns the loss and the remaining time for a progress report of the fit."""
+    """Returns the loss and the remaining time, to be included in a progress report."""
     left = {} if now.seconds is None else {"seconds_left": now.seconds}
     return {"loss": now.loss, **left, **_remaining_time(limit)}
 

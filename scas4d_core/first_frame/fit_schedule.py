@@ -23,18 +23,18 @@ MIN_ITERATIONS = 500
 FIRST_TIMED = 10
 """Number of initial iterations that are not timed, because they load kernels and fill caches."""
 PLAN_EVERY = 25
-"""Number of iterations between plans, over which the pace is measured."""
+"""Number of iterations between updates of the plan; the pace is measured over this interval."""
 TIME_TOLERANCE = 1.03
-"""Ratio of predicted to remaining time up to which nothing is shortened, because predictions are not that accurate."""
+"""Ratio of predicted to remaining time up to which the fit is not shortened, given the accuracy of predictions."""
 MIN_PLAN_CHANGE = 0.02
-"""Relative change of the number of iterations above which a new plan is recorded."""
+"""Relative change in the number of iterations above which a new plan is recorded."""
 REPORTED_SHORTFALL = 0.05
 """Fraction of missing iterations above which the report mentions them; smaller fractions have less effect than the
-seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10 and 20 % fewer iterations, it reaches 35.20,
-35.29 and 35.24 dB, and with half of the iterations 35.03 dB. *cloth* at half size (one seed) reaches 28.91 dB; with 5
-and 20 % fewer iterations, it reaches 28.91 and 28.88 dB."""
+random seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10 and 20 % fewer iterations, it reaches
+35.20, 35.29 and 35.24 dB, and with half the iterations, 35.03 dB. *cloth* at half size (one seed) reaches 28.91 dB;
+with 5 and 20 % fewer iterations, it reaches 28.91 and 28.88 dB."""
 MIN_COUNT_RATIO = 1.3
-"""Minimum ratio between Gaussian counts for separating the cost per Gaussian from the cost of the pixels."""
+"""Minimum ratio of the largest to the smallest Gaussian count for separating per-Gaussian cost from pixel cost."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class FitSchedule:
     Args:
         iterations: number of iterations of the full schedule.
         limit: time limit of frame 0.
-        expected: function that returns the expected number of Gaussians at a point of the schedule.
+        expected: function that returns the expected number of Gaussians at a given position in the schedule.
 
     Attributes:
         done: number of completed iterations.
@@ -133,7 +133,7 @@ class FitSchedule:
             self.planned.append((self.done, self.total))
 
     def _seconds(self, begin: float, end: float) -> float:
-        """Predicts the seconds between two points of the full schedule from the expected numbers of Gaussians."""
+        """Predicts the time in seconds between two points of the full schedule, based on expected Gaussian counts."""
         times, counts = np.array(self._times), np.array(self._counts)
         each, more = times[-1], 0.0
         if counts.max() >= MIN_COUNT_RATIO * counts.min():

@@ -1,7 +1,7 @@
-"""Estimates gloss strengths from the images of frame 0: how strongly a colour follows its predicted reflection.
+"""Estimates gloss strengths from the images of frame 0: how strongly colours follow their predicted reflections.
 
-Gradient descent leaves matte objects with half of the initial gloss, because their gradients are small. Such objects
-then show highlights in novel views. For given normals and environment, the strength is the slope of a regression line.
+Gradient descent leaves matte objects with half of their initial gloss, because their gradients are small. Such objects
+then show highlights in novel views. Given the normals and environment, the strength is the slope of a regression line.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 ENOUGH = 0.05
-"""Minimum blending weight, in pixels, for a camera's colour of a Gaussian to count."""
+"""Minimum blending weight of a Gaussian in a view, in pixels, for its colour in that view to be used."""
 WHITE = 0.97
-"""Colour value above which a colour is saturated."""
+"""Channel value, in 0…1, from which a colour is treated as saturated."""
 FLATTEST = 0.2
-"""Cosine between normal and camera direction below which footprints extend beyond the outline."""
+"""Minimum cosine between normal and camera direction; below it, footprints extend beyond the object's outline."""
 NEAR = 64
 """Number of neighbours over which a slope is estimated; a single Gaussian rarely reflects two highlights."""
 CLEAR = 0.3
 """Fraction of the light variation that the line must explain for full confidence in its slope. If it explains less,
 confidence is proportional to the explained fraction."""
 ROUNDS = 3
-"""Number of rounds of averaging over neighbours, which derive uncertain strengths from reliable ones nearby."""
+"""Number of rounds of neighbour averaging, which infers uncertain strengths from reliable ones nearby."""
 GLOSSY = 0.12
 """Minimum fraction of the light variation that must be explained, on average, around a point of a glossy surface. On
 frame 0 of `gloss`, the median is 0.005 on the matte stand, and 0.25 and 0.17 on vase and ring. Where there is less
@@ -54,10 +54,10 @@ def estimate_strengths(
 
     Args:
         normals: [N, 3] unit surface normals.
-        environment: environment that is reflected.
+        environment: reflected environment.
         state: Gaussians of the surface.
-        views: training views, whose images are used.
-        renderer: renderer for the state.
+        views: training views, including their images.
+        renderer: renderer used to compute blending weights.
     """
     from scas4d_core.kernels.appearance.direction import DARK, FALL, OVER, shade
 

@@ -1,8 +1,8 @@
-"""Frame 0 with glossy objects: a trial that detects them, and a fit that models their reflections.
+"""Fits frame 0 with glossy objects: a trial detects them, and a second fit models their reflections.
 
-Without gloss, the fit explains each camera's highlights by Gaussians off the surface that only this camera sees. These
-persist in later frames. An early trial checks whether colours depend on the viewing direction. If they do, the
-environment is learnt on the current surface, and the fit restarts with this environment and surface.
+Without a gloss model, the fit reproduces each camera's highlights with off-surface Gaussians that only this camera
+sees. These Gaussians persist in later frames. An early trial checks whether colours depend on the viewing direction. If
+they do, the environment is learnt on the current surface, and the fit restarts with this environment and surface.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit
 Array = NDArray[np.float32]
 
 TRIAL = 0.15
-"""Fraction of the iterations after which the trial runs: a surface exists, but there are few false Gaussians yet."""
+"""Fraction of the iterations after which the trial runs; a surface exists by then, but few false Gaussians."""
 MIN_ITERATIONS = 100
 """Minimum number of iterations of a fit with a trial; in a shorter fit, other errors dominate the residual."""
 MIN_VIEWS = 12
 """Minimum number of views for the trial; with fewer, only one camera sees each highlight and any model explains it."""
 MAX_STRIDE = 1.5
 """Schedule stride above which there is no time for a trial, which takes as long as 350 iterations. Moreover, the
-surface of a shortened fit explains less: on basketball, direction explains 7 % after 600 iterations, and nothing after
-3000."""
+surface of a shortened fit explains less of the images, so view dependence seems to explain more: on basketball, 7 %
+after 600 iterations, but nothing after 3000."""
 ROUNDS = 8
 """Number of passes over all views in the trial."""
 RATE = 2.5e-3
@@ -56,7 +56,7 @@ SMOOTH_EVERY = 10
 def fit_with_gloss_trial(
     make: Callable[[], StaticTrainer], mode: Mode, progress: Callable[[FitProgress], None] | None = None
 ) -> StaticResult:
-    """Fits Θ_0, with view-dependent colours if they are needed.
+    """Fits Θ_0, with view-dependent colours if needed.
 
     Args:
         make: function that creates a new trainer.
@@ -78,7 +78,7 @@ def fit_with_gloss_trial(
 
 
 def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:
-    """Returns the surface normals scaled by gloss strength, [N, 3], and the means.
+    """Returns each Gaussian's surface normal scaled by its gloss strength, [N, 3], and the Gaussian means.
 
     Without an environment, the initial gloss strength is used.
     """
@@ -126,7 +126,7 @@ class GlossTrial:
         return self.on
 
     def _remaining_error(self, gloss: GlossShading | None) -> float:
-        """Returns the mean squared image error after fitting colours, and gloss if given, for a few passes."""
+        """Returns the mean squared image error after a few passes of fitting the colours, and the gloss if given."""
         trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
         rates[COLOUR] = RATE
         parameters, cameras = trainer.fit.table.parameters.copy(), len(trainer.views)
@@ -181,7 +181,7 @@ class GlossyFit:
         trainer.fit.set_gloss(GlossShading.fresh(self._with_first_normals(None), means, environment))
 
     def _with_first_normals(self, gloss: Array | None) -> Array:
-        """Returns the [N, 3] gloss with the normals of the first surface, and its strengths too if gloss is None."""
+        """Returns the [N, 3] gloss with the first surface's normals, and also with its strengths if gloss is None."""
         near = self._tree.query(self._trainer.fit.table.parameters[:, MEAN], 6)[1]
         normals = self._normals[near].mean(axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)

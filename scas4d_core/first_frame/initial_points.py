@@ -56,8 +56,8 @@ class InitialCloud(InitialPoints):
             front of a plain backdrop), "pairs" (two cameras agree), "plane" (a floor or table on which images agree),
             "surroundings" (images placed far behind the scene), "volume" (unconfirmed points in the volume that the
             cameras share).
-        coverage: fraction of image cells that contain a point on which cameras agree, as the median over cameras.
-        stage: region that the surroundings enclose, or None without surroundings.
+        coverage: median over cameras of the fraction of image cells that contain a point that cameras agree on.
+        stage: region enclosed by the surroundings, or None if there are no surroundings.
     """
 
     method: str = "agreement"
@@ -79,12 +79,12 @@ def initial_points(
 ) -> InitialCloud:
     """Finds points on the surfaces that are visible in the images of one frame.
 
-    Triangulated features bound the scene and support walls and floors. PatchMatch stereo adds textured surfaces; its
-    points are kept if at least ``MIN_VIEWS`` cameras agree and few see through them. The visual hull (of the masks, or
-    of silhouettes in front of a plain background) and fitted surfaces add the rest.
+    Triangulated features bound the scene and provide support for walls and floors. PatchMatch stereo adds textured
+    surfaces; its points are kept if at least ``MIN_VIEWS`` cameras agree and few see through them. The visual hull (of
+    the masks, or of silhouettes in front of a plain background) and fitted surfaces add the rest.
 
     With few, widely spaced cameras, these points may cover too little of the images. Further methods are then tried in
-    turn: silhouettes in front of a backdrop that does not fill the image borders, points on which two cameras agree,
+    turn: silhouettes in front of a backdrop that does not fill the image borders, points that two cameras agree on,
     and a plane on which images agree. Finally, the images themselves are placed far behind the scene. If almost nothing
     is found, points are sampled in the volume that the cameras share.
 
@@ -95,7 +95,7 @@ def initial_points(
         progress: function called with (stage, done, total).
         max_points: maximum number of points.
         stereo: whether to use dense stereo in textured regions.
-        stereo_iterations: rounds of propagation and refinement.
+        stereo_iterations: number of stereo rounds of propagation and refinement.
         seed: random seed; the same seed gives the same points.
         limit: time limit of frame 0; if time is short, the search is coarser, as recorded in ``limit.shortened``.
 
@@ -154,7 +154,7 @@ def _add_points(
     views: Sequence[PosedPicture],
     spacing: float,
 ) -> InitialCloud | None:
-    """Merges the points that a method finds into the previous points, which stay unchanged if it finds none."""
+    """Merges a method's points into the previous points, which are returned unchanged if the method finds none."""
     try:
         return merge_points(found, search(), method, views, spacing)
     except InitialPointsError:
@@ -162,7 +162,7 @@ def _add_points(
 
 
 def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSearch]]:
-    """Returns the methods that search for points on which cameras agree, most reliable first."""
+    """Returns the search methods for points that cameras agree on, most reliable first."""
     ways = [("agreement", first)]
     if not masked and not first.backdrop:
         colour = backdrop([view.image for view in first.labelled])
@@ -194,11 +194,11 @@ def merge_points(
 
 
 def image_coverage(views: Sequence[PosedPicture], cloud: InitialPoints) -> float:
-    """Returns the fraction of image (or mask) cells that contain a point, as the median over the views.
+    """Returns the median over the views of the fraction of image (or mask) cells that contain a point.
 
     Args:
-        views: views of the cameras.
-        cloud: points, in the world of the cameras.
+        views: views, with masks if available.
+        cloud: points, in the same world as the cameras.
     """
     shares = []
     for view in views:

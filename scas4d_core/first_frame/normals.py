@@ -17,16 +17,16 @@ from scas4d_core.gaussians import Gaussians
 Array = NDArray[np.float32]
 
 BLUR = 1.5
-"""Standard deviation, in pixels, of the blur that is applied to depth before differentiation."""
+"""Standard deviation, in pixels, of the blur applied to depth before differentiation."""
 STEEPEST = 0.2
-"""Minimum cosine between normal and viewing ray for a pixel's normal to count."""
+"""Minimum cosine between normal and viewing ray for a pixel's normal to be used."""
 REACH, NEAR = 0.03, 64
-"""Radius (relative to the extent) and number of neighbours over which normals are averaged."""
+"""Radius (as a fraction of the extent) and number of neighbours over which normals are averaged."""
 SKIN = 1 / 3
-"""Exponent applied to opacities. A surface is a haze in front of opaque Gaussians, and its depth is that of the haze.
-On `gloss`, the rendered depth was 15 mm behind the surface. Median normal errors on vase and ring were 8 and 6 degrees
-with the rendered depth, and 4 and 4 degrees with this exponent. With twice the neighbours at 1.5 times the radius, they
-were 3 and 4 degrees."""
+"""Exponent applied to opacities. The fit represents a surface as a haze in front of opaque Gaussians; the haze is at
+the depth of the surface. On `gloss`, the rendered depth was 15 mm behind the surface. Median normal errors on vase and
+ring were 8 and 6 degrees with the rendered depth, and 4 and 4 degrees with this exponent. With twice the neighbours at
+1.5 times the radius, they were 3 and 4 degrees."""
 OPAQUE = 0.99
 SOLID = 0.5
 """Minimum alpha of a pixel that shows a surface."""
@@ -41,8 +41,8 @@ def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: R
 
     Args:
         state: Gaussians of the surface.
-        views: training views, from whose cameras depth is rendered.
-        renderer: renderer for the state.
+        views: training views; depth is rendered from their cameras.
+        renderer: renderer used to render depth.
     """
     means, count = state.means, len(state)
     haze = state.replace(opacities=np.minimum(state.opacities**SKIN, OPAQUE).astype(np.float32))

@@ -1,4 +1,4 @@
-"""Result of the fit of frame 0, and the origin of its initial points."""
+"""Result of fitting frame 0, and the origin of its initial points."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ class FirstCloud:
     """Origin of the initial point cloud.
 
     Attributes:
-        method: "given" for a cloud from the user, otherwise the methods; see ``initial_points.InitialCloud``.
+        method: "given" for a cloud supplied by the user, otherwise the methods used; see
+            ``initial_points.InitialCloud``.
         points: number of points.
-        coverage: fraction of the images covered by points on which cameras agree, or None for a given cloud.
+        coverage: fraction of the image area covered by points that the cameras agree on, or None for a cloud supplied
+            by the user.
     """
 
     method: str
@@ -32,19 +34,20 @@ class FirstCloud:
 
 @dataclass(frozen=True, eq=False)
 class StaticResult:
-    """Result of the fit of frame 0.
+    """Result of fitting frame 0.
 
     Attributes:
         gaussians: fitted Gaussians Θ_0.
-        exposures: [3, 2] gain and offset of each training camera, keyed by name; empty without exposure terms.
+        exposures: maps each training camera to a [3, 2] array, the gain and offset of each colour channel; empty
+            without exposure terms.
         losses: training loss of each iteration.
         psnr: PSNR of the view rendered in each iteration, in dB.
-        cameras: fit of each camera's image in its last iteration, keyed by camera name.
+        cameras: how well each camera's image was fitted in its last iteration, keyed by camera name.
         evidence: evidence for each effect, keyed by effect name, or None without a trial.
         cloud: origin of the initial points, or None if unknown.
         planned: (iteration, total iterations) at each change of plan.
         ran_short_of_time: whether any iteration advanced the schedule by more than one.
-        shortened: descriptions of the steps that had too little time.
+        shortened: descriptions of the steps that were shortened or skipped for lack of time.
     """
 
     gaussians: Gaussians

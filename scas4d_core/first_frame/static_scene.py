@@ -37,11 +37,11 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 INITIAL_SHARE = 0.6
-"""Maximum fraction of the budget for the initial points; a larger cloud is subsampled at random."""
+"""Maximum fraction of the Gaussian budget used by the initial points; a larger cloud is subsampled at random."""
 DENSIFY_FROM = 200
 """First iteration with densification; earlier gradients are too noisy."""
 DENSIFY_EVERY = 100
-"""Number of iterations between densifications (3DGS)."""
+"""Number of iterations between densification steps, as in 3DGS."""
 DENSIFY_UNTIL = 0.6
 """Fraction of the iterations after which no Gaussians are added, so that the existing ones can converge."""
 DENSIFY_GRADIENT = 1e-6
@@ -61,9 +61,10 @@ rotations), and of the cameras' gain and offset."""
 WEIGHT_MASK = 3.0
 """Weight of the mask loss if there are masks; in frame 0 it only trains the labels."""
 SPLIT_SHRINK = 1.6
-"""Factor by which the two halves are smaller than the Gaussian that is split (3DGS)."""
+"""Factor by which the scales of a Gaussian are divided when it is split in two, as in 3DGS."""
 STOP_ROUNDS = 5
-"""Number of passes over all views that the stopping rule compares with as many preceding ones; fewer are too noisy."""
+"""Number of passes over all views whose mean loss the stopping rule compares with that of the same number of preceding
+passes; fewer are too noisy."""
 
 
 class StaticTrainer:
@@ -74,7 +75,7 @@ class StaticTrainer:
         schedule: iteration schedule of the fit.
         exposures: exposures of the views, learnt in place.
         budget: maximum number of Gaussians.
-        cameras: fit of each camera's image in its last iteration, keyed by camera name.
+        cameras: how well each camera's image was fitted in its last iteration, keyed by camera name.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class StaticTrainer:
         progress: Callable[[FitProgress], None] | None = None,
         should_stop: Callable[[FitStep], bool] | None = None,
     ) -> list[float]:
-        """Runs all iterations, or fewer due to the stopping rule or the time limit, and returns their losses.
+        """Runs all iterations, or fewer if the stopping rule or the time limit applies, and returns their losses.
 
         Args:
             progress: function called after each iteration.
@@ -142,12 +143,12 @@ class StaticTrainer:
         schedule.end_iteration(len(self.fit))
 
     def _target(self, at: float) -> int:
-        """Returns the target number of Gaussians at a point of the schedule."""
+        """Returns the target number of Gaussians at a given point in the schedule."""
         share = (at - DENSIFY_FROM) / max(self._until - DENSIFY_FROM, 1)
         return round(self._start + (self.budget - self._start) * min(1.0, share + 0.1))
 
     def _expected(self, at: float) -> float:
-        """Returns the expected number of Gaussians at a point of the schedule; past points refer to a similar fit."""
+        """Returns the expected number of Gaussians at a point in the schedule; past points refer to a second fit."""
         aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
         return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
@@ -160,7 +161,7 @@ class StaticTrainer:
         return bool(before - now < self.settings.stop_gain * before)
 
     def scalars(self, now: FitStep) -> FitScalars:
-        """Returns the learning rates of an iteration; the last iterations also measure each camera's colour shift."""
+        """Returns the learning rates for an iteration; the last iterations also measure each camera's colour shift."""
         # A shortened fit may end in the middle of a pass, but two passes include every view.
         rounds = 1 if self.schedule.stride == 1 else 2 * self.schedule.stride
         ending = now.begun >= self._last - len(self.views) * rounds
@@ -205,7 +206,7 @@ class StaticTrainer:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
 
         A Gaussian that no camera sees is unconstrained and may become visible when the scene moves. A Gaussian that
-        only one camera sees is a floater, which explains the image of this camera but degrades all other views.
+        only one camera sees is a floater, which fits this camera's image but degrades all other views.
         """
         counts = np.zeros(len(self.fit), np.int64)
         state = self.gaussians()
@@ -221,7 +222,7 @@ class StaticTrainer:
             self.fit.replace_rows(np.flatnonzero(keep), np.zeros((0, COLUMNS), np.float32), none)
 
     def _half(self, half: Array, factors: Array) -> Array:
-        """Returns the parameter rows with smaller scales, each displaced by a sample from its Gaussian."""
+        """Returns copies of the rows with smaller scales, each mean displaced by a random sample of its Gaussian."""
         offset = self.random.standard_normal((len(half), 3)).astype(np.float32)
         half = half.copy()
         half[:, MEAN] += np.einsum("nij,nj->ni", factors, offset)
@@ -229,12 +230,12 @@ class StaticTrainer:
         return half
 
     def gaussians(self) -> Gaussians:
-        """Returns the state Θ_0; without masks, every Gaussian may move."""
+        """Returns the state Θ_0; without masks, all Gaussians are labelled as foreground."""
         state = self.fit.state()
         return state if self._masked else state.replace(foreground=np.ones(len(state), np.float32))
 
     def result(self, losses: list[float]) -> StaticResult:
-        """Returns the result of the iterations so far."""
+        """Returns the result after the iterations so far."""
         exposures, planned, shortened = self.exposures.by_camera(), self.schedule.record, self.schedule.shortened
         return StaticResult(
             self.gaussians(),

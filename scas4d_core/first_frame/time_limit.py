@@ -1,4 +1,4 @@
-"""The time limit of frame 0, which keeps track of the remaining time and of steps that had too little time."""
+"""Time limit of frame 0, which tracks the remaining time and records the steps that were shortened."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from math import inf
 from time import perf_counter
 
 FEATURES = 0.15
-"""Fraction of the time limit by which features should be extracted."""
+"""Fraction of the time limit by which feature extraction should be finished."""
 MATCHES = 0.2
-"""Fraction of the time limit by which features should be matched."""
+"""Fraction of the time limit by which feature matching should be finished."""
 STEREO = 0.35
 """Fraction of the time limit by which stereo should end, each time it is tried. Without a limit, computing the initial
 points takes a third of frame 0 on basketball (27 cameras at 640x360). On rigs of four to seven cameras, it takes less
@@ -18,7 +18,7 @@ AFTER_S = 2.5
 """Seconds reserved for the steps after the fit: clustering, the neighbour graph and the commit took 1 to 2 seconds for
 50,000 to 90,000 Gaussians."""
 AFTER_SHARE = 0.1
-"""Maximum fraction of the time limit that is reserved for these steps."""
+"""Maximum fraction of the time limit reserved for the steps after the fit."""
 
 
 class TimeLimit:
@@ -29,7 +29,7 @@ class TimeLimit:
         clock: function that returns the current time in seconds.
 
     Attributes:
-        shortened: descriptions of the steps that had too little time.
+        shortened: descriptions of the steps that were shortened or skipped for lack of time.
 
     >>> now = [0.0]
     >>> limit = TimeLimit(100.0, clock=lambda: now[0])

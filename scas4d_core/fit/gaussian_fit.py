@@ -53,7 +53,7 @@ def each_once(done: int) -> FitStep:
 
 
 def never(now: FitStep, last: FitLoss) -> bool:
-    """Returns false, so that the fit does not end early."""
+    """Always returns false, so that the fit does not end early."""
     return False
 
 
@@ -61,7 +61,7 @@ class GaussianFit:
     """Fits the rows of a parameter table to views.
 
     Args:
-        engine: fit engine, which no other fit may use.
+        engine: fit engine, which must not be shared with another fit.
         views: views to fit.
         parameters: [N, 15] parameter table with the columns of ``engines.fit``; changed in place.
         fixed: fixed Gaussians of each view, which are rendered with the fitted ones; empty if there are none.

@@ -1,6 +1,6 @@
 """Adam step (Kingma and Ba 2015) for a parameter table, with a learning rate per column.
 
-Reference implementation: ``torch.optim.Adam``. Gradients that are not finite, or so large or small that the moments
+Reference implementation: ``torch.optim.Adam``. Gradients that are non-finite, or so large or small that the moments
 would overflow or become subnormal, are clamped and counted; see ``guards.GRADIENT_CEILING`` and
 ``guards.MOMENT_FLOOR``.
 """
@@ -50,7 +50,7 @@ def adam(
         rates: [columns] learning rates.
         by_row: [n] learning rate factor of each row, or ``EVERY_ROW``.
         beta1, beta2: decay rates, float32.
-        step: number of this step, starting with 1.
+        step: number of this step, counted from 1.
 
     Returns:
         [2] number of gradient values that triggered each guard in ``COUNTED_GUARDS``.

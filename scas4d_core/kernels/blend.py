@@ -27,7 +27,7 @@ BLOCKS = (TILE // BLOCK) ** 2
 BLOCK_X = np.array([BLOCK * (block >> 3) for block in range(BLOCKS)], np.float32)
 BLOCK_Y = np.array([BLOCK * (block & 7) for block in range(BLOCKS)], np.float32)
 AHEAD = 4
-"""Prefetch distance in entries, because the data of Gaussians is scattered in memory."""
+"""Prefetch distance in entries. Prefetching pays off because the data of Gaussians is scattered in memory."""
 
 HALF_LOG2_E = np.float32(0.5 * 1.4426950408889634)
 """Factor that converts exponents to base 2: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
@@ -54,7 +54,7 @@ def fetch_ahead(entry, end, items, splats, features):
 
 @kernel
 def copy_blocks(plane, y_first, x_first, state, start, step, inward):
-    """Copies blocks from a tile of a plane to the block state if ``inward``, otherwise back.
+    """Copies blocks from a tile of a plane to the block state if ``inward``, otherwise from the state to the plane.
 
     The first block is at index ``start`` of the state, and consecutive blocks are ``step`` apart.
     """
@@ -199,7 +199,7 @@ def blend(
         starts: [tiles + 1] start of each tile's list in ``items``.
         items: [entries] Gaussian of each entry.
         covers: [entries] uint64 block mask of each entry; see ``tiles.cover``. Blocks in which the Gaussian has no
-            effect are cleared.
+            effect are cleared from the mask.
         wanted: [tiles] uint64 mask of the blocks to render; all others are filled with the background.
         tile_order: int64 tiles to render, distributed to tasks in this order. All other tiles stay unchanged.
         tasks: number of parallel tasks.

@@ -30,7 +30,7 @@ except ImportError:  # not available on this system
 
 PREFIX = "kernels-"
 KEPT = 3
-"""Number of versions to keep, because several checkouts may share a cache."""
+"""Number of versions to keep; more than one, because several checkouts may share a cache."""
 
 
 GUARDS = Path(__file__).parent.parent / "guards.py"
@@ -55,7 +55,7 @@ def base() -> Path:
 
 
 def use(folder: Path) -> None:
-    """Makes Numba use this version's cache folder in ``folder``. If it cannot be created, Numba's default applies."""
+    """Makes Numba use this version's cache folder in ``folder``, or its default if that cannot be created."""
     mine = folder / (PREFIX + digest())
     try:
         mine.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
 
 
 class _OneAtATime(IndexDataCacheFile):
-    """Cache files of one function, which only one process at a time may save."""
+    """Cache files of one function, which only one process at a time may write."""
 
     def save(self, key: Any, data: Any) -> None:
         with locked(Path(self._cache_path) / "saving.lock"):
@@ -108,7 +108,7 @@ class _OneAtATime(IndexDataCacheFile):
 
 
 def shared(dispatcher: Any) -> Any:
-    """Makes concurrent saving to the cache of a compiled function safe, and returns the function."""
+    """Makes concurrent writes to a compiled function's cache safe, and returns the function."""
     cache = dispatcher._cache
     if isinstance(cache, FunctionCache):  # caching is enabled
         file = cache._cache_file

@@ -1,13 +1,13 @@
 """Cascade of cluster maps and its backward pass (paper, single-layer deformation function and nesting).
 
-Each step processes sixteen Gaussians of one cluster, so values of the cluster are scalars and values of Gaussians are
+Each step processes sixteen Gaussians of one cluster, so per-cluster values are scalars and per-Gaussian values are
 vectors (``Lanes``). ``deform`` combines the steps. Each layer transforms a point x, the Gaussian's factor F (nine
 entries, row-major; the map's Jacobian is applied to it directly) and its rotation Q. Reference implementation:
 ``deformation.cascade``.
 
 Cluster map, with y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
 centred x' = p + t + f R y, published x' = f (R y + p + t). Both have J = R (f I + f' e cᵀ),
-with e = y (centred) or e = y + Rᵀ(p + t) (published). With separate covariance, factors stay unchanged.
+with e = y (centred) or e = y + Rᵀ(p + t) (published). With separate covariance, factors remain unchanged.
 
 Points are updated by adding a displacement: x' = w + (f − 1) u with w = x + t + (R − I) y, and u = R y (centred) or
 u = w (published). All terms except x are 0 if the parameters are 0, so the identity is bit-exact on every processor.
@@ -132,8 +132,8 @@ def polar(table, about_origin, f, yx, yy, yz):
     """Computes the polar rotation of f I + f' e cᵀ in the plane of e and c; the common factor f is omitted.
 
     Returns:
-        The quaternion a (4 values). For the backward pass, also e (3), e·c, c × e (3), cosine, sine (3), their norm
-        rho, the scale of the quaternion, and rho + cosine.
+        Quaternion a (4 values), followed by values for the backward pass: e (3), e·c, c × e (3), cosine, sine (3),
+        their norm rho, the scale of the quaternion, and rho + cosine.
     """
     cx, cy, cz = table[19], table[20], table[21]
     mx, my, mz = table[13] + table[16], table[14] + table[17], table[15] + table[18]
@@ -164,7 +164,7 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
         about_origin: 0 for the centred cluster map, 1 for the published one.
         separate: if None, J is applied to the factors; otherwise, factors stay unchanged.
         points: points before the layer; x, y and z of the block start at flat index ``place``.
-        v: [13, 16] factors 0–8 and rotations 9–12, updated in place.
+        v: [13, 16] factors (rows 0–8) and rotations (rows 9–12), updated in place.
         present: mask, starting at flat index ``lane``: 0 for Gaussians that are not counted, otherwise 1.
         guard_counts: [3 or more] int64 counts, to which the number of Gaussians that triggered each guard in
             ``COUNTED_GUARDS`` is added; None disables counting.
@@ -214,8 +214,8 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
     Args:
         table, about_origin, separate, points, place: see ``apply_cluster_map``.
         v: factors and rotations before the layer, starting at flat index ``entering``.
-        g: [16, 16] gradients of points 0–2, factors 3–11 and rotations 12–15. Output gradients are replaced by input
-            gradients.
+        g: [16, 16] gradients of points (rows 0–2), factors (rows 3–11) and rotations (rows 12–15). Output gradients are
+            replaced by input gradients.
         records: output, starting at flat index ``record``: the block's contribution to the gradient of its cluster.
     """
     n = lanes.COUNT

@@ -1,9 +1,9 @@
-"""Deformation D_t of all moving Gaussians and its backward pass, which combine ``cascade`` and ``deltas``.
+"""Deformation D_t of all moving Gaussians and its backward pass, combining ``cascade`` and ``deltas``.
 
 Gaussians are processed in blocks of sixteen that belong to one cluster of the finest layer, and hence to one cluster
 in every layer. If the size of a cluster is not a multiple of sixteen, its last block repeats its last Gaussian.
 
-Only points are stored between layers, because pivots are their means. The backward pass recomputes factors and
+Only points are stored between layers, because pivots are means of points. The backward pass recomputes factors and
 rotations, which is cheaper than reading them from memory. Frozen layers are applied once (``freeze_layer``), and
 later passes skip them. Reference implementation: ``engines.torch.deformation``.
 """
@@ -131,7 +131,7 @@ def deform(
         means: [N, 3] output, written at ``rows``.
         factors: [N, 3, 3] output, written at ``rows``.
         state: [M, 16] output; means and rotations are written. See ``deltas`` for the columns.
-        guard_counts: [tasks of ``BLOCKS`` blocks, 3] int64 output, number of times that each guard in
+        guard_counts: [tasks of ``BLOCKS`` blocks, 3] int64 output, number of times each guard in
             ``cascade.COUNTED_GUARDS`` was triggered.
     """
     blocks, layers = clusters.shape
@@ -190,7 +190,7 @@ def deform_backward(
     """Backpropagates through ``deform``, and adds the gradient of the scale loss.
 
     Args:
-        first … tables: see ``deform``; its outputs are required. Frozen layers get no gradient.
+        first … tables: see ``deform``, which must have been called first. Frozen layers receive no gradient.
         scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If 0, the loss has no
             gradient.
         bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
@@ -200,7 +200,7 @@ def deform_backward(
         records: [B, L, 32] scratch buffer.
         gradients: [K, 10] output, gradients of the cluster parameters.
         g_deltas: [M, 9] output, gradients of the deltas.
-        losses: [B] output, total length in metres by which axes exceed their bounds, for each block.
+        losses: [B] output, total length by which the axes in each block exceed their bounds, in metres.
     """
     blocks, layers = clusters.shape
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):

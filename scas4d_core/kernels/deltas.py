@@ -46,7 +46,7 @@ def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, mean
         rows: int64 indices of the Gaussians among all N, starting at flat index ``place``.
         place: flat index of the first Gaussian in ``entries``, ``rows`` and ``present``.
         present: mask, starting at flat index ``place``: 0 for Gaussians that are not counted, otherwise 1.
-        v: [13, 16] factors 0–8 and rotations 9–12 from the cascade.
+        v: [13, 16] factors (rows 0–8) and rotations (rows 9–12) from the cascade.
         points: [3, 16] points from the cascade.
         means: [N, 3] output, written at ``rows``.
         factors: [N, 3, 3] output, written at ``rows``.
@@ -100,7 +100,8 @@ def apply_gaussian_deltas_backward(
         g_means: [N, 3] gradients of the means.
         g_factors: [N, 3, 3] gradients of the factors.
         g_tied: [M, 8] additional gradients of means and rotations, from the neighbour terms.
-        g: [16, 16] output, gradients of points 0–2, factors 3–11 and rotations 12–15 after the cascade.
+        g: [16, 16] output, gradients of the points (rows 0–2), factors (rows 3–11) and rotations (rows 12–15) after the
+            cascade.
         g_deltas: [M, 9] output, gradients of the deltas.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Backward pass for features only, used if positions and shapes need no gradient.
+"""Backward pass for features only, used if positions and shapes need no gradients.
 
 The gradient of a feature is the image gradient, summed over pixels with the Gaussian's blending weights. As in
 ``blend``, the weights are recomputed front to back; later entries in a tile do not affect them. Results are

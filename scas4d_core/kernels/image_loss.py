@@ -48,7 +48,7 @@ LOSSES = WINDOWS | LOSS
 
 
 def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Returns the flags [H, columns] required to compute the gradient of some pixels, and all losses they affect.
+    """Returns the flags [H, columns] needed for the gradient of the given pixels and all losses affected by them.
 
     Args:
         shown: [H, W] mask of the pixels.
@@ -150,7 +150,7 @@ def start_of(planes, channel, y):
 
 @kernel
 def span_of(image, gain, offset, target, channel, y, pitch, spans):
-    """Finds the column ranges near pixels of a row that are not black in both images.
+    """Finds the column ranges of a row near pixels that are not black in both images.
 
     Args:
         spans: [4] output: column range (first, last + 1) of the windows that contain such pixels, followed by the range
@@ -187,7 +187,7 @@ def union_of_spans(spans, which, y, reach):
 
 @parallel_kernel
 def target_moments(target, scratch, means, squares):
-    """Computes the windowed means of a target and of its square, which is required once per frame and view.
+    """Computes the windowed means of a target and of its square; needed once per frame and view.
 
     Args:
         target: [C, H, W] target image.

@@ -20,7 +20,7 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, models, regist
 from scas4d_core.kernels.jit import LOG2_E, MOST, inline
 
 COUNT = 16
-"""Number of lanes of a ``Lanes`` value."""
+"""Number of lanes in a ``Lanes`` value."""
 
 emitted: Any = intrinsic
 """Decorator for functions that emit LLVM instructions into kernels."""
@@ -252,7 +252,7 @@ def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any,
 
 @emitted
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """Loads sixteen values of a float32 array from a flat index, without alignment requirements or bounds checks."""
+    """Loads sixteen values of a float32 array, starting at a flat index; no alignment requirements or bounds checks."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments)
@@ -263,7 +263,7 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 @emitted
 def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Stores the lanes at a flat index."""
+    """Stores the lanes in an array, starting at a flat index."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -344,7 +344,7 @@ def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
 
 @emitted
 def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Stores the lanes at a flat index with a stride."""
+    """Stores the lanes in an array with a stride, starting at a flat index."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments[:3])):
@@ -498,7 +498,7 @@ def exp(x):
 
 @emitted
 def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
-    """Decomposes positive numbers x = m 2^e with m in [1/√2, √2) into e and m."""
+    """Decomposes positive numbers x into e and m such that x = m 2^e, with m in [1/√2, √2)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def all_of(value: int) -> Any:

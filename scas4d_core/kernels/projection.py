@@ -27,7 +27,7 @@ CHUNK = 256
 """Number of Gaussians per task, a compromise between overhead and load balance."""
 
 AHEAD = 16
-"""Prefetch distance in Gaussians, because their records are scattered in memory."""
+"""Prefetch distance in Gaussians. Prefetching pays off because their records are scattered in memory."""
 
 FARTHEST = np.float32(NOT_FINITE)
 BRIGHTEST = np.float32(FEATURE_CEILING)

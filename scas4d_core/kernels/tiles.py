@@ -1,4 +1,4 @@
-"""Depth sorting and tile lists. Gaussians are sorted once globally, and tile lists filled in this order are sorted."""
+"""Depth sorting and tile lists. Gaussians are sorted once globally; lists filled in this order are also sorted."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SOME = 4096
 """Number of rows per task."""
 
 AHEAD = 8
-"""Prefetch distance in Gaussians, because depth order scatters memory accesses."""
+"""Prefetch distance in Gaussians. Prefetching pays off because depth order scatters memory accesses."""
 
 
 @inline

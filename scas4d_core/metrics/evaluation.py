@@ -6,9 +6,9 @@ These definitions complement those in ``scas4d_core.metrics``:
 - *Foreground* pixels are inside the mask of the test camera. *Changed* pixels differ by more than 0.1 in at least one
   channel from the ground-truth image of frame 0.
 - 3D tracks start at the ground-truth points in frame 0. 2D tracks start at the pixels of the moving points that are
-  visible in a test camera in frame 0, and use rendered depth. They are evaluated in frames where the point is visible.
-- Parts are rendered with as many labels as the scene has foreground parts, and compared at pixels whose true label is a
-  part.
+  visible in a test camera in frame 0, and use rendered depth; only frames where the point is visible are evaluated.
+- Parts are rendered with as many labels as the scene has foreground parts, and compared at pixels that show a part in
+  the ground truth.
 - *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
   evaluated frames. *Flicker* is the temporal standard deviation of the rendered values at these pixels, in levels.
 """
@@ -137,7 +137,7 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
 
 
 def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Returns the adjusted Rand index of rendered part labels, pooled over frames and all test cameras with labels."""
+    """Computes the part scores: adjusted Rand index, pooled over frames and labelled test cameras, and part count."""
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
     assert rig is not None

@@ -107,7 +107,7 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
         truth: [H, W, 3] ground-truth image in sRGB.
 
     Returns:
-        Score without a value if the flip_evaluator package is not installed.
+        The score. Its value is None if the flip_evaluator package is not installed.
 
     Raises:
         ValueError: if the shapes differ, or if values are not finite.
@@ -141,7 +141,7 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
         backbone: "vgg", as reported for 3D Gaussian Splatting, or "alex".
 
     Returns:
-        Score without a value if the lpips package or its weights are not installed.
+        The score. Its value is None if the lpips package or its weights are not installed.
 
     Raises:
         ValueError: if the shapes differ, if values are not finite, or if the backbone is unknown.

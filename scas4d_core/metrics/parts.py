@@ -14,9 +14,9 @@ def adjusted_rand_index(
 ) -> float:
     """Returns the agreement of two partitions of the foreground pixels, corrected for chance (Hubert and Arabie 1985).
 
-    Pixels of several frames and cameras can be stacked and are pooled, so a part must have the same label in all of
-    them. The label values themselves do not matter. Foreground pixels without a rendered part are treated as another
-    part, with their value in ``labels``.
+    Pixels from several frames and cameras can be stacked and are then pooled, so a part must have the same label in all
+    of them. The label values themselves do not matter. Foreground pixels where no part was rendered count as a part of
+    their own.
 
     Args:
         labels: [...] rendered integer labels.

@@ -56,7 +56,7 @@ def median_trajectory_error(
         counted: [T, Q] bool mask of the positions to evaluate, i.e. those visible in the camera. Tracks without such
             positions are ignored.
         diagonal: image diagonal in pixels.
-        query: frame in which the points were given, which is excluded.
+        query: frame in which the query points were given; excluded from the error.
 
     Returns:
         Error in %, or NaN if there are no positions to evaluate.
@@ -85,8 +85,8 @@ def oracle_tracks(
     """Returns oracle tracks as defined in the paper, which follow the best candidate near each point.
 
     Among the candidates near a point in the query frame, the oracle selects the one with the smallest error. Because it
-    uses the ground truth, its error (``median_trajectory_error`` of these tracks) is a bound for the centroids and not
-    a measure of tracking. Report it together with the error without oracle.
+    uses the ground truth, its error (``median_trajectory_error`` of these tracks) bounds what the centroids can achieve
+    and does not measure tracking. Report it together with the error without the oracle.
 
     Args:
         candidates: [T, N, 2] positions of all Gaussian centroids in pixels, NaN behind the camera.
@@ -139,7 +139,7 @@ def track_error_3d(
         moving: [P] bool mask of the moving points. Only these are evaluated, because static points would lower the
             median.
         extent: longest side of the foreground's bounding box, in user units.
-        query: frame in which the points were given, which is excluded.
+        query: frame in which the query points were given; excluded from the error.
 
     Raises:
         ValueError: if the shapes differ, if the extent is not positive, or if no point moves.
@@ -214,7 +214,7 @@ def error_by_confidence(
         confidence: [T, P] confidence of each predicted position.
         moving: [P] bool mask of the points to evaluate.
         extent: extent of the scene in user units; see ``track_error_3d``.
-        query: frame in which the points were given, which is excluded.
+        query: frame in which the query points were given; excluded from the error.
         groups: number of groups. If positions cannot be divided evenly, the least confident ones are ignored.
 
     Raises:
@@ -238,12 +238,12 @@ def error_by_confidence(
 
 
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
-    """Returns the fraction of correct visibility predictions in 0…1, the occlusion accuracy of TAP-Vid.
+    """Returns the fraction of correct visibility predictions in 0…1, called occlusion accuracy in TAP-Vid.
 
     Args:
         predicted: [T, Q] bool predicted visibility.
         truth: [T, Q] bool true visibility.
-        query: frame in which the points were given, which is excluded.
+        query: frame in which the query points were given; excluded from the accuracy.
 
     Raises:
         ValueError: if the shapes differ.

@@ -10,9 +10,9 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 WEISZFELD_ROUNDS = 12
-"""Number of iterations for the geometric median; later changes are a small fraction of the carriers' spread."""
+"""Number of iterations for the geometric median; more would change it by a small fraction of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
-"""Working memory for the search for carriers, in bytes."""
+"""Working memory limit for the carrier search, in bytes."""
 ABSENT = -1e9
 """Log opacity assigned to retired Gaussians, so that they carry no points."""
 MIN_PRESENT_WEIGHT = 0.05
@@ -34,8 +34,8 @@ def carriers(
 
     Returns:
         Rows [Q, K] of the carriers, largest weight first. Weights [Q, K] proportional to o·exp(−½ m²), which sum to 1;
-        far from all Gaussians, only the nearest counts. Opacity 1 − Π(1 − o·exp(−½ m²)) of the K carriers at each
-        point, [Q].
+        far from all Gaussians, only the nearest has a significant weight. Combined opacity 1 − Π(1 − o·exp(−½ m²)) of
+        the K carriers at each point, [Q].
 
     >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
     >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
@@ -69,7 +69,7 @@ def carriers(
 
 
 def geometric_median(points: Float, weights: Float) -> Float:
-    """Returns the geometric median [Q, 3] of K points by Weiszfeld's iteration.
+    """Returns the geometric median [Q, 3] of each row of K points, computed by Weiszfeld's algorithm.
 
     Args:
         points: [Q, K, 3] points.

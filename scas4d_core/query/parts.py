@@ -1,8 +1,8 @@
-"""Part segmentation: Gaussians with similar motion, by K-means on positions and material rotations over time.
+"""Part segmentation: clusters Gaussians by motion, using K-means on positions and material rotations over time.
 
 Implements the section "Visualization of Part Segmentation" of the paper. The feature of Gaussian i is ``[λp·p_i(t),
-λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here, p is in units of the extent of the moving Gaussians, so that one set
-of λ suits every scene.
+λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here, p is in units of the extent of the moving Gaussians, so that the
+same λ values suit every scene.
 
 When parts are computed again after more frames, they keep their labels. The clustering also starts from the previous
 parts, and replaces them only if a fresh clustering is clearly better. New labels are matched to previous ones by their
@@ -42,17 +42,17 @@ LAMBDA_INITIAL = 0.25
 MAX_FRAMES = 32
 """Maximum number of frames in the features, evenly spaced over the history; limits memory use."""
 SAMPLE = 20_000
-"""Maximum number of Gaussians that are clustered; all are then labelled."""
+"""Maximum number of Gaussians used for clustering; all moving Gaussians are then labelled."""
 MAX_PARTS = 12
 """Maximum number of parts to try if no number is given."""
 STAY = 0.05
 """Margin by which the inertia of the previous parts must exceed that of a fresh clustering before they are replaced."""
 STAY_COUNT = 0.02
-"""Bonus on the mean silhouette score for keeping the previous number of parts."""
+"""Bonus added to the mean silhouette score for keeping the previous number of parts."""
 RESTARTS = 10
 """Number of K-means initializations (n_init); the best result is kept."""
 SEED = 0
-"""Seed of the initializations and of the sample."""
+"""Random seed of the initializations and the sample."""
 
 
 def parts(
@@ -69,8 +69,8 @@ def parts(
         history: history with at least one committed frame; with only one, positions alone separate parts.
         count: number of parts, or None for the number from 2 to ``MAX_PARTS`` with the largest mean silhouette score
             (Rousseeuw 1987) on up to 1,000 Gaussians.
-        previous: [N] labels from fewer frames with the same ``count`` (or None). Parts that persist then keep their
-            labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
+        previous: [N] labels computed from fewer frames with the same ``count``, or None. Parts that persist then keep
+            their labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
 
     Raises:
         ValueError: if no frame is committed, no Gaussian moves, count is below 1 or above the number of moving
@@ -130,7 +130,7 @@ def parts(
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
     """Renumbers parts to maximize their overlap with the previous labels (Hungarian method).
 
-    A part without overlap, or whose match was assigned to another part, gets the lowest free label.
+    A part that overlaps no previous part, or whose match was assigned to another part, gets the lowest free label.
 
     Args:
         labels: [N] new labels from 0; negative labels belong to no part and are unchanged.
@@ -201,7 +201,7 @@ def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) 
 def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float) -> Features:
     """Returns the features of M Gaussians over T frames, [M, 12 T + 3] float32.
 
-    The paper repeats p(0) in every frame. Here it is included once, times √T, which gives the same distances. All
+    The paper repeats p(0) in every frame. Here it is included once, scaled by √T, which gives the same distances. All
     features are divided by √T, so that distances do not grow with the number of frames.
 
     Args:
@@ -225,7 +225,7 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
 
 
 def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
-    """Returns the opacity times the product of the two longest axes, [N] in m², an estimate of the image area."""
+    """Returns each Gaussian's approximate image area in m², [N]: opacity times the product of its two longest axes."""
     axes = np.linalg.svd(gaussians.factors.astype(np.float64), compute_uv=False)
     return gaussians.opacities * axes[:, 0] * axes[:, 1]
 
@@ -251,7 +251,7 @@ def _cluster(
 
 
 def _best_count(features: Features, known: int) -> int:
-    """Returns the count with the best mean silhouette score, favouring the previous count ``known`` (0 for none)."""
+    """Returns the number of parts with the best mean silhouette score, favouring the previous number (0 if none)."""
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0

@@ -1,9 +1,9 @@
 """Writes and reads a frame as a standard 3D Gaussian Splatting ``.ply`` (Kerbl et al. 2023), for any splat viewer.
 
 The format is binary little-endian with one float32 row per Gaussian. The columns are x y z, nx ny nz (zero), f_dc_0…2
-(degree 0 of the spherical harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). If colours depend on
-direction, f_rest_0…44 (degrees 1 to 3, channel by channel) follow. Positions and lengths are in the user's world and
-units.
+(degree 0 of the spherical harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). If colours depend on the
+viewing direction, f_rest_0…44 (degrees 1 to 3, channel by channel) follow. Positions and lengths are in the user's
+world and units.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FIELDS = (
 
 
 class PlyError(InputError):
-    """Raised if Gaussians cannot be exported or a file is invalid; the message names the rows or path."""
+    """Raised if Gaussians cannot be exported or a file is invalid; the message names the affected rows or the path."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +164,10 @@ def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
 def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
     """Splits factors into rotations Q [N, 3, 3] and lengths s [N, 3] with Q diag(s²) Qᵀ = F Fᵀ.
 
-    This is one-sided Jacobi: columns of F are rotated pairwise, by at most 45°, until they are orthogonal. Columns that
-    are already orthogonal do not change, even if lengths are equal and eigenvectors would be arbitrary. Of the 24 ways
-    to label the axes of a right-handed frame, the one with the largest trace against the columns of F is used.
+    This is the one-sided Jacobi method: columns of F are rotated pairwise, by at most 45°, until they are orthogonal.
+    Columns that are already orthogonal do not change, even if lengths are equal and eigenvectors would be arbitrary. Of
+    the 24 ways to label the axes of a right-handed frame, the one with the largest trace against the columns of F is
+    used.
 
     Args:
         factors: [N, 3, 3] factors F of full rank.

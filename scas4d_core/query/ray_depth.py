@@ -1,9 +1,9 @@
 """Surface depth along single rays, for pixel queries that need more accuracy than rendered depth.
 
 Rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here, each Gaussian absorbs light along the
-ray itself, around the point on the ray that is closest to its centre in its own metric. The surface is at the depth by
-which half of the absorbed light has been lost. At an edge, the mean is between two surfaces, but this median is on one
-of them.
+ray itself, around the point on the ray with the smallest Mahalanobis distance to its centre. The surface is at the
+depth where half of the light lost along the ray has been absorbed. At an edge, the mean depth is between two surfaces,
+but this median is on one of them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TILE_PX = 16
 RAYS_AT_ONCE = 64
 """Number of rays processed at once, to limit working memory to a few megabytes."""
 DEEPEST = 96
-"""Maximum number of Gaussians per ray: those that absorb the most light. All others have no visible effect."""
+"""Maximum number of Gaussians per ray. Those that absorb the most light are used; the others have no visible effect."""
 BISECTIONS = 26
 """Number of bisection steps, which reduce a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
@@ -46,7 +46,7 @@ def ray_depths(
         gaussians: state of N Gaussians in the internal world.
         camera: camera in the internal world.
         uv: [Q, 2] pixel positions; (0.5, 0.5) is the centre of the first pixel.
-        limits: rasterizer constants, so that a ray hits the Gaussians that the rendered pixel shows.
+        limits: rasterizer constants; with them, a ray hits the same Gaussians that the rendered pixel shows.
         softening: uncertainty of the surface in metres, added to every axis in quadrature.
 
     Returns:
@@ -114,7 +114,7 @@ class _Splats:
         self.spread = np.sqrt(softened[:, 2, 2])
 
     def depths(self, near: NDArray[np.intp], uv: Float) -> tuple[Float, Float]:
-        """Returns the depth and coverage of rays for candidate Gaussians in front-to-back order."""
+        """Returns the depth and coverage of rays, given the candidate Gaussians in front-to-back order."""
         limits = self.limits
         off = uv[:, None] - self.centre[near]
         power = 0.5 * np.einsum("qni,nij,qnj->qn", off, self.conic[near], off, optimize=True)

@@ -23,7 +23,7 @@ def tapvid3d(
     metres_per_unit: float = 1.0,
     pixels: NDArray[Any] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Returns the arrays of one file, without images (``images_jpeg_bytes``), which predictions do not need.
+    """Returns the arrays of one TAPVid-3D file, without images (``images_jpeg_bytes``), which predictions do not need.
 
     Args:
         positions: [T, Q, 3] positions in the user's world and units, NaN if unknown.

@@ -45,7 +45,7 @@ DEPTH_TOLERANCE = 0.0075
 """Distance behind the rendered surface up to which a point counts as visible, as a fraction of the extent. The value is
 approximately the error of the rendered depth."""
 PIXEL_REACH = 2.0
-"""Distance in pixels within which a pixel query that misses a silhouette uses the nearest covered pixel's depth."""
+"""Maximum distance, in pixels, from a query without a surface to the covered pixel whose depth is used instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ def tracks_of_points(
     indices: Sequence[int],
     count: int = CARRIERS,
 ) -> Tracks:
-    """Tracks 3D points over frames.
+    """Tracks 3D points over the given frames.
 
     Args:
         history: history of committed states.
@@ -150,7 +150,7 @@ def tracks_of_pixels(
     render_depth: RenderDepth,
     limits: Limits = DEFAULT,
 ) -> Tracks:
-    """Tracks the surface points at pixels of one frame of a camera, with their visibility in that camera.
+    """Tracks the surface points that a camera sees at given pixels of one frame, with their visibility in that camera.
 
     Args:
         history: history of committed states.
@@ -243,7 +243,7 @@ def find_visibility(
     """Returns the visibility of points in a camera, [T, Q] bool: in the image, in front of the camera and not occluded.
 
     A point is occluded if it is more than ``tolerance`` behind the farthest rendered depth in the 3×3 pixels around it.
-    Tracks are often off by a pixel, which matters at edges; this rule is also more often correct for true positions. A
+    Tracks are often off by a pixel, which matters at edges; this rule is also more accurate for exact positions. A
     pixel that is less than half covered does not occlude.
 
     Args:

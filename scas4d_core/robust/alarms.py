@@ -25,13 +25,13 @@ first value applies to two consecutive frames, the second to a single frame. Cle
 GAIN = (0.15, 0.25)
 """Maximum common deviation of all channels, as in ``TINT``. Clean captures reach 0.09, for a sheet seen edge-on."""
 SPREAD = 4.0
-"""``TINT`` and ``GAIN`` are raised to this multiple of the deviation that half of the cameras do not exceed in a frame.
+"""``TINT`` and ``GAIN`` are raised to at least this multiple of the median deviation over the cameras of the frame.
 If all cameras fit badly, as on small images, colours are unreliable."""
 SHARPNESS = (0.12, 0.2)
 """Maximum deviation of the log sharpness, as in ``TINT``. Clean captures reach 0.07; a blur of one pixel causes
 0.42."""
 FOLLOWS = 0.2
-"""Rate at which the usual colours and sharpness of a camera follow new values; suspended while they are suspect."""
+"""Rate at which the usual colours and sharpness of a camera follow new values; paused while these are suspect."""
 ROW = 2
 """Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
@@ -91,7 +91,7 @@ def alarms_of(
     same: Collection[str],
     left_out: Collection[str] = (),
 ) -> tuple[list[Alarm], Past]:
-    """Returns the alarms of an update, except those of excluded cameras, and the past with figures for the next frame.
+    """Returns the alarms of an update, except those for excluded cameras, and the past updated for the next frame.
 
     Args:
         past, after: usual values before and after the frame.
@@ -153,7 +153,7 @@ def _check_camera(
         sharp: sharpness of the image.
         sharper: change from the usual sharpness, relative to the other cameras.
         same: whether the image is unchanged while those of other cameras have changed.
-        spread: tint and gain deviations that half of the cameras do not exceed.
+        spread: median tint and gain deviations over the cameras.
     """
     now, alarms = replace(before, same=before.same + 1 if same else 0), list[Alarm]()
     if now.same >= ROW:
@@ -216,13 +216,13 @@ def common_change(change: Numbers) -> float:
 
 
 def _known(usual: tuple[float, float, float], now: Numbers) -> Numbers:
-    """Returns the [3] usual colours, replaced by the current ones if unknown."""
+    """Returns the [3] usual colours, or the current ones if the usual colours are unknown."""
     known: Numbers = np.where(np.isnan(usual), now, usual)
     return known
 
 
 def _upper_median(sizes: Iterable[float]) -> float:
-    """Returns the absolute value that half of the values, rounded up, do not exceed; 0 if there are none."""
+    """Returns the median absolute value (the lower of two middle values), or 0 if there are no values."""
     ordered = sorted(abs(size) for size in sizes)
     return ordered[(len(ordered) - 1) // 2] if ordered else 0.0
 
@@ -233,7 +233,7 @@ def left_out_alarms(names: Sequence[str], shown: Collection[str], dropped: Mappi
     Args:
         names: names of the rig's cameras.
         shown: names of the cameras with an image.
-        dropped: reason for the exclusion of each excluded camera.
+        dropped: maps each excluded camera to the reason for its exclusion.
     """
     reasons = {name: "no image was received" for name in names if name not in shown} | dict(dropped)
     return [

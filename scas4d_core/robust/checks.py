@@ -8,7 +8,7 @@ from frame to frame like a dimming lamp, is treated differently (``solve_frame``
 gain, and the images are unchanged.
 
 A frame may repeat the images of the previous frame, because a camera runs at half the rate of its rig or an idle rig
-resends its last frame. Nothing is learnt from such a frame, and it does not count as a pause of the motion: the next
+resends its last frame. Nothing is learnt from such a frame, and it does not count as a pause in the motion: the next
 frame starts from the motion before the repeated images.
 
 A state that is not finite, bounded and plausible is never committed. Single faulty Gaussians keep their previous state.
@@ -119,9 +119,9 @@ def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
 
 
 def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
-    """Returns whether a lighting change continues at the same rate as in the previous frame, faster than noise.
+    """Returns whether a lighting change continues at the same rate as in the previous frame and exceeds noise.
 
-    In this case the scene's own lighting changes, and the colours follow at once. Flicker reverses, and a sudden jump
+    If so, the scene's own lighting changes, and the colours follow immediately. Flicker reverses, and a sudden jump
     has no previous step.
     """
     step = measure_brightness_ratio(past, bright)
@@ -223,8 +223,7 @@ LONGEST = 1.0
 """Maximum length of an axis, in rig radii."""
 SHRUNK, STRETCHED = 0.1, 10.0
 """Bounds of an axis length relative to its length in frame 0. Over thousands of updates, small residuals add up and
-lengths would drift without limit (docs/stability.md, Long runs). An axis outside the bounds is set to the bound and
-counted."""
+lengths would drift without limit (docs/stability.md, Long runs). An axis outside the bounds is clamped and counted."""
 BRIGHTEST = 8.0
 """Maximum absolute value of a colour; cameras record 0…1, and camera gains extend this range."""
 FEW = 0.01

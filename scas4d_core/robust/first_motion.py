@@ -26,7 +26,7 @@ ANOTHER_ORDER = 1_000_003
 
 
 class OrderResult(NamedTuple):
-    """The result of one order.
+    """The result of an update in one view order.
 
     Attributes:
         result: result of the update.
@@ -42,7 +42,7 @@ class OrderResult(NamedTuple):
 def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[OrderResult, int]:
     """Runs an update in two or three view orders, and returns the best result and the number of orders.
 
-    An update that needs no iteration is not repeated.
+    An update that needs no iterations is not repeated.
 
     Args:
         run: function that runs the update with a seed and a factor on the layers' rates.
@@ -60,7 +60,7 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
 
 
 def errors_of(ends: Sequence[OrderResult]) -> list[float]:
-    """Returns the RMS error (0…1) of each result, averaged over cameras that no order excluded.
+    """Returns the RMS error (0…1) of each result, averaged over cameras that were not excluded in any order.
 
     The error is infinite if a state is implausible, or no better than the previous state.
     """

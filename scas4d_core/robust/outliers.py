@@ -26,7 +26,7 @@ NEAR_DB = -4.0
 """Offset below which a camera is suspect. Its usual level is then not updated, so that a lasting fault remains visible;
 two consecutive frames raise an alarm. Clean captures reach -3.7."""
 FITS_DB = -4.0
-"""Offset above which an excluded camera is accepted again; meanwhile, colours follow only the other cameras."""
+"""Offset above which an excluded camera is accepted again; until then, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""
 DROP_DB = 6.0
@@ -177,7 +177,7 @@ def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str
 
 
 def past_in_light(past: Past, gain: float) -> Past:
-    """Returns the past with usual values for the new lighting; errors are larger in brighter light."""
+    """Returns the past with its usual values adapted to the new lighting; errors are larger in brighter light."""
     brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
     return replace(past, brightness=brightness, level=level, error={}, light=1.0, light_frames=0)
@@ -194,7 +194,7 @@ def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
-    """Returns the reason for each camera that fits much worse than usual, keyed by camera name.
+    """Returns the cameras that fit much worse than usual, mapped to the reason.
 
     Args:
         past: usual values of the cameras.
@@ -255,7 +255,7 @@ def _shorter(past: Past, iterations: int) -> float:
 
 
 def level_of(past: Past, psnr: Mapping[str, float]) -> float:
-    """Returns the median PSNR in dB over cameras, each relative to its usual level, or NaN without cameras."""
+    """Returns the median PSNR in dB over cameras, each relative to its usual level, or NaN if there are none."""
     places = {name: past.camera_level(name) for name in psnr}
     values = [value - (places[name] if isfinite(places[name]) else 0.0) for name, value in _capped(psnr).items()]
     return float(np.median(values)) if values else nan
@@ -283,7 +283,7 @@ def past_after_update(
         bright: brightness of each image of the frame.
         exposure: brightness ratio of the frame.
         iterations: number of iterations of the update; 0 means as in the previous update.
-        moved: whether this or an earlier update changed the state; otherwise, no usual values of updates are known.
+        moved: whether this or an earlier update changed the state; otherwise, the usual values of updates are unknown.
     """
     psnr = _capped(psnr)
     off = offsets(past, psnr)

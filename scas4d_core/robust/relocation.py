@@ -1,4 +1,4 @@
-"""Relocates an object after a jump: the update only tracks motions up to about the object's size.
+"""Relocates an object after a jump: the update only tracks motion up to about the object's size.
 
 Each image is compared with a rendering of the scene without moving Gaussians; pixels that differ show the object. The
 rays of all cameras through the object's centre are intersected, once for the images and once for renderings of the
@@ -26,7 +26,7 @@ SMALLEST_AREA = 0.25
 CAMERAS = 3
 """Minimum number of cameras with a plausible object area."""
 AGREE = 0.25
-"""Maximum RMS distance of the rays from their intersection, relative to the displacement; otherwise they disagree."""
+"""Maximum RMS distance of the rays from their intersection, relative to the displacement; above it, they disagree."""
 
 
 def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Renderer, rig: Rig) -> Float | None:

@@ -61,7 +61,7 @@ class FrameSolver:
     """Solves the frames of a scene.
 
     Args:
-        updater: update of the scene's frames.
+        updater: updates the scene's frames.
         factory: factory that creates the scene's training views.
         renderer: renderer with the background and limits of the settings.
         settings: update settings.
@@ -285,7 +285,7 @@ class FrameSolver:
         return outliers.lag_reason(given.past, result.trace.met, len(result.trace.losses))
 
     def _budget_is_spent(self, given: UpdateInput, more: int = 0) -> bool:
-        """Returns whether the time budget has no room for another attempt after ``more`` iterations."""
+        """Returns whether the time budget leaves no room for another attempt after ``more`` iterations."""
         return given.end is not None and perf_counter() + (PROBE + more) * (given.iteration_seconds or 0.0) > given.end
 
     def _search(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult | None:

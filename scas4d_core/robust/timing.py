@@ -41,17 +41,17 @@ CAUCHY, QUIETEST = 2.4, 1 / 255
 SMALLEST = 1e-6
 """Regularization of possibly singular equations, relative to the square of each unknown."""
 NEIGHBOURS = 10.0
-"""Approximate number of pixels with correlated errors, by which variances are increased."""
+"""Approximate number of pixels with correlated errors; variances are multiplied by it."""
 USUAL = 0.1
-"""Variation of a camera's measurements in fast motion, in frames, because of tracking lag and curved motion."""
+"""Variation of a camera's measurements in fast motion, in frames, caused by tracking lag and curved motion."""
 FARTHEST = 0.75
 """Limit to which a measured offset is clamped, in frames: motion that reverses has no measurable shift."""
 KEEPS = 0.95
-"""Factor on the weight of earlier measurements at each new one; effectively, the last forty count."""
+"""Factor applied to earlier measurements' weights at each new one; effectively, the last forty count."""
 ENOUGH = 2.5
-"""Minimum effective number of measurements for a known mean."""
+"""Minimum effective number of measurements for a mean to count as known."""
 CAMERAS = 4
-"""Minimum number of cameras with known means for a median; with fewer, the one that is off cannot be identified."""
+"""Minimum number of cameras with known means for a median; with fewer, a camera that is off cannot be identified."""
 APART = 0.02
 """Measured difference between the means of synchronized cameras on captures, in frames; added to each standard error in
 quadrature."""
@@ -67,7 +67,7 @@ Row = tuple[float, ...]
 
 
 class PictureTiming(NamedTuple):
-    """Capture time of one image: ``offset`` after (+) or before (−) the state, in frames, and its ``variance``."""
+    """Capture time of one image relative to the state: ``offset`` in frames (+ if later), and its ``variance``."""
 
     offset: float
     variance: float

@@ -22,11 +22,11 @@ COLUMNS = 4
 """Number of columns of the log: frame, kind, first id and last id."""
 NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
 NO_PARENT = -1
-"""Parent of a Gaussian that starts its own structure."""
+"""Parent value of a Gaussian that has no parent and starts its own structure."""
 
 
 class Event(IntEnum):
-    """Kinds of events in a log."""
+    """Kind of an event in the log."""
 
     BORN = 0
     RETIRED = 1
@@ -77,7 +77,7 @@ def births_in(events: Int) -> list[tuple[int, int, int]]:
 
 
 def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
-    """Returns which Gaussians [N] are retired at the end of a log.
+    """Returns a mask [N] of the Gaussians that are retired at the end of a log.
 
     Args:
         events: event log.

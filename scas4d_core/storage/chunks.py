@@ -1,7 +1,7 @@
 """Chunks: compact files in a history's folder, each with a series of older frames. Requires NumPy and zstandard.
 
 ``states_<index>.s4d`` starts with the frame of that index. A frame is in a chunk once the record of its state is
-complete; the note before it contains the frame's report. If a frame also has its own file, that file takes precedence.
+complete; the preceding note contains the frame's report. If a frame also has its own file, that file takes precedence.
 Exact data is stored elsewhere: ids and opacities with the first frame and the births, retirements in later logs.
 """
 
@@ -30,13 +30,13 @@ from scas4d_core.storage.npz import open_atomically
 REPORT = "report"
 """Key of the report in a frame's note."""
 READERS = 2
-"""Number of chunks that each process keeps open with a cached state, for sequential tracks and for random views."""
+"""Number of chunks that each process keeps open, with a cached state: one for tracks, and one for random views."""
 _CHUNK_FILE = re.compile(r"states_(\d{6,})\.s4d")
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Compact file of a history.
+    """A compact file in a history's folder.
 
     Attributes:
         path: path of the file.
@@ -45,7 +45,7 @@ class Chunk:
         times: time of each frame in seconds, keyed by frame index.
         stamps: stamp of each frame: its size in the file in bytes, and −1 minus the checksum of the state. The negative
             value distinguishes it from stamps of frame files.
-        damage: description of the first damage in the file, or None; frames after the damage could not be listed.
+        damage: description of the first damage in the file, or None; frames after the damage are not listed.
         foreign: whether the file has an unsupported format.
     """
 
@@ -180,7 +180,7 @@ class Chunks:
         return arrays
 
     def reader(self, index: int) -> CompactReader:
-        """Returns the open reader of the chunk that contains a frame; this object closes it.
+        """Returns an open reader for the chunk that contains a frame; callers must not close it.
 
         Raises:
             FileNotFoundError: if no chunk contains the frame.
@@ -277,7 +277,7 @@ def chunk_of(name: str) -> int | None:
 
 
 def _listed(path: Path, status: os.stat_result) -> Chunk:
-    """Lists the frames of a chunk, or no frames if the chunk cannot be opened."""
+    """Returns a chunk with a list of its frames, which is empty if the chunk cannot be opened."""
     size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:

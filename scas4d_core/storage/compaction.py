@@ -2,7 +2,7 @@
 
 The first and newest frames are kept bit-exact, because updates, replays and restarts depend on them. A frame is
 appended to a chunk with its report as a note, the chunk is synced, and then the frame's own file is deleted. Every
-frame therefore remains readable, no matter when the process ends. A view of an older frame changes at most once.
+frame therefore remains readable, no matter when the process ends. Renders of an older frame change at most once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
 
 CHUNK_FRAMES = 120
-"""Number of frames per chunk. The first state is as large as five to ten others; retention deletes whole chunks."""
+"""Frames per chunk. The first state of a chunk is as large as five to ten others; retention deletes whole chunks."""
 
 NOT_ENCODED = (ValueError, ArithmeticError, MemoryError)
 """Exceptions for states that cannot be read or encoded, including the errors of histories and compact files."""
@@ -32,7 +32,7 @@ class Compaction:
     """Moves the oldest exact states of a history to chunks, in the process that appends to it.
 
     Args:
-        history: history in a directory.
+        history: history stored in a directory.
         head: function that returns the file header with the error bounds; called when a chunk is created or resumed.
         exact: number of newest states that are kept bit-exact, at least ``NEWEST_KEPT``.
 

@@ -16,7 +16,7 @@ class UnreadableFrameError(HistoryError):
 
 
 class DamagedFrameError(UnreadableFrameError):
-    """Raised if a frame's file is damaged, as opposed to deleted."""
+    """Raised if a frame's file is damaged rather than deleted."""
 
 
 def other_format(what: str, written: int | None, read: int) -> OtherFormatError:

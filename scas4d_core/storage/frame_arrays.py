@@ -14,7 +14,7 @@ from scas4d_core.storage.npz import member
 
 Arrays = dict[str, NDArray[Any]]
 Stamp = tuple[int, int]
-"""Size and modification time (ns) of a file, which reveal a rewritten file. For frames in chunks, see ``Chunk``."""
+"""Size and modification time (ns) of a file, used to detect rewritten files. For frames in chunks, see ``Chunk``."""
 EVENTS = "events"
 """Name of the array with the log of births, retirements and revivals up to the frame; absent if there are none."""
 EFFECTS = "effects"
@@ -58,7 +58,7 @@ def frame_file_arrays(
         time: time of the frame in seconds.
         report: encoded report.
         log: event log up to the frame.
-        left: packed effect arrays, or None.
+        left: packed effect arrays, or None if there are none.
     """
     if len(log):
         frame = {**frame, EVENTS: log}

@@ -30,7 +30,7 @@ FORMAT = 1
 """Format of a folder of states and checkpoints, stored in ``fixed.npz``; folders with other formats are rejected."""
 _FORMAT = "format"
 INDEX = "index"
-"""Name of the array, in the copy of the first frame, that contains its index."""
+"""Name of the array that stores the frame index in the copy of the first frame."""
 
 FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.npz"
 _CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
@@ -43,7 +43,7 @@ class FrameFiles:
 
     Attributes:
         chunks: compact files that contain older frames.
-        faults: maps the name of each file that could not be read to the reason; cleared when reported. A frame in a
+        faults: maps the name of each unreadable file to the reason; cleared when reported. A frame in a
             chunk is listed under the name that its own file would have.
     """
 
@@ -112,13 +112,21 @@ class FrameFiles:
         return self._copied
 
     def write(self, index: int, arrays: Mapping[str, Any]) -> Stamp:
-        """Writes the file of a frame, which commits the frame, and returns its stamp."""
+        """Writes a frame's file, which commits the frame, and returns the file's stamp."""
         file = self.path(index)
         write_npz(file, arrays)
         return _stamp(file.stat())
 
     def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
-        """Writes the arrays shared by all frames, and both of their copies, before the first frame is committed."""
+        """Writes the arrays shared by all frames, a copy of these arrays, and a copy of the first frame.
+
+        Call this before the first frame is committed.
+
+        Args:
+            arrays: arrays shared by all frames.
+            index: index of the first frame.
+            first: arrays of the first frame.
+        """
         write_npz(self.fixed, with_format(arrays))
         write_npz(self.fixed_copy, with_format(arrays))
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
@@ -139,7 +147,7 @@ class FrameFiles:
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Reads arrays of a frame from its file, otherwise from its chunk or, for the first frame, from the copy.
+        """Reads arrays of a frame from its own file, or else from its chunk or, for the first frame, from its copy.
 
         Args:
             index: index of the frame.
@@ -173,7 +181,7 @@ class FrameFiles:
             raise UnreadableFrameError(str(error)) from error
 
     def fault(self, index: int) -> str | None:
-        """Verifies everything stored for a frame, and returns the problem, or None if the frame is intact."""
+        """Verifies all stored data of a frame, and returns the problem found, or None if the frame is intact."""
         if not self.path(index).exists() and index in self.chunks:
             return self.chunks.fault(index)
         return fault_of(self.path(index))
@@ -206,7 +214,7 @@ class FrameFiles:
         write_npz(self.directory / born_file(index, copy=True), arrays)
 
     def read_born(self, index: int, names: Sequence[str] | None = None) -> Arrays:
-        """Reads the arrays of Gaussians born in a frame: the named ones, or all if ``names`` is None.
+        """Reads the arrays of Gaussians born in a frame: the named arrays, or all arrays if ``names`` is None.
 
         Raises:
             UnreadableFrameError: if the file and its copy are damaged or missing.
@@ -274,12 +282,12 @@ class FrameFiles:
         return index in self.chunks
 
     def chunk_of(self, index: int) -> list[int]:
-        """Returns all frames of the chunk that contains a frame, or only the frame if it is in no chunk."""
+        """Returns all frames of the chunk that contains a frame, or just the frame itself if it is not in a chunk."""
         chunk = self.chunks.of(index)
         return [index] if chunk is None else list(chunk.times)
 
     def remove_oldest(self, deleted: Collection[int], left: Container[int]) -> None:
-        """Deletes frames, and chunks that contain no remaining frame.
+        """Deletes frames, and all chunks without any remaining frames.
 
         Args:
             deleted: indices of the frames to delete.
@@ -301,7 +309,7 @@ class FrameFiles:
 
 
 def with_format(fixed: Arrays) -> Arrays:
-    """Returns the arrays of ``fixed.npz``: the arrays that all frames share, and the format of the folder."""
+    """Returns the arrays of ``fixed.npz``: the arrays shared by all frames, and the format of the folder."""
     return {**fixed, _FORMAT: np.asarray(FORMAT, np.int64)}
 
 
@@ -339,7 +347,7 @@ def checkpoint_of(name: str) -> int | None:
 
 
 def fault_of(file: Path) -> str | None:
-    """Verifies a whole file, and returns the problem, or None if the file is intact."""
+    """Verifies a whole file, and returns the problem found, or None if the file is intact."""
     try:
         verify(file)
     except (FileNotFoundError, ValueError) as error:

@@ -27,7 +27,7 @@ class FramesReader:
     """Committed frames, in the memory of this process or in a directory to which another process writes.
 
     Attributes:
-        damaged: maps each frame whose file cannot be read to the reason; these frames are not in ``indices``.
+        damaged: maps each unreadable frame to the reason; these frames are not in ``indices``.
     """
 
     def __init__(self, directory: Path | None = None) -> None:
@@ -49,7 +49,7 @@ class FramesReader:
         self._log: tuple[int, Int] = (-1, NO_EVENTS)
         """Index of the newest frame, and its event log."""
         self._grown: tuple[list[tuple[int, int, int]], Arrays] = ([], {})
-        """Births, and the fixed arrays of all Gaussians after them."""
+        """Cached list of births, and the fixed arrays of all Gaussians after these births."""
 
     @classmethod
     def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> Self:
@@ -80,8 +80,8 @@ class FramesReader:
         """Reads the changes made by the process that writes to this directory, without reopening known frames.
 
         Args:
-            only: indices of frames that may have changed. If None, all states are listed, which is slow for a long
-                scene.
+            only: indices of frames that may have changed. If None, all states are listed, which is slow for long
+                scenes.
 
         Returns:
             The indices of new or rewritten frames, and the indices of deleted frames.
@@ -116,14 +116,14 @@ class FramesReader:
         return added, gone
 
     def older_than_newest(self, newest: int, after: int) -> list[int]:
-        """Returns the frames after ``after``, in increasing order, except the first frame and the ``newest`` newest."""
+        """Returns frames after ``after``, in increasing order, without the first one and the ``newest`` latest ones."""
         first = next(iter(self._times), -1)
         frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
         return list(frames)[::-1]
 
     @property
     def damaged_chunks(self) -> list[str]:
-        """One sentence per damaged compact file whose frames are partly missing from ``indices``."""
+        """One sentence per damaged compact file of which some frames are missing from ``indices``."""
         return [] if self._files is None else self._files.chunks.damaged
 
     def is_compacted(self, index: int) -> bool:
@@ -167,7 +167,7 @@ class FramesReader:
 
     @property
     def files(self) -> FrameFiles | None:
-        """Files on disk, to repair them (``scas4d_core.recompute``), or None for a history in memory."""
+        """Files on disk, for repairs (``scas4d_core.recompute``), or None for a history in memory."""
         return self._files
 
     def time(self, index: int) -> float:
@@ -221,7 +221,7 @@ class FramesReader:
         return unpack_effects(self._left(index))
 
     def _left(self, index: int) -> NDArray[np.uint8] | None:
-        """Returns the packed effect arrays, or None if there are none."""
+        """Returns the packed effect arrays of a frame, or None if there are none."""
         self._require(index)
         left = self._packed.get(index)
         if left is None and self._files is not None:

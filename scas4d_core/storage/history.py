@@ -2,8 +2,8 @@
 
 On disk (``frame_files``), a history has one file with opacities and ids, written once, and one file per committed
 frame with its state, time and report. Frames with newborn Gaussians have a second file. Renaming a frame's file to its
-final name is the commit. One process appends and deletes through a ``History``; other processes only read, and see the
-changes after ``refresh``.
+final name is the commit. Only one process appends and deletes, through a ``History``; other processes only read, and
+see changes after calling ``refresh``.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class History(HistoryReader):
     """The committed states of one scene in frame order, for the process that appends to them.
 
     Args:
-        directory: folder of the states, created if missing. If None, states are kept in memory, and older ones in a
-            scratch file (``move_to_scratch``). For a folder with existing states, use ``History.load`` or
+        directory: folder of the states, created if missing. If None, recent states are kept in memory and older
+            ones in a scratch file (``move_to_scratch``). For a folder with existing states, use ``History.load`` or
             ``History.open``.
 
     Attributes:
-        record_seconds: seconds that the last ``append`` spent on the report: encoding it, and a share of the write time
-            in proportion to its size.
+        record_seconds: time that the last ``append`` spent on the report, in seconds: the encoding time, and a share of
+            the write time proportional to the report's size.
 
     Raises:
         HistoryError: if ``directory`` already contains states.
@@ -121,7 +121,7 @@ class History(HistoryReader):
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:
-        """Commits the state of one frame with its report. With a directory, both are on disk on return.
+        """Commits the state of one frame with its report. If there is a directory, both are on disk when this returns.
 
         Args:
             index: frame index, greater than all previous indices.
@@ -184,8 +184,8 @@ class History(HistoryReader):
     def _birth(self, index: int, born: Gaussians, parents: Int | None, roots: Gaussians | None) -> Arrays:
         """Returns the stored arrays of a birth.
 
-        If a truncated frame is committed again with the same birth, the birth keeps its ids. Any other birth gets ids
-        that no Gaussian ever had, not even in a truncated frame.
+        If a truncated frame is committed again with the same birth, its Gaussians keep their ids. In any other case,
+        they get ids that have never been used, not even in a truncated frame.
         """
         count = len(born)
         origin = born if roots is None else roots.rows(np.arange(len(roots) - count, len(roots)))
@@ -219,7 +219,7 @@ class History(HistoryReader):
             log: event log up to and including the frame.
             births: arrays of births that may not have been written yet, keyed by frame.
             fixed: fixed arrays of the first frame.
-            left: packed arrays of the effects, or None.
+            left: packed effect arrays, or None if there are none.
         """
         if self._files is not None:
             encoded = text.encode()
@@ -278,7 +278,7 @@ class History(HistoryReader):
         return deleted
 
     def move_to_scratch(self, folder: Path | None, keep_newest: int = 1) -> None:
-        """Moves all states except the first and the newest from memory to a scratch file, without any loss.
+        """Moves all states except the first and the newest from memory to a scratch file, bit-identically.
 
         If there is no disk space, states stay in memory. The file is deleted with this history.
 
@@ -333,7 +333,7 @@ class History(HistoryReader):
         """Rewrites the file of a committed frame with identical content.
 
         Returns:
-            False if the frame is not in memory.
+            Whether the file was rewritten; false if the frame is not in memory.
         """
         frame, text = self._frames.get(index), self._texts.get(index)
         if self._files is None or frame is None or text is None or index not in self._times:
@@ -352,7 +352,7 @@ class History(HistoryReader):
         Args:
             index: index of a frame before the newest one.
             time: time of the frame in seconds.
-            arrays: arrays of ``PER_FRAME``, and of ``WHOLES`` if any.
+            arrays: arrays named in ``PER_FRAME``, and those named in ``WHOLES`` if there are any.
             report: report as JSON values; see ``append``.
             effects: arrays that a cold start needs; see ``append``.
 

@@ -25,7 +25,7 @@ from scas4d_core.storage.faults import DamagedFrameError, HistoryError, Unreadab
 from scas4d_core.storage.frames_reader import FramesReader
 
 ROOT = "root."
-"""Name prefix of the birth arrays that describe newborn Gaussians in the first frame (``roots``)."""
+"""Name prefix of the birth arrays that describe newborn Gaussians as they would have been in frame 0 (``roots``)."""
 ROOTS = ("means", "factors", "rotations")
 """Names of the ``Gaussians`` arrays that have separate values in the roots."""
 
@@ -34,7 +34,7 @@ class HistoryReader(FramesReader):
     """Reads committed states from the memory of this process, or from a directory to which another process writes.
 
     Attributes:
-        damaged: maps each frame whose file cannot be read to the reason; these frames are not in ``indices``.
+        damaged: maps each unreadable frame to the reason; these frames are not in ``indices``.
     """
 
     @property
@@ -69,7 +69,7 @@ class HistoryReader(FramesReader):
         return self.gaussians(self.indices[0])
 
     def roots(self, index: int | None = None) -> Gaussians:
-        """Returns the first frame with all later Gaussians at their frame-0 positions (``births.extend_roots``).
+        """Returns the first state plus all later Gaussians at their frame-0 positions (``births.extend_roots``).
 
         Args:
             index: frame up to which births and retirements are included, or None for the newest.
@@ -132,7 +132,7 @@ class HistoryReader(FramesReader):
 
     @property
     def parents(self) -> Int:
-        """[count] row of the parent that the Gaussian in each row joined at birth; −1 if it has none."""
+        """[count] row of the parent of the Gaussian in each row; −1 if it has none."""
         none = np.full(len(self._fixed.get("ids", ())), NO_PARENT, np.int64)
         return np.concatenate([none, *(self._born(birth)["parents"] for birth in births_in(self._events()))])
 
@@ -196,7 +196,7 @@ class HistoryReader(FramesReader):
 
         Args:
             name: name of the array, one of ``PER_FRAME``.
-            indices: indices of committed frames in the order of the result, which may repeat, or None for all frames.
+            indices: indices of committed frames, in any order and possibly repeated, or None for all frames.
             rows: rows of Gaussians, of any shape; the result is then [T, *rows.shape, ...].
 
         Raises:

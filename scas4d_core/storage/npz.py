@@ -39,7 +39,7 @@ PIECE = 1 << 20
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes an npz atomically, via a temporary file that is synced and renamed.
+    """Writes an npz file atomically, via a temporary file that is synced and renamed.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -133,7 +133,7 @@ def member(name: str) -> str:
 
 
 def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Reads arrays of an npz and verifies their checksums; nothing is unpickled.
+    """Reads arrays from an npz file and verifies their checksums; nothing is unpickled.
 
     Args:
         path: path of the file.
@@ -171,7 +171,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
 
 
 def iter_verified(path: Path) -> Iterator[int]:
-    """Verifies a whole npz piece by piece and yields the size of each piece in bytes.
+    """Verifies a whole npz file piece by piece and yields the size of each piece in bytes.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -193,7 +193,7 @@ def iter_verified(path: Path) -> Iterator[int]:
 
 
 def verify(path: Path) -> None:
-    """Verifies a whole npz; raises the same errors as ``iter_verified``."""
+    """Verifies a whole npz file; raises the same errors as ``iter_verified``."""
     for _ in iter_verified(path):
         pass
 
@@ -219,6 +219,6 @@ def _damage(path: Path, error: BaseException) -> ValueError:
 
 
 def clear_parts(folder: Path) -> None:
-    """Removes temporary files of interrupted ``write_npz`` calls. Only the process that writes to it may call this."""
+    """Removes temporary files of interrupted ``write_npz`` calls. Only the folder's writer may call this."""
     for part in folder.glob(".*.npz.*.part"):
         part.unlink(missing_ok=True)

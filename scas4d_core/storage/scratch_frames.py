@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 ROUNDED = 512
-"""Block sizes are multiples of this number of bytes."""
+"""Granularity of block sizes, in bytes."""
 IN_MEMORY = 16
 """Number of newest states that a history without a directory keeps in memory; older states go to a scratch file."""
 
@@ -82,13 +82,13 @@ class ScratchFile:
         return array
 
     def free(self, places: Mapping[str, tuple[int, int]]) -> None:
-        """Releases blocks, given as (offset, bytes), for reuse; lock-free, because garbage collection may call this."""
+        """Releases blocks, given as (offset, size), for reuse. Lock-free, because the garbage collector may call it."""
         for begins, size in places.values():
             self._free.setdefault(_size_class(size), []).append(begins)
 
 
 def _size_class(size: int) -> int:
-    """Returns the block size for an array; blocks of equal size can replace each other."""
+    """Returns the block size for an array of ``size`` bytes; blocks of equal size are interchangeable."""
     return -(-size // ROUNDED) * ROUNDED
 
 
@@ -98,7 +98,7 @@ class ScratchFrame(Mapping[str, NDArray[Any]]):
     Args:
         file: file that contains the arrays.
         begins: offset of each array in the file.
-        frame: arrays of the frame, of which only the dtypes and shapes are used.
+        frame: arrays of the frame; only their dtypes and shapes are used.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -59,7 +59,7 @@ def build_hierarchy(
 
     Args:
         means: [N, 3] positions in metres; Gaussians with non-finite positions belong to no cluster.
-        moving: [N] bool, Gaussians to cluster.
+        moving: [N] bool mask of the Gaussians to cluster.
         clusters: number of clusters per layer, coarse to fine, ascending; no layers if empty.
         smallest: minimum average number of Gaussians per cluster, which caps the numbers of clusters.
         seed: random seed of K-means.

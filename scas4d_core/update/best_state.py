@@ -47,10 +47,10 @@ def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
 
 
 WHOLE = " whole"
-"""Suffix of the names of views compared at full size, in errors that are kept across frames."""
+"""Suffix of the names of views compared at full size, in the errors kept across frames."""
 
 COMMITTED = " committed"
-"""Suffix of the names of views in which a committed state was evaluated at full size, in the same errors."""
+"""Suffix, in the same errors, of the names of views in which a committed state was evaluated at full size."""
 CONFIRMING = 2
 """Number of views in which a committed state is evaluated; full-size images have four times as many pixels."""
 SLOW = 0.5
@@ -274,7 +274,7 @@ class BestState:
         return best
 
     def _best_at_full_size(self, best: Candidate, left_out: Mapping[str, str]) -> Candidate:
-        """Returns the best candidate on full-size images, which may reveal slow motion; ties are resolved to ``best``.
+        """Returns the best candidate on full-size images, which may reveal slow motion; ``best`` wins ties.
 
         The engine's tables are unchanged afterwards.
         """

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 Arrays = dict[str, NDArray[Any]]
 NOTHING: Mapping[str, Arrays] = MappingProxyType({})
-"""Empty mapping, without arrays of any effect."""
+"""Empty mapping, used if no effect has arrays."""
 
 P = TypeVar("P", bound="UpdatePart")
 
@@ -78,7 +78,7 @@ class UpdatePart:
 
 @dataclass(eq=False)
 class PlanBuilder:
-    """Builds the plan and the parts of a scene's updates while the active effects register.
+    """Builds the plan and the parts of a scene's updates, as the active effects register themselves.
 
     Attributes:
         scene: scene settings, with the floor in the internal world.

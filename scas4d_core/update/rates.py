@@ -39,7 +39,7 @@ NEAR_OWN = 2.0
 """Same as ``NEAR_FINEST``, but for the Gaussians' own displacements, which account for the remaining motion. Their
 rotations and scales keep their rates, because synthetic scenes fit less well with higher rates (docs/tried.md)."""
 LEAST_TIME = 0.3
-"""Minimum share of the iterations for a layer before it is frozen."""
+"""Minimum share of the iterations in which a layer learns before it is frozen."""
 NEAR = 0.6
 """Maximum unexplained share of the change for early freezing of layers. With every second frame left out, the share was
 about 0.55 to 1.2, and unconditional freezing cost 0.6 to 3.5 dB (docs/tried.md)."""
@@ -174,7 +174,7 @@ class Rates:
         )
 
     def for_warm_start(self, unexplained: float) -> Rates:
-        """Returns the rates for a previous motion that leaves a share of the change unexplained.
+        """Returns the rates for a warm start, given the share of the change that the previous motion does not explain.
 
         If the share is at most ``NEAR``, layers are frozen early, and the finest layer and the Gaussians' own Δp learn
         faster. Otherwise no layer is frozen.

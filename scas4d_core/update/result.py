@@ -19,11 +19,11 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Function that takes the first PSNR of each camera in dB, and returns the reason for each camera to exclude."""
+"""Function that takes each camera's first PSNR in dB, and maps each camera to be excluded to the reason."""
 
 
 class Stopwatch:
-    """Measures the time of each stage; the overhead of the timers counts as ``REPORT``.
+    """Measures the time spent in each stage; the overhead of the timers counts as ``REPORT``.
 
     Args:
         began: ``perf_counter`` value at the start, or None for the current time.
@@ -105,11 +105,12 @@ AS_CONFIGURED = AttemptOptions()
 
 
 class CameraFit(TypedDict):
-    """The fit of one camera when it was last rendered; a row of the report on disk.
+    """The fit of one camera when it was last rendered, stored as a row of the report.
 
     Keys:
-        psnr: PSNR in dB. colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1, or None if not
-        measured. health: 1 if the camera fits as usual relative to the other cameras, 0 at the exclusion limit
+        psnr: PSNR in dB.
+        colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1, or None if not measured.
+        health: 1 if the camera fits as usual relative to the other cameras, 0 at the exclusion limit
             (``outliers.health``).
     """
 
@@ -134,11 +135,11 @@ class UpdateTrace:
         seconds: time spent in each stage, in seconds.
         first: PSNR of each camera when first rendered, in dB.
         cameras: fit of each camera when last rendered.
-        left_out: reason for each camera that the gate excluded.
+        left_out: maps each camera excluded by the gate to the reason.
         planned: (iteration, total iterations) for each change of plan by the stopping rule.
         errors: image loss of each candidate in each probe view; empty if nothing was compared.
         kept: candidate that became Θ_t.
-        whole: whether these errors are for full-size images.
+        whole: whether ``errors`` are for full-size images.
         shown: rendering of each camera in the last ``engine.KEPT_PICTURES`` iterations, which evidence uses without
             rendering again. Empty if the update ended earlier than planned.
         guards: number of interventions of each guard that intervened.

@@ -104,13 +104,13 @@ UNTIMED = 100
 RATE = 0.3
 """Rate at which the budget's predictions follow new measurements."""
 FOR_BIRTHS = 0.4
-"""Share of the time budget for fitting added Gaussians: about the time of an update when an object enters."""
+"""Share of the time budget for fitting added Gaussians: about as long as an update takes when an object enters."""
 AFTER_S = 0.05
 """Predicted time after the last iteration before any frame has been measured, in seconds."""
 
 
 class Stopping:
-    """Determines the length of an update by a number of iterations, a time limit, or an early stop without progress.
+    """Determines when an update ends: after a number of iterations, at a time limit, or once it makes no progress.
 
     Args:
         most: maximum number of iterations.
@@ -120,7 +120,7 @@ class Stopping:
         gain: minimum relative decrease of the error on the probe views per ``LOOK_EVERY`` iterations; with less, the
             update cools down and stops. Probe views are training views, never held-out ones. If 0, there is no early
             stop.
-        first: share of the iterations before which there is no early stop, so that late parameters have started.
+        first: share of the iterations before which there is no early stop, so that all parameters have started.
         clock: function that returns the current time in seconds.
 
     Attributes:
@@ -195,7 +195,7 @@ class TimeBudget:
         iteration_seconds: predicted time per iteration in seconds, or None if unknown.
         after: predicted time from the last iteration to the end of the commit in seconds, without fits of added
             Gaussians.
-        births: whether the next frame reserves time for such fits, because the previous frame had such fits.
+        births: whether time is reserved for such fits in the next frame, because the previous frame had some.
     """
 
     def __init__(self, milliseconds: float | None) -> None:

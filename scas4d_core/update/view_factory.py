@@ -93,7 +93,7 @@ class ViewFactory:
         return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure)
 
     def retouched(self, view: TrainingView, target: Array) -> TrainingView:
-        """Returns the view with different planes [C, H, W] of the same size."""
+        """Returns the view with its planes replaced by ``target`` [C, H, W], which has the same size."""
         return TrainingView(view.name, view.camera, target, view.exposure)
 
     def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:

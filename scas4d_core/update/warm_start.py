@@ -145,7 +145,7 @@ def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_
 
 
 def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
-    """Returns the motion without the parameters that are not free in the next update, or None for no motion.
+    """Returns the motion without the parameters that are not free in the next update, or None if there is none.
 
     >>> motion = Motion([np.ones((1, 3))], [np.ones((1, 3))], np.ones((2, 3)), np.ones((2, 3)), 0.1)
     >>> predicted(motion, Freedom(cluster_rotation=True, prediction=True)).shifts

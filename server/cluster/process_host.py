@@ -44,7 +44,7 @@ class ProcessScheduling:
 
     Attributes:
         threads: value of OMP_NUM_THREADS, which Ray would otherwise set to the actor's number of CPUs.
-        nice: niceness, which Ray would otherwise raise by 15, so that a worker yields to all other processes on its node.
+        nice: niceness, which Ray would otherwise raise by 15, making a worker yield to every other process on its node.
     """
 
     threads: str | None = None

@@ -214,7 +214,7 @@ class Ingest:
         return receipt
 
     def publish_ended(self, index: int) -> None:
-        """Publishes a frame that ended without an update: skipped, missing, or before the reconstruction's first frame."""
+        """Publishes a frame that ended without an update: skipped, missing, or before the first reconstructed frame."""
         self._publisher.publish_frame(self.ledger.frames[index].report)
 
     # Rules. These methods do not change any state.

@@ -105,7 +105,7 @@ class Scrub:
         await self._scrub_frames()
 
     async def _read(self, pieces: Iterator[int], weight: int = 1) -> str | None:
-        """Reads a file to its end; returns a description of its fault, `GONE` if the file is missing, or None if it is intact."""
+        """Reads a file to its end; returns its fault, `GONE` if the file is missing, or None if it is intact."""
         try:
             while (size := await asyncio.to_thread(next, pieces, None)) is not None:
                 counters.SCRUBBED.inc(size)

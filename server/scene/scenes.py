@@ -314,7 +314,7 @@ class Scenes:
         """Raises the `Problem` for a scene that does not exist or is not available yet.
 
         Raises:
-            Problem: 503 if the scene may still be in recovery, otherwise 404.
+            Problem: 503 if the scene is still being recovered, otherwise 404.
         """
         self.recovering.check(id)
         reason = f": {self.unreadable[id]}" if id in self.unreadable else ""

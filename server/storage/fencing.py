@@ -1,9 +1,9 @@
 """Fencing of workers with one state folder per epoch, so that writes of an abandoned worker are never read.
 
 A worker on another machine may hang, be presumed dead, and resume after another worker has taken over its scene. File
-locks do not work across machines, and checking before each write leaves a race condition. Every worker therefore commits to its
-own folder, `states.EPOCH`. Initially, it contains hard links to the files that the previous worker committed. The
-symbolic link `states` points to the folder of the current worker, and all readers follow it.
+locks do not work across machines, and checking before each write leaves a race condition. Every worker therefore
+commits to its own folder, `states.EPOCH`. Initially, the folder contains hard links to the files that the previous
+worker committed. The symbolic link `states` points to the folder of the current worker, and all readers follow it.
 
 The service creates the folder and moves the link before it starts the worker. Anything that the previous worker writes
 afterwards ends up in a folder that nobody reads. Only the compact file that is still being written changes in place, so

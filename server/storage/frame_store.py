@@ -1,7 +1,7 @@
 """Frame log of a scene: images as they were uploaded, one record per file, written while they are received.
 
-A file gets its final name immediately and is treated as an orphan until the journal references it. No frame is copied or
-renamed, an interrupted write damages at most one record, and retention deletes whole files.
+A file gets its final name immediately and is treated as an orphan until the journal references it. No frame is copied
+or renamed, an interrupted write damages at most one record, and retention deletes whole files.
 """
 
 from __future__ import annotations

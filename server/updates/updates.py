@@ -131,7 +131,7 @@ class Updates:
         return [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
 
     def begin(self) -> None:
-        """Sends the next waiting frame to an idle worker; call this whenever the queue or the worker's state may change."""
+        """Sends the next waiting frame to the worker if idle; call this when the queue or worker state changes."""
         if self._stopped:
             return
         self._publisher.publish_status()

@@ -76,11 +76,11 @@ def _centre(gains: Array) -> Array:
 
 
 def spread_of(seen: FrameObservation) -> float | None:
-    """Returns the standard deviation of colour gains over cameras, in linear light, or None with too few cameras.
+    """Returns the standard deviation of colour gains over cameras, in linear light, or None if there are too few.
 
     The gains are estimated from the mean colours of images and renderings. The factor common to all channels of a
-    camera is removed. Glossy objects in front of black, and objects that are rendered slightly too small, change all
-    channels alike.
+    camera is removed, because glossy objects on a black background and objects that are rendered slightly too small
+    affect all channels equally.
     """
     spreads = []
     for view in seen.views:
@@ -100,7 +100,7 @@ class CameraGain(Effect):
     """Estimates a gain per camera and channel from the renderings of an update."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns how much the gains differ between cameras, including the gains that are already compensated."""
+        """Returns how much the gains differ between cameras, including gains that are already compensated for."""
         spread = spread_of(seen)
         return (
             None

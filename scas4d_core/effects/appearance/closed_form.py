@@ -4,7 +4,7 @@ Each step changes a Gaussian's colour by the mean residual (image minus renderin
 weighted by the Gaussian's share of each pixel. This is SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
 1994). Steps of size 1 do not overshoot, because the shares of a pixel sum to at most 1. The kernels are shared
 with the rasterizer. The last subset dominates where views disagree, for example at a new object that the state does not
-contain yet. Therefore each subset has views from all sides, and the residual of each pixel is clamped.
+contain yet. Therefore each subset contains views from all sides, and each pixel's residual is clamped.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from scas4d_core.engines.views import TrainingView
 
 SUBSETS = 6
-"""Number of steps per frame; the views are divided evenly between them."""
+"""Number of steps per frame; the views are divided evenly among them."""
 MOST = 0.2
-"""Limit on the residual of a pixel, RGB in 0…1; larger differences are not due to lighting. On `visit`, which a ball
-enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
+"""Limit on the residual of a pixel, RGB in 0…1; larger differences are not due to lighting. On `visit`, in which
+a ball enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
 FEW = 1.0
 """Number of pixels added to each Gaussian's blending weight, so that barely visible Gaussians keep their colours."""
 

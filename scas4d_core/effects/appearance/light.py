@@ -1,4 +1,4 @@
-"""Changing light: colours adapt faster, and those of moving Gaussians as fast as those of static Gaussians.
+"""Changing light: colours adapt faster, and those of moving Gaussians at least as fast as those of static ones.
 
 A lamp that moves or dims changes colours with few degrees of freedom: surfaces with similar orientation and position
 become brighter or darker together. This joint change is the evidence. The colours themselves adapt individually.
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # fastest and whose shading therefore changes under constant light), 0.012 on stage with its moving shadows, 0.023 to
 # 0.061 on lamps while the lamp moves.
 SAMPLE = 2000
-"""Approximate number of Gaussians used for the evidence (up to twice as many), for only seven estimates per channel."""
+"""Approximate number of Gaussians used for the evidence (up to twice as many); enough for 7 unknowns per channel."""
 OPAQUE = 0.3
 """Minimum opacity at which a Gaussian's colour counts as the colour of a surface."""
 
@@ -50,7 +50,7 @@ def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Dou
 
 
 def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> float:
-    """Returns the RMS relative colour change between two states that orientation and position explain.
+    """Returns the RMS relative colour change between two states, as explained by orientation and position.
 
     Args:
         centre: [3] centre of the cameras, in metres.

@@ -30,7 +30,7 @@ class ShadingPart(UpdatePart):
         self._moves[builder.hierarchy.rows] = 1
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Updates the colours if the update kept its motion and learnt colours."""
+        """Updates the colours unless the update fell back to Θ_{t−1} or learns no colours of moving Gaussians."""
         if attempt.kept is Candidate.PREVIOUS or attempt.rates.colour == 0 or not self._moves.any():
             return state
         return follow_pictures(state, attempt.views, attempt.renderer, self._moves)

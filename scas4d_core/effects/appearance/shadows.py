@@ -1,8 +1,8 @@
 """Moving shadows and light: the colours of static Gaussians follow the images once per frame, in closed form.
 
-At the end of an update, the colours of static Gaussians take the steps of ``closed_form``. This only happens in frames
-in which the static scene looks different from frame 0. In other frames, it would fit noise and disagreement between
-cameras.
+At the end of an update, the colours of static Gaussians are updated as in ``closed_form``. This only happens in frames
+in which the static scene looks different from frame 0. In other frames, the update would fit noise and disagreement
+between cameras.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 NAME = "shadows"
 CHANGED = 0.02
-"""Difference of a mean colour, RGB in 0…1, above which a square looks different from frame 0."""
+"""Difference of a mean colour, RGB in 0…1, above which a square of pixels looks different from frame 0."""
 HARDLY = 0.005
 """Maximum share of changed static squares at which nothing is learnt from a frame. With a tenth of this value,
 `basketball` gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""
 ENOUGH = 0.5
-"""Minimum share of frame 0's cameras that a frame must have to be learnt; with fewer, noise would be learnt."""
+"""Minimum share of frame 0's cameras that a frame must contain for an update; with fewer, noise would be learnt."""
 STANDS = 0.05
 """Minimum share of static Gaussians; with fewer, there is no background for shadows."""
 
@@ -70,7 +70,7 @@ class Shadows(Effect):
         return refusal_at_zero(settings, "rate_static_colour")
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns a [h, w, 4] float16 array per view: each square's mean colour, and 1 if moving Gaussians reach it."""
+        """Returns a [h, w, 4] float16 array per view: each square's mean colour, and a flag for moving Gaussians."""
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:

@@ -45,7 +45,7 @@ class AlignedPixels(NamedTuple):
     """An image and its rendering at selected pixels.
 
     Attributes:
-        target, shown: [3, P] RGB of the image and of the rendering in 0…1, with the camera's exposure.
+        target, shown: [3, P] RGB of the image and of the rendering in 0…1, with the camera's exposure applied.
         slopes: [3, 2, P] image gradients per pixel, along x and y.
         places: [2, P] pixel positions u, v.
         pixels: [P] flat pixel indices in the image.
@@ -62,8 +62,8 @@ class Equations(NamedTuple):
     """The normal equations of one image in K unknowns.
 
     Attributes:
-        matrix: [K, K] matrix. A twist ξ leaves the weighted squared error ``energy − 2 vector·ξ + ξ·matrix·ξ``, in
-            units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``.
+        matrix: [K, K] matrix. After a twist ξ, the weighted squared error is ``energy − 2 vector·ξ + ξ·matrix·ξ``,
+            in units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``.
         vector: [K] right-hand side.
         energy: weighted squared error without a twist.
         depth: depth of the image centre, in metres.
@@ -181,7 +181,7 @@ def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
 
 
 def turn_from_pixels(lens: Array) -> Double:
-    """Returns the [3, 3] matrix from the three unknowns of ``turn_equations`` to a rotation in radians."""
+    """Returns the [3, 3] matrix that maps the unknowns of ``turn_equations`` to a rotation in radians."""
     fx, fy, width = float(lens[0]), float(lens[1]), float(lens[4])
     return np.array([[0, -1 / fy, 0], [1 / fx, 0, 0], [0, 0, 4 / width]])
 
@@ -200,10 +200,10 @@ def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | Non
     """Returns the [6] increment of a twist. A prior keeps the total twist small if the image constrains it weakly.
 
     Args:
-        one: equations of the camera.
+        one: normal equations of the camera.
         lens: camera parameters; see ``flow``.
         twist: [6] current twist of the camera, with its translation in metres.
-        vector: [6] vector to use instead of the equations' own vector, or None.
+        vector: [6] right-hand side to use in place of ``one.vector``, or None to use ``one.vector``.
     """
     focal, units = float(lens[0] + lens[1]) / 2, np.array([one.depth] * 3 + [1.0] * 3)
     before = np.array([(focal / SHIFTED) ** 2] * 3 + [(focal / TURNED) ** 2] * 3)
@@ -213,7 +213,7 @@ def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | Non
 
 
 def to_camera_twist(one: Equations, pose: Double) -> Double:
-    """Returns the [6, 6] matrix from a twist in world axes to the unknowns of a camera's equations.
+    """Returns the [6, 6] matrix that maps a twist in world axes to the unknowns of a camera's equations.
 
     Args:
         pose: [4, 4] world-to-camera matrix.
@@ -236,7 +236,7 @@ def adjoint(pose: Double) -> Double:
 
 
 def twist_to_matrix(twist: Double) -> Double:
-    """Returns the [4, 4] exponential of a twist [6].
+    """Returns the [4, 4] matrix exponential of a twist [6].
 
     >>> twist_to_matrix(np.array([1.0, 2, 3, 0, 0, 0]))[:3, 3]
     array([1., 2., 3.])

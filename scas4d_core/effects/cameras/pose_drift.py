@@ -56,10 +56,10 @@ CAMERAS = 4
 ENOUGH = 0.5
 """Minimum share of the rig's cameras that a frame must contain to be used."""
 LEAST = 0.25
-"""Minimum offset of a suspect camera, in pixels. Fixed cameras have at most 0.15 on captures, 0.4 on shaken cloth."""
+"""Minimum offset of a suspect camera, in pixels. Fixed cameras reach at most 0.15 on captures, 0.4 on shaken cloth."""
 TIMES = 4.0
 """Minimum ratio of a suspect camera's offset to the median offset; if many cameras seem to be off, the tracking
-lags."""
+is lagging."""
 # Measurements on which the effect's threshold is based: at half size, captures with fixed cameras have shares of at
 # most 0.14 on cloth played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
 SHARE = 0.5
@@ -74,7 +74,8 @@ and stays excluded."""
 COVERED = 0.1
 """Minimum alpha at which a pixel has a depth."""
 SMALLEST = 1e-3
-"""Regularization of the 3×3 equations of a rotation in pixels. It acts as a weak prior: a plain wall shows no rotation.
+"""Regularization of the 3×3 equations of a rotation in pixels. It acts as a weak prior, because a plain wall shows no
+rotation.
 """
 
 
@@ -196,7 +197,7 @@ def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
 
 
 def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
-    """Returns the [C, 6] twists without the twist that most cameras share, which is scene motion.
+    """Returns the [C, 6] twists with the motion shared by most cameras removed, because it is scene motion.
 
     The shared twist is the median of each component, in world axes, over the accepted cameras. With a mean, a camera
     that is off by 3 pixels would move the other cameras, and the world with them.
@@ -251,7 +252,7 @@ class PoseDrift(Effect):
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the largest share of a camera's residual that its offsets from earlier frames explain."""
+        """Returns the largest share of any camera's residual explained by its offsets from earlier frames."""
         arrays = seen.result.carried.get(NAME)
         if arrays is None or not _says(seen):
             return None

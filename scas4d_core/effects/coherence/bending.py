@@ -4,7 +4,7 @@ The loss term ``rotation`` is a sum of norms of differences, so it removes rotat
 finds rigid parts, but in swinging cloth it removes nearly all rotation differences. In bending scenes the term is
 therefore switched off. Rigidity, which couples positions to these rotations, fades to zero during an update.
 
-The evidence only uses positions, so it is comparable with and without these terms. It measures patches that each
+The evidence uses only positions, so it is comparable with and without these terms. It measures patches that each
 contain about a hundredth of the moving Gaussians. The evidence is the median rotation of a patch relative to the
 surrounding patches, minus the part of its motion that is not a rotation. Joints affect few patches, and badly tracked
 patches do not move rigidly, so neither provides evidence.
@@ -35,7 +35,7 @@ PATCH = 40
 PATCHES = 400
 """Approximate number of patches (up to twice as many); the evidence is the median over patches."""
 AROUND = 19
-"""Number of nearest patches with which a patch is compared; together they cover a twentieth of the object."""
+"""Number of nearest patches that each patch is compared with; together they cover a twentieth of the object."""
 REST = 1e-3
 """Minimum motion relative to the extent of the moving Gaussians; if 90 % move less, the frame provides no evidence."""
 

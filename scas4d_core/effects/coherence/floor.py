@@ -26,10 +26,10 @@ FLOOR_WEIGHT = 2.0
 def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
     """Converts a plane (a, b, c, d) from the user's world to the internal world.
 
-    Points with a·x + b·y + c·z + d > 0 are below the floor; in the internal world, the value is the depth in metres.
+    Points with a·x + b·y + c·z + d > 0 are below the floor; in the internal world, the value is that depth in metres.
 
     Raises:
-        ValueError: if (a, b, c) is not a direction.
+        ValueError: if (a, b, c) has zero length.
     """
     normal = np.asarray(plane[:3], dtype=np.float64)
     length = float(np.linalg.norm(normal))

@@ -1,7 +1,7 @@
 """Hull of new objects: voxels that several cameras see as new and that few cameras see through.
 
-The hull is carved from an octree, like the visual hull of frame 0. Each camera has a silhouette, and also pixels in
-which it is ignored because a moving object of the state may hide the new one.
+The hull is carved from an octree, like the visual hull of frame 0. Each camera contributes a silhouette. It is ignored
+at pixels in which a moving object of the state may hide the new one.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Hull:
 
 
 def carve_new(seen: Sequence[Novelty]) -> Hull:
-    """Carves new objects from a cube about the scene centre that contains all cameras.
+    """Carves new objects from a cube around the scene centre that contains all cameras.
 
     Args:
         seen: novelty map of each camera.
@@ -92,7 +92,7 @@ def _depth_of(one: Novelty, point: Float) -> float:
 
 
 def _distance(pixels: Bool) -> Float:
-    """Returns the [H, W] distances to the nearest true pixel, in pixels, or infinity if there is no such pixel."""
+    """Returns the [H, W] distance of each pixel to the nearest true pixel, in pixels, or infinity if there is none."""
     if not pixels.any():
         return np.full(pixels.shape, np.inf)
     result: Float = distance_transform_edt(~pixels)
@@ -159,7 +159,7 @@ def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
-    """Returns the [H, W] mask of a camera's pixels that show voxels with centres [P, 3]."""
+    """Returns the [H, W] mask of a camera's pixels that are covered by voxels with centres [P, 3]."""
     column, row, depth, inside = pixels_inside(one.camera, points)
     shown = np.zeros(one.new.shape, np.bool_)
     shown[row[inside], column[inside]] = True
@@ -171,7 +171,9 @@ def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
 
 
 def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Returns the median colour [P, 3] over the cameras that see a point as new (NaN if none do), and their number [P].
+    """Returns each point's median colour [P, 3] over the cameras that see it as new, and the camera count [P].
+
+    The colour is NaN if no camera sees the point as new.
 
     Args:
         seen: novelty map of each camera.

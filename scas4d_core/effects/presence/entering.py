@@ -29,20 +29,20 @@ Bool = NDArray[np.bool_]
 
 NAME = "entering"
 MIN_CAMERAS = 2
-"""Minimum number of screened cameras that see something new before all cameras are checked."""
+"""Minimum number of screened cameras that must see something new before all cameras are checked."""
 SMALLEST = 0.003
 """Minimum share of new pixels in an image for a camera to count (200 of 256 x 256). Moving objects that are tracked
 with a lag leave fewer new pixels."""
 SHARE = 0.05
 """Minimum share of all images' squared error that an object must explain to switch the effect on."""
 WORTH = 0.01
-"""Minimum share of the error for adding Gaussians while the effect is on."""
+"""Minimum share of the error that an object must explain for Gaussians to be added while the effect is on."""
 SURPLUS = 0.5
 """Minimum surplus of new over stale pixels, relative to the object's pixels; otherwise the object has only moved."""
 BORDER, SUDDEN = 0.5, 0.2
 """New objects enter across the image border. The first value is the minimum share of cameras in which an object touches
 the border. The second is the minimum share of the error for an object that appears elsewhere. A limb that is tracked
-with a lag can look like such an object: 0.07 in `stage`."""
+with a lag can look like such an object; in `stage`, its share is 0.07."""
 TINY = 1e-12
 """Lower bound on a sum of squared errors, to avoid division by zero."""
 SETTLED = 4
@@ -71,13 +71,13 @@ BUDGET = 0.1
 
 @dataclass(frozen=True, eq=False)
 class EnteredThings:
-    """Objects that have entered, as a hull.
+    """Objects that have entered the scene, represented by their hull.
 
     Attributes:
         seen: novelty map of each camera.
         hull: hull of the accepted objects.
         share: share of the squared error that the objects explain.
-        cameras: number of cameras that see the most widely seen object.
+        cameras: number of cameras that see the object seen by the most cameras.
     """
 
     seen: Sequence[Novelty]
@@ -159,7 +159,7 @@ class Entering(Effect):
     """Adds Gaussians in frames that show objects missing from the state."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the error share that new objects explain, or the recorded share while added Gaussians are present."""
+        """Returns the share of the error explained by new objects, or the recorded share if added Gaussians exist."""
         if not seen.views:
             return None
         left = seen.result.carried.get(NAME)

@@ -1,6 +1,6 @@
 """Leaving objects: moving Gaussians are retired when they and their neighbourhood are outside all images.
 
-They keep their rows and ids. They are neither rendered nor moved until something that they explain comes into view.
+They keep their rows and ids. They are neither rendered nor moved until an object that they explain comes into view.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 NAME = "leaving"
 SHARE, IDLE_SHARE = 0.02, 0.002
-"""Shares of the moving Gaussians outside all images at which the effect switches on, and below which it may switch off.
+"""Shares of moving Gaussians outside all images: at the first the effect is switched on, below the second it may be
+switched off.
 """
 FRAMES = 2
 """Number of consecutive frames outside all images before a Gaussian is retired; objects at the border come and go."""

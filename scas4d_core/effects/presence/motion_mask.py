@@ -29,11 +29,11 @@ CHANGE = 0.04
 REACH_PIXELS = 5
 """Side of the square marked around a changed pixel, because the inside of a plain surface moves without changing."""
 SEEN_PIXELS = 0.02
-"""Blending weight of a Gaussian, in pixels, above which a camera has a vote on it."""
+"""Blending weight of a Gaussian, in pixels, above which a camera may vote on it."""
 IN_CHANGE = 0.5
 """Share of a Gaussian's weight in changed pixels above which a camera votes that it moves."""
 MAJORITY = 0.5
-"""Share of the voting cameras, and at least two cameras, that must agree that a Gaussian moves."""
+"""Share of the voting cameras that must agree that a Gaussian moves; at least two cameras must agree."""
 
 STANDING_SHARE = 0.1
 """Minimum share of static Gaussians in a scene with a static part; below it, static labels are noise."""
@@ -44,7 +44,7 @@ a mask and with the Gaussian in view are considered. Automatic masks are ragged;
 `basketball` equally well.
 """
 INSIDE_CAMERAS = 3
-"""Minimum number of cameras for this vote; the intersection of only two silhouettes contains much empty space."""
+"""Minimum number of cameras for ``INSIDE_SHARE``; the intersection of two silhouettes contains much empty space."""
 
 FIRST_LABELS = 32
 """Minimum number of moving Gaussians for learning the first labels. A mouse in a room makes up only a few hundredths of

@@ -35,16 +35,17 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 ITERATIONS = 400
-"""Number of iterations of a fit; on image crops they take less time than an update of 100 iterations."""
+"""Number of iterations of a fit; on image crops, they take less time than an update of 100 iterations."""
 SETTLING = 150
 """Number of iterations for refining recently added Gaussians after each update."""
 FEWEST = 0.25
-"""Minimum share of a fit's iterations that must fit into the available time. Half-fitted Gaussians would harm all later
+"""Minimum share of a fit's iterations for which there must be enough time. Half-fitted Gaussians would harm all later
 frames, and the next frame detects the object again anyway."""
 SHORTEST = 1e-6
 """Minimum length of an axis, in metres."""
 FIRST_OPACITY = 0.6
-"""Initial opacity of an added Gaussian; its surface is known, so it is above the 0.1 of the unreliable initial cloud.
+"""Initial opacity of an added Gaussian. Its surface is known, so the value is higher than the 0.1 used for the
+unreliable initial cloud.
 """
 CONFIRMED = 2
 """Minimum number of cameras that must see the colour of a point."""
@@ -119,7 +120,7 @@ def refine_newborns(
     Args:
         state: state Θ_t.
         rows: rows of recently added Gaussians, whose hull and first update were coarse. Revived glossy Gaussians are
-            skipped, because the fit has only colours and no gloss.
+            skipped, because the fit models colours but no gloss.
         views: training views of the frame.
         rig: cameras in the internal world.
         renderer: renderer with the background and limits of the scene.

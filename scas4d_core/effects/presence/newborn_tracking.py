@@ -60,7 +60,7 @@ class NewbornTracking(UpdatePart):
 
 
 def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
-    """Returns the [3] displacement of an object since it was added. Retries may start where another attempt ended."""
+    """Returns an object's [3] displacement since it was added, non-zero if a retry starts where an attempt ended."""
     rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):
         return np.zeros(3)

@@ -31,7 +31,7 @@ Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]
 
 THERE, ABSENT = 0.5, 0.3
-"""Rendered labels above which a pixel shows a moving Gaussian, and below which it shows none."""
+"""Rendered label above which a pixel shows a moving Gaussian, and label below which it shows none."""
 RIM = 3
 """Minimum width of a region, in pixels; narrower regions are outlines that are off by a pixel."""
 BARE = 0.5
@@ -53,7 +53,7 @@ class Novelty:
         stale: [H, W] mask of pixels in which the state shows something that the image does not show.
         covered: [H, W] mask of pixels in which the state shows a moving object, which may hide something new.
         bare: [H, W] mask of pixels in which the state is empty but the image shows static background.
-        behind: [H, W] mask of pixels in which image and state show no moving object, as far as measurable.
+        behind: [H, W] mask of pixels in which image and state show no moving object, as far as can be measured.
         error: [H, W] squared difference between image and rendering, averaged over channels.
     """
 
@@ -158,7 +158,7 @@ def _all_corners(plane: Bool) -> Bool:
 
 
 def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
-    """Returns novelty maps with the previous frame's colours, because static colours may have absorbed a new object."""
+    """Returns novelty maps rendered in the previous frame's colours; static colours may have absorbed a new object."""
     state = seen.result.gaussians
     known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]

@@ -44,7 +44,7 @@ class ReturnedThing(NamedTuple):
 
 
 def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[ReturnedThing]:
-    """Returns the retired Gaussians that explain new objects if they are only moved to the hull's centre.
+    """Returns the retired Gaussians that explain new objects when simply moved to the hull's centre.
 
     Args:
         seen: novelty map of each camera.

@@ -29,14 +29,14 @@ SMALLEST = 0.0004
 SHARE = 0.03
 """Minimum share of all images' squared error that must be in bare regions to switch the effect on."""
 WORTH = 0.005
-"""Minimum share of the error for adding Gaussians while the effect is on."""
+"""Minimum share of the error in bare regions for Gaussians to be added while the effect is on."""
 BUDGET = 0.05
 """Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
 
 Found = tuple[UncoveredPoints, float]
 _points_cache: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
-"""Results for each state and minimum number of screened cameras, used for evidence and for adding Gaussians."""
+"""Cached results for each state and minimum number of screened cameras; used for evidence and to add Gaussians."""
 
 
 def _find_points(seen: FrameObservation, glanced: int) -> Found | None:
@@ -68,7 +68,7 @@ class UncoveredEffect(Effect):
     """Adds static Gaussians behind moving objects."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the error share of bare regions. Once Gaussians have been added, fewer cameras must see them."""
+        """Returns the share of the error in bare regions. Once Gaussians are added, fewer cameras must see a region."""
         if not seen.views:
             return None
         points = _find_points(seen, MIN_CAMERAS_WHILE_ON if NAME in seen.result.carried else MIN_CAMERAS)

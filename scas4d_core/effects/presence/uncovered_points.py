@@ -36,7 +36,7 @@ ROUNDS = 5
 NEAR = 0.02
 """Approximate relative deviation of an inlier from the plane, in inverse depth."""
 CAMERAS, SPREAD = 3, 0.08
-"""Minimum number of cameras that see a point, and maximum mean absolute colour deviation, 0…1, for agreement."""
+"""Minimum number of cameras that must see a point, and maximum mean absolute colour deviation (0…1) for agreement."""
 APART = 1.3
 """Spacing of points, in pixels of the camera that sees them best."""
 
@@ -121,7 +121,7 @@ def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:
 
 
 def _agreed(seen: Sequence[Novelty], points: Float) -> tuple[Array, Bool]:
-    """Returns the median colour [P, 3] over the cameras that see static background, and whether they agree [P]."""
+    """Returns the median colour [P, 3] over the cameras that see static background, and a mask [P] of agreement."""
     samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
     bare = np.zeros(len(points), np.int64)
     for sample, one in zip(samples, seen, strict=True):

@@ -23,7 +23,7 @@ class Adam:
         by_row: [n] learning rate factor of each row.
 
     Attributes:
-        guards: number of times that each guard was triggered.
+        guards: number of times each guard was triggered.
     """
 
     def __init__(
@@ -42,7 +42,8 @@ class Adam:
 
         Args:
             gradients: [n, columns] gradients of the parameters.
-            factor: factor that scales all learning rates. If 0, the step is skipped and the moments are unchanged.
+            factor: factor that scales all learning rates. If it is 0, the step is skipped and the moments remain
+                unchanged.
         """
         if factor == 0:
             return

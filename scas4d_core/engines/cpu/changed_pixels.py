@@ -1,9 +1,9 @@
-"""Incremental rendering and loss of the pixels covered by moving Gaussians, for updates with fixed static Gaussians.
+"""Incremental rendering and loss of the pixels covered by moving Gaussians, used while static Gaussians are fixed.
 
-Moving Gaussians only change the blocks (4×4 pixels) that their supports intersect. In these blocks, moving Gaussians
-and intersecting static Gaussians are rendered in the same order as in the full image. Pixels and gradients are
-therefore bit-identical to a full rendering. All other pixels only show static Gaussians, and are rendered again only
-when the static Gaussians change.
+Moving Gaussians only affect the blocks (4×4 pixels) that their supports intersect. In these blocks, all intersecting
+Gaussians, both moving and static, are rendered in the same order as in the full image. Pixels and gradients are
+therefore bit-identical to those of a full rendering. All other pixels show only static Gaussians, and are re-rendered
+only when the static Gaussians change.
 
 Candidate blocks and their static Gaussians are determined once per frame and view, around the current moving Gaussians.
 The blocks to render are determined in every iteration. The image loss is evaluated near all candidate blocks; the loss
@@ -36,7 +36,7 @@ MARGIN = 2
 REACH = 2 * image_loss.REACH
 """Distance in pixels within which the gradient depends on the image: twice the radius of the SSIM window."""
 MOST = 0.6
-"""Fraction of moving Gaussians above which full images are cheaper, because few Gaussians are static."""
+"""Fraction of moving Gaussians above which rendering full images is cheaper, because few Gaussians are static."""
 
 
 @dataclass(eq=False)
@@ -54,7 +54,7 @@ class Region:
             losses are included in ``outside_losses``.
         view: view to which the following fields belong, or None if no view is loaded yet.
         target: [C, h, w] crop of the view's target.
-        moments: crops of the target's two SSIM moments, with the same shape.
+        moments: crops of the target's two SSIM moments, each with the same shape as ``target``.
         outside_losses: image loss, mask loss and squared error of the constant part of the image.
     """
 
@@ -71,7 +71,7 @@ class Region:
 
 
 class ChangedPixels(CpuRenderer):
-    """A ``CpuRenderer`` for states in which only the moving Gaussians change between calls of ``load_state``.
+    """A ``CpuRenderer`` for states in which only the moving Gaussians change between calls to ``load_state``.
 
     The gradients of static Gaussians are 0.
 
@@ -106,7 +106,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = np.zeros(3)
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame. If static Gaussians have changed, they will be rendered again."""
+        """Loads the initial state of a frame. If static Gaussians have changed, they will be re-rendered."""
         features = previous.features(previous.colours)
         state = take_rows((previous.means, previous.factors, previous.opacities, features), self._static_rows)
         if self._static_state is None or not all(map(np.array_equal, state, self._static_state)):
@@ -145,7 +145,7 @@ class ChangedPixels(CpuRenderer):
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``. If exactly the moving Gaussians are requested, only their pixels are rendered."""
+        """See ``Renderer.residuals``. Renders only changed pixels if ``learnt`` is exactly the moving Gaussians."""
         if not np.array_equal(learnt, self._is_moving):
             return super().residuals(state, view, learnt, most)
         count, shown = len(state), features_seen(state, view.camera)
@@ -232,7 +232,7 @@ class ChangedPixels(CpuRenderer):
         return self._static_planes[key]
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
-        """Computes the losses of the rendering, and fills the gradient of the rendered blocks."""
+        """Computes the losses of the rendering, and their gradient in the rendered blocks."""
         base, (rows, columns) = self._static_background(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
@@ -264,10 +264,10 @@ class ChangedPixels(CpuRenderer):
         near: NDArray[np.uint8],
         gradient: Array,
     ) -> NDArray[np.float64]:
-        """Returns image loss, mask loss and squared error of part of an image, and fills the requested gradients.
+        """Returns image loss, mask loss and squared error of part of an image, and computes the requested gradients.
 
         If ``near`` does not request gradients (``image_loss.GRADIENT``), ``gradient`` may be ``planes`` itself, which
-        then stays unchanged.
+        then remains unchanged.
         """
         channels, height, width = target.shape
         rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
@@ -304,10 +304,10 @@ def _key(view: TrainingView) -> tuple[str, int, int]:
 
 
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Returns a box around the given pixels that contains the windows of all losses that the pixels affect.
+    """Returns a box around the given pixels that contains the windows of all losses affected by these pixels.
 
-    If there are no such pixels, it is a single pixel. The first column is a multiple of sixteen, so that the flags of
-    ``image_loss.near`` align with the flags of the full image.
+    If no pixels are marked, the box is a single pixel. The first column is a multiple of sixteen, so that the flags of
+    ``image_loss.near`` align with those of the full image.
     """
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if len(rows) == 0:

@@ -1,4 +1,4 @@
-"""Optimization of colours during an update, with a learning rate per Gaussian and the soft-colour loss."""
+"""Optimization of colours during an update, with per-Gaussian learning rates and the soft-colour loss."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from scas4d_core.engines.engine import AttemptStart
 Array = NDArray[np.float32]
 
 MOST = 0.6
-"""Fraction of moving Gaussians above which the table contains all Gaussians, because indexing would cost more."""
+"""Fraction of moving Gaussians above which the table contains all Gaussians, because indexing a subset would cost
+more."""
 
 
 class Colours:
-    """Colours that are learned during an attempt.
+    """Colours learned during an attempt, with their optimizer.
 
     Args:
         colours: [N, 3] RGB colours, updated in place.
         before: [N, 3] colours of Θ_{t−1}.
         rows: [M] rows of the moving Gaussians.
-        static: whether to learn the colours of static Gaussians too.
+        static: whether the colours of static Gaussians are also learned.
         weight: weight of the soft-colour loss, the mean absolute change (Dynamic3DGaussians).
         start: settings of the attempt, with learning rates and Adam decay rates.
     """
@@ -51,19 +52,19 @@ class Colours:
         self._change: Array
 
     def loss(self, curve: bool) -> float:
-        """Returns the weighted soft-colour loss, or 0 if ``curve`` is false. Call before ``gradient`` or ``step``."""
+        """Returns the weighted soft-colour loss, or 0 if ``curve`` is false. Must precede ``gradient`` and ``step``."""
         self._change = self._table - self._before
         return float(self._weight * np.abs(self._change).sum(dtype=np.float64)) if curve else 0.0
 
     def gradient(self, g_features: Array) -> Array:
-        """Returns the gradient [rows of the table, 3] of rendering losses (``g_features``) and soft-colour loss."""
+        """Returns the gradient of the rendering losses (``g_features``) plus the soft-colour loss, [table rows, 3]."""
         pull: Array = self._weight * np.sign(self._change)
         chosen = g_features if self._whole else g_features[self._rows]
         total: Array = chosen[:, :3] + pull
         return total
 
     def all_gradients(self, g_features: Array) -> Array:
-        """Returns the gradient of the last iteration [N, 3]; it is 0 for Gaussians that are not in the table."""
+        """Returns the last iteration's gradient [N, 3], which is 0 for Gaussians that are not in the table."""
         if self._whole:
             return self.gradient(g_features)
         total = np.zeros_like(self._colours)

@@ -1,9 +1,9 @@
-"""Deformation D_t on the CPU: the parameters of one frame, with fused kernels for the forward and backward pass.
+"""Deformation D_t on the CPU: the parameters of one frame, with fused kernels for the forward and backward passes.
 
 Reference implementation: ``engines.torch.deformation``. Buffers are allocated once per hierarchy.
 
-Gaussians with non-finite values at the start of an update are held back. They stay unchanged and have no weight in
-cluster pivots and neighbour terms. Their number is recorded.
+Gaussians with non-finite values at the start of an update are held back: they remain unchanged and do not contribute to
+cluster pivots or neighbour terms. Their number is recorded.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class CpuDeformation:
 
     Args:
         hierarchy: cluster hierarchy of the moving Gaussians.
-        neighbours: neighbour graph, or None if no term needs it.
-        bounds: [M, 3] axis lengths in metres; see ``Structure.length_bounds``.
+        neighbours: neighbour graph, or None if no loss term needs it.
+        bounds: [M, 3] axis lengths above which the scale loss applies, in metres; see ``Structure.length_bounds``.
         cluster_map, covariance: variants of the deformation; see ``engines.torch.deformation``.
 
     Attributes:
@@ -43,7 +43,7 @@ class CpuDeformation:
         factors: [N, 3, 3] covariance factors of all Gaussians, filled by ``forward``.
         turns: [M, 4] rotations since the previous frame, filled by ``forward``.
         held_back: [held] int64 rows with non-finite values in Θ_{t−1}, found by ``start``.
-        guards: number of times that each guard was triggered since the last ``reset``. ``forward`` counts the guards
+        guards: number of times each guard was triggered since the last ``reset``. ``forward`` counts the guards
             in ``cascade.COUNTED_GUARDS``, excluding frozen layers; ``start`` counts all others.
     """
 
@@ -97,7 +97,7 @@ class CpuDeformation:
         self._held: tuple[Array, Array] = self.means, self.factors
 
     def start(self, previous: Gaussians) -> None:
-        """Loads the state Θ_{t−1} to deform. Its static Gaussians stay unchanged."""
+        """Loads the state Θ_{t−1} to be deformed. Its static Gaussians remain unchanged."""
         moving = self.hierarchy.rows
         held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)
@@ -119,7 +119,7 @@ class CpuDeformation:
         self.factors = previous.factors.copy()
 
     def _hold_back(self, sound: NDArray[np.bool_]) -> None:
-        """Excludes Gaussians whose entry in ``sound`` [M] is false from pivots and neighbour terms; counts them."""
+        """Counts Gaussians that are not ``sound`` [M], and excludes them from pivots and neighbour terms."""
         self._present, self._ranges = self._all_present, self._all_ranges
         if self.neighbours is not None:
             self._weights = self.neighbours.weights
@@ -138,7 +138,7 @@ class CpuDeformation:
     def freeze_layers(self, layers: int) -> None:
         """Freezes the first ``layers`` layers at their current parameters.
 
-        Frozen layers are applied once and get no gradient; the results of ``forward`` stay bit-identical. Call
+        Frozen layers are applied once and receive no gradient. The results of ``forward`` remain bit-identical. Call
         ``freeze_layers(0)`` before changing the parameters.
 
         Raises:
@@ -173,7 +173,7 @@ class CpuDeformation:
     def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
         """Returns the mean rigidity, isometry and rotation losses over the sampled pairs.
 
-        The next call of ``backward`` includes their gradients.
+        The next call to ``backward`` includes their gradients.
 
         Args:
             sample: [S] sampled Gaussians, as indices in hierarchy order.
@@ -191,7 +191,7 @@ class CpuDeformation:
         return means
 
     def backward(self, g_means: Array, g_factors: Array, scale_weight: float) -> float:
-        """Fills ``delta_gradients``, and ``cluster_gradients`` of all layers that are not frozen.
+        """Computes ``delta_gradients``, and ``cluster_gradients`` for all layers that are not frozen.
 
         Args:
             g_means: [N, 3] gradients of ``means``.
@@ -212,20 +212,20 @@ class CpuDeformation:
 
 
 def cache_lines(count: int) -> Array:
-    """Returns an array of zeros [count, 16] whose rows are aligned to 64-byte cache lines."""
+    """Returns a zero-filled array [count, 16] whose rows are aligned to 64-byte cache lines."""
     flat = np.zeros((count + 1) * STATE, np.float32)
     first = -(flat.ctypes.data // 4) % STATE
     return flat[first : first + count * STATE].reshape(count, STATE)
 
 
 class Blocks(NamedTuple):
-    """The Gaussians of a hierarchy, grouped into B blocks of sixteen that each belong to one cluster in every layer.
+    """A hierarchy's Gaussians in B blocks of sixteen; in every layer, each block belongs to a single cluster.
 
     Attributes:
         entries: [B, 16] int64 indices of the Gaussians in hierarchy order; partial blocks repeat their last index.
         present: [B, 16] float32 mask: 0 for repeated entries, otherwise 1.
         clusters: [B, L] int64 cluster of each block in each layer, numbered across all layers.
-        offsets: [L + 1] int64 number of the first cluster in each layer.
+        offsets: [L + 1] int64 index of the first cluster in each layer, followed by the total number of clusters.
         ranges: [clusters of all layers, 3] int64 first block, last block + 1, and number of entries of each cluster.
     """
 

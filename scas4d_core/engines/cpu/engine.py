@@ -1,4 +1,4 @@
-"""CPU engine for updates, which runs each iteration in the order of algorithm 1."""
+"""CPU engine for updates, which runs the steps of each iteration in the order given by algorithm 1."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class CpuEngine:
 
     Attributes:
         name: name of the engine, used in messages.
-        renderer: renderer for states, with the background, limits and weights of the plan.
+        renderer: renderer for states, with the plan's background, limits and weights.
     """
 
     name = "cpu"
@@ -138,7 +138,10 @@ class CpuEngine:
         lap(REPORT)
 
     def _pictures(self, views: Sequence[int], step: StepScalars) -> tuple[float, Gradients]:
-        """Returns the mean image and mask loss over views, and its gradients (renderer buffers for a single view)."""
+        """Returns the sum of image and mask loss, averaged over views, and its gradients.
+
+        If there is a single view, the gradients are renderer buffers.
+        """
         loss, total = 0.0, None
         for index in views:
             view_loss, gradients = self._picture(index, step)
@@ -210,7 +213,7 @@ class CpuEngine:
             self._gains.leave_out([self._views[index] for index in views])
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``. This method does nothing, because the host itself is the device."""
+        """See ``UpdateEngine.wait``. Does nothing, because the host itself is the device."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """See ``UpdateEngine.probe``."""
@@ -270,7 +273,7 @@ class CpuEngine:
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
-        """See ``UpdateEngine.gradients``. The gradients of frozen layers are outdated."""
+        """See ``UpdateEngine.gradients``. The gradients of frozen layers are stale."""
         deformation = self._deformation
         tables = {f"cluster {layer}": g.copy() for layer, g in enumerate(deformation.cluster_gradients)}
         tables["deltas"] = deformation.delta_gradients.copy()

@@ -51,7 +51,7 @@ class CpuFitEngine:
     """The CPU implementation of ``FitEngine``. It updates the arrays of the loaded table in place.
 
     Args:
-        renderer: renderer, which also defines the loss weights.
+        renderer: renderer to use; it also defines the loss weights.
     """
 
     def __init__(self, renderer: CpuRenderer) -> None:

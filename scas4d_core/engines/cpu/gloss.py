@@ -21,14 +21,14 @@ GLOSS = np.float32(0.5)
 equally glossy Gaussians stay near this value and the environment absorbs the rest."""
 RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 1e-3, 2e-2, 5e-3
 """Adam learning rates in frame 0. The gloss rate applies at a strength of ``GLOSS``; see ``gloss_rate``. With higher
-gloss rates, single Gaussians overfit the highlight of one camera. On the `gloss` scene, test views lost 0.6 dB at 5e-3
-for strengths and 3e-3 for normals."""
+gloss rates, individual Gaussians overfit a single camera's highlight. On the `gloss` scene, rates of 5e-3 for strengths
+and 3e-3 for normals reduced the PSNR of test views by 0.6 dB."""
 UPDATE_RATE_GLOSS, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS = 2e-3, 1e-2, 1e-3
-"""Initial Adam learning rates of an update, during which they decay to a tenth."""
+"""Initial Adam learning rates of an update; they decay to a tenth of these values during the update."""
 NEARNESS = 0.3
 """Initial nearness (inverse distance) of the environment in 1/m, typical of lamps in a room."""
 NEIGHBOURS = 16
-"""Number of neighbours over which changes of normals and strengths are averaged, since surfaces bend slowly."""
+"""Number of neighbours over which changes of normals and strengths are averaged, since surfaces curve gradually."""
 SAME_SIDE = 0.5
 """Cosine between normals above which neighbours are considered part of the same surface."""
 
@@ -70,8 +70,8 @@ def gloss_rate(rate: float, gloss: Array) -> float:
     """Scales a gloss learning rate so that normals rotate as fast as they would at strength ``GLOSS`` with ``rate``.
 
     Adam's step length does not depend on the strength, so at a fifth of the strength, normals rotate five times as
-    fast. On the `gloss` scene, this cost 0.6 dB in frame 0. The typical strength is the mean strength weighted by
-    strength, because Gaussians without gloss have no normal.
+    fast. On the `gloss` scene, this reduced the PSNR in frame 0 by 0.6 dB. The rate is scaled by the mean strength,
+    weighted by the strengths themselves, because Gaussians without gloss have no normal.
 
     Args:
         rate: learning rate at strength ``GLOSS``.
@@ -94,11 +94,11 @@ class GlossShading:
         rates: learning rates of the gloss, the environment and its nearness.
 
     Attributes:
-        gloss, environment, rates: as given.
+        gloss, environment, rates: same as the arguments.
         moments: Adam moments of gloss and environment, [2, …] each.
         steps: number of Adam steps so far.
-        changed_from: gloss from which changes are smoothed.
-        gradients: gradients of gloss and environment since the last step.
+        changed_from: reference gloss; ``smooth`` averages the changes since this reference.
+        gradients: gradients of gloss and environment, accumulated since the last step.
     """
 
     def __init__(self, gloss: Array, environment: Array, rates: tuple[float, float, float]) -> None:
@@ -135,7 +135,7 @@ class GlossShading:
     def shade_backward(
         self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array
     ) -> None:
-        """Converts feature to colour gradients in place, and accumulates the gloss and environment gradients."""
+        """Converts feature gradients to colour gradients in place; accumulates gloss and environment gradients."""
         g_environment = self._kernel.shade_backward(
             means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
         )
@@ -166,7 +166,7 @@ class GlossShading:
         np.clip(nearness, 0, None, out=nearness)
 
     def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> GlossShading:
-        """Returns the gloss of ``rows`` with their moments, followed by copies of ``parents`` with zero moments."""
+        """Returns the gloss and moments of ``rows``, followed by copies of ``parents`` with zero moments."""
         every = np.concatenate([rows, parents])
         chosen = GlossShading(self.gloss[every], self.environment, self.rates)
         moments = self.moments[0][:, every]
@@ -194,7 +194,7 @@ class GlossShading:
 
 
 def cell_areas(side: int) -> Array:
-    """Returns the fraction of the sphere that each cell of an octahedral map covers, [side²]; they sum to 1."""
+    """Returns the fraction of the sphere covered by each cell of an octahedral map, [side²]. The fractions sum to 1."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, side)] * 2)
     x, y, z = u, v, 1 - abs(u) - abs(v)
     # The solid angle of a map element is proportional to 1/|p|³; cells on the border are cut in half.
@@ -225,21 +225,21 @@ class LearntGloss:
 
     @property
     def gloss(self) -> Array:
-        """[M, 3] current gloss, relative to the orientation in Θ_{t−1}."""
+        """Current gloss [M, 3], relative to the orientation in Θ_{t−1}."""
         return self._shading.gloss
 
     @property
     def environment(self) -> Array:
-        """The current environment."""
+        """Current environment."""
         return self._shading.environment
 
     def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
-        """Fills the RGB channels of ``features`` [N, 4]; ``turns`` [M, 4] are the rotations of moving Gaussians."""
+        """Fills the RGB channels of ``features`` [N, 4], given the rotations ``turns`` [M, 4] of moving Gaussians."""
         self._turns[self._rows] = turns
         self._shading.shade(means, self._turns, colours, camera, features)
 
     def shade_backward(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
-        """Converts feature to colour gradients in place, and accumulates the gloss and environment gradients."""
+        """Converts feature gradients to colour gradients in place; accumulates gloss and environment gradients."""
         self._shading.shade_backward(means, self._turns, colours, camera, g_features)
 
     @property

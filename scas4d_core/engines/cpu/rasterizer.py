@@ -1,9 +1,9 @@
-"""CPU rasterizer: projection, depth sorting, tile lists and blending, with the backward pass of all stages.
+"""CPU rasterizer: projection, depth sorting, tile lists and blending, with backward passes for all stages.
 
-Buffers are shared between the forward and backward pass of a view; they are reused and never shrink. Results do not
+Buffers are shared between the forward and backward passes of a view; they are reused and never shrink. Results do not
 depend on the number of threads. Reference implementation: ``engines.torch.rasterizer``.
 
-Gaussians with non-finite values or an overflowing footprint are not rendered and get zero gradients. Overflowing
+Gaussians with non-finite values or an overflowing footprint are not rendered and receive zero gradients. Overflowing
 gradients are also set to 0. ``CpuRasterizer.guards`` counts these events.
 """
 
@@ -33,9 +33,10 @@ class Drawing(NamedTuple):
 
     Attributes:
         blocks: [tiles] uint64 bitmask of the blocks in each tile; see ``tiles.cover`` for the bit order.
-        learnt: [N] uint8 mask of the Gaussians that get gradients. If such a Gaussian extends beyond ``blocks``,
+        learnt: [N] uint8 mask of the Gaussians that receive gradients. If such a Gaussian extends beyond ``blocks``,
             ``CpuRasterizer.outside_region`` is set.
-        mask_to_region: whether to render only the blocks covered by these Gaussians; see ``CpuRasterizer.drawn``.
+        mask_to_region: whether to render only the blocks covered by the ``learnt`` Gaussians; see
+            ``CpuRasterizer.drawn``.
     """
 
     blocks: NDArray[np.uint64]
@@ -69,7 +70,7 @@ class CpuRasterizer:
     """Renders any number of feature channels in one pass and backpropagates their gradients.
 
     Attributes:
-        guards: number of times that each guard was triggered since the last ``reset``.
+        guards: number of times each guard was triggered since the last ``reset``.
         limits: [6] float32 rasterizer constants, in the order of the ``Limits`` fields.
         outside_region: whether a learned Gaussian covered a block that the last forward pass did not render.
         drawn: [tiles] uint64 bitmask of the blocks that the last forward pass rendered.
@@ -103,7 +104,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """Returns a contiguous scratch array. Arrays grow by an extra 25 % to avoid reallocation as sizes drift."""
+        """Returns a contiguous scratch array; allocates 25 % extra to avoid reallocation as sizes vary."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view
@@ -162,7 +163,7 @@ class CpuRasterizer:
         depth_channel: int = -1,
         drawing: Drawing | None = None,
     ) -> Picture:
-        """Renders features and transmittance of one view. All arrays are float32 and C-contiguous.
+        """Renders the features and transmittance of one view. All arrays are float32 and C-contiguous.
 
         Args:
             means: [N, 3] means, in metres.
@@ -228,7 +229,7 @@ class CpuRasterizer:
         return self.picture
 
     def _whole(self, tile_count: int, count: int) -> Drawing:
-        """Returns a ``Drawing`` that selects all blocks and gives every Gaussian gradients."""
+        """Returns a ``Drawing`` that selects all blocks and computes gradients for every Gaussian."""
         blocks, learnt = self._buffer("blocks", (tile_count,), np.uint64), self._buffer("learnt", (count,), np.uint8)
         blocks[:], learnt[:] = np.uint64(2**64 - 1), 1
         return Drawing(blocks, learnt)
@@ -237,7 +238,7 @@ class CpuRasterizer:
         """Returns the buffers for dL/dimage [C, rows, stride] and dL/dalpha [rows, stride] that ``backward`` reads.
 
         Like the forward buffers, they are padded to whole tiles. They are set to zero whenever the image size changes.
-        The padding must stay zero.
+        The padding must remain zero.
         """
         camera, image, transmittance = self._last.camera, self._last.image, self._last.transmittance
         g_image = self._buffer("g_image", image.shape)
@@ -305,21 +306,21 @@ class CpuRasterizer:
 
     @property
     def planes(self) -> Array:
-        """[C, rows, stride] image of the last forward pass, padded to whole tiles."""
+        """Image of the last forward pass [C, rows, stride], padded to whole tiles."""
         return self._last.image
 
     @property
     def picture(self) -> Picture:
-        """The result of the last forward pass, valid until the next one."""
+        """Result of the last forward pass, valid until the next one."""
         height, width = self._last.camera.height, self._last.camera.width
         return Picture(self._last.image[:, :height, :width], self._last.transmittance[:height, :width])
 
     @property
     def splats(self) -> Array:
-        """[N, 16] splats of the last forward pass; see ``kernels.projection`` for the columns."""
+        """Splats of the last forward pass [N, 16]; see ``kernels.projection`` for the columns."""
         return self._last.splats
 
     @property
     def counts(self) -> NDArray[np.int32]:
-        """[N] number of tiles that each Gaussian covered in the last forward pass; 0 if culled."""
+        """Number of tiles covered by each Gaussian in the last forward pass [N]; 0 if culled."""
         return self._last.counts

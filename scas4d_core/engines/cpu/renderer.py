@@ -21,11 +21,12 @@ Array = NDArray[np.float32]
 Moments = tuple[Array, Array]
 
 _moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
-"""SSIM moments of each view (windowed means of the target and of its square), computed once for all renderers."""
+"""SSIM moments of each view (windowed means of the target and of its square), computed once and shared by all
+renderers."""
 
 
 def no_lap(stage: str) -> None:
-    """Does nothing at the end of a stage; used as the default ``lap`` callback."""
+    """Default ``lap`` callback, which does nothing."""
 
 
 class CpuRenderer:
@@ -34,8 +35,8 @@ class CpuRenderer:
     Args:
         background: background colour, RGB in 0…1.
         image_weight, mask_weight: weights of the image and mask losses.
-        mask_moves: whether the mask loss affects positions and shapes, or only the labels. Masks have hard edges, so
-            silhouettes fitted to masks differ from silhouettes fitted to images.
+        mask_moves: whether the mask loss affects positions and shapes in addition to the labels. Masks have hard
+            edges, so silhouettes fitted to masks differ from silhouettes fitted to images.
         limits: rasterizer constants.
 
     Attributes:
@@ -126,7 +127,7 @@ class CpuRenderer:
     # Losses of iterations, for arrays that are updated in place.
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame. This base class does nothing; subclasses may use the state."""
+        """Loads the initial state of a frame. The base class ignores the state; subclasses may use it."""
 
     def forward_backward(
         self,
@@ -147,7 +148,7 @@ class CpuRenderer:
             opacities: [N] float32 opacities.
             features: [N, 4] float32 features (RGB, label).
             view: view to render and compare.
-            lap: callback that is called with the name of each stage when it ends.
+            lap: callback that receives the name of each stage when the stage ends.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         lap("render")
@@ -172,7 +173,7 @@ class CpuRenderer:
         return self.rasterizer.picture
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        """Returns the mean of the view's image minus that of its last rendering with exposure, RGB in 0…1."""
+        """Returns the view's mean colour minus that of its last rendering with exposure applied, RGB in 0…1."""
         height, width = view.camera.height, view.camera.width
         rendered = means(self.rasterizer.planes[:3, :height, :width])
         shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
@@ -225,7 +226,7 @@ class CpuRenderer:
 
 
 def forget_moments(view: TrainingView) -> None:
-    """Drops the cached moments of a view, once its renderer has copied the part that it needs."""
+    """Drops a view's cached moments; called once its renderer has copied the part that it needs."""
     _moments.pop(view, None)
 
 

@@ -25,14 +25,14 @@ ClusterMap = Literal["centred", "published"]
 Covariance = Literal["entangled", "separate"]
 """How a Gaussian's covariance is deformed, apart from its own ΔR and Δs.
 
-"entangled" uses the Jacobian of the map that moves the mean, as in equation (5). "separate" does not deform it, as in
-the paper's ablation, which learns covariances independently of positions. The Gaussians of a rotating wheel then keep
-their orientation, unless ΔR rotates them. Means and rotations are the same in both variants.
+"entangled" applies the Jacobian of the map that moves the mean, as in equation (5). "separate" leaves the covariance
+undeformed, as in the paper's ablation, which learns covariances independently of positions. The Gaussians of a rotating
+wheel then keep their orientation, unless ΔR rotates them. Means and rotations are the same in both variants.
 """
 
 
 class ClusterParams(NamedTuple):
-    """Learned parameters of the K clusters of one layer, in the paper's notation. All zeros is the centred identity.
+    """Learned parameters of one layer's K clusters, in the paper's notation. If all are 0, the map is the identity.
 
     Attributes:
         r: [K, 3] rotation, as the quaternion (1, r)/|(1, r)|.
@@ -68,7 +68,7 @@ class Layer(NamedTuple):
 
 
 class Deltas(NamedTuple):
-    """Per-Gaussian deltas applied after the cascade (Δp, ΔR, Δs in the paper). All zeros is the identity.
+    """Per-Gaussian deltas applied after the cascade (Δp, ΔR, Δs in the paper). All-zero deltas represent the identity.
 
     Attributes:
         dp: [M, 3] offset added to the mean, in metres.
@@ -198,7 +198,7 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
 
 
 def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Returns the mean position [count, 3] of each cluster, detached from the graph; 0 for empty clusters.
+    """Returns the mean position [count, 3] of each cluster, detached from autograd; 0 for empty clusters.
 
     >>> cluster_pivots(torch.tensor([[0.0, 0, 0], [2, 0, 0], [5, 5, 5]]), torch.tensor([0, 0, 1]), 2)
     tensor([[1., 0., 0.],
@@ -262,11 +262,11 @@ def cluster_map(
 def cascade(points: Tensor, layers: Sequence[Layer], kind: ClusterMap = "centred") -> Transported:
     """Evaluates equation (7), the nested maps x → φ_K(… φ_2(φ_1(x))), starting with the coarsest layer.
 
-    The pivot of a cluster is the mean of its points after the coarser layers, detached from the graph.
+    The pivot of a cluster is the mean of its points after the coarser layers, detached from autograd.
 
     Args:
         points: [M, 3] points, in metres.
-        layers: layers, coarse to fine. An empty sequence is the identity.
+        layers: layers, coarse to fine. An empty sequence represents the identity.
         kind: variant of the cluster map.
 
     Returns:
@@ -300,7 +300,7 @@ def deform(
     kind: ClusterMap = "centred",
     covariance: Covariance = "entangled",
 ) -> Deformed:
-    """Deforms Gaussians by equation (5), applied to factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
+    """Deforms Gaussians by equation (5), in terms of factors: the cascade, then each Gaussian's Δp, ΔR, Δs.
 
     mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. If the deltas are 0,
     Σ = F Fᵀ is J Σ_previous Jᵀ. With separate covariance, J is omitted.

@@ -1,4 +1,4 @@
-"""Reference engine for updates in PyTorch, which runs each iteration in the order of algorithm 1."""
+"""Reference engine for updates in PyTorch, which runs each iteration in the order given by algorithm 1."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TorchEngine:
 
     Attributes:
         name: name of the engine, used in messages.
-        renderer: renderer for states, with the background and limits of the plan.
+        renderer: renderer for states, with the plan's background and limits.
     """
 
     name = "torch"
@@ -190,7 +190,7 @@ class TorchEngine:
             learnt.gloss.copy_(before + (weights[..., None] * (learnt.gloss - before)[index]).sum(dim=1))
 
     def _neighbours_on_surface(self, gloss: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the neighbours [M, k] in frame 0, with equal weights for those on the same surface, otherwise 0."""
+        """Returns the frame-0 neighbours [M, k] and their weights: equal on the same surface, 0 elsewhere."""
         if self._smoothing is None:
             count = len(gloss)
             roots = self._structure.roots[:count]
@@ -207,7 +207,7 @@ class TorchEngine:
             self._gains.leave_out([self._views[index] for index in views])
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``. This method does nothing, because the host itself is the device."""
+        """See ``UpdateEngine.wait``. Does nothing, because the host itself is the device."""
 
     @torch.no_grad()
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:

@@ -24,7 +24,7 @@ def colours_seen(
     See ``shade`` for the other arguments.
 
     Args:
-        gloss: [M, 3] gloss of the first M Gaussians; the others are not glossy. None if no Gaussian is glossy.
+        gloss: [M, 3] gloss of the first M Gaussians (all others are not glossy), or None if no Gaussian is glossy.
     """
     if gloss is None or environment is None:
         return colours
@@ -33,7 +33,7 @@ def colours_seen(
 
 
 def cell_shares() -> Tensor:
-    """Returns the fraction of the sphere that each cell of the octahedral map covers, [CELLS]; they sum to 1."""
+    """Returns the fraction of the sphere covered by each cell of the octahedral map, [CELLS]; the sum is 1."""
     line = torch.linspace(-1, 1, SIDE, dtype=torch.float64)
     v, u = torch.meshgrid(line, line, indexing="ij")
     z = 1 - u.abs() - v.abs()
@@ -46,7 +46,7 @@ def cell_shares() -> Tensor:
 
 
 def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environment: Tensor, centre: Tensor) -> Tensor:
-    """Returns the shaded colours [N, 3]. The arguments are those of the kernel, but with gloss for every Gaussian."""
+    """Returns the shaded colours [N, 3]. Same arguments as the kernel, but ``gloss`` must include every Gaussian."""
     strength = gloss.norm(dim=1, keepdim=True)
     glossy = strength[:, 0] > float(DULL)
     strength = torch.where(glossy[:, None], strength, torch.ones_like(strength))

@@ -196,7 +196,7 @@ def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
 
 
 def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:
-    """Returns the mean absolute colour change since the previous frame over Gaussians and channels; both are [N, 3].
+    """Returns the mean absolute difference, over Gaussians and channels, from the previous colours; both are [N, 3].
 
     >>> soft_colour_loss(torch.full((4, 3), 0.5), torch.full((4, 3), 0.25))
     tensor(0.2500)

@@ -42,7 +42,7 @@ class GlossParameters:
 
     @property
     def environment(self) -> Tensor:
-        """[ROWS, 3] environment: light, middle and nearness."""
+        """Environment [ROWS, 3]: light, middle and nearness."""
         return torch.cat([self.light, self.middle, self.nearness])
 
 

@@ -19,7 +19,8 @@ from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import FEATURE_CEILING, NOT_FINITE
 
 PAIRS_AT_ONCE = 4_000_000
-"""Maximum number of pixel–Gaussian pairs in memory. Larger images are split into strips, which backward recomputes."""
+"""Maximum number of pixel–Gaussian pairs in memory. Larger images are split into strips, which the backward pass
+recomputes."""
 
 
 class CameraParams(NamedTuple):
@@ -81,7 +82,7 @@ class Rendered(NamedTuple):
     Attributes:
         features: [H, W, C] rendered features, including the background.
         alpha: [H, W] alpha in 0…1, one minus the remaining transmittance.
-        means: [N, 2] projected means in pixels, whose gradient is used by adaptive density control.
+        means: [N, 2] projected means, in pixels; adaptive density control uses their gradient.
         depths: [N] depths along z, in metres.
     """
 
@@ -145,7 +146,7 @@ def _composite(
 
 
 def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
-    """Returns a mask [N] of valid Gaussians: finite, and within ``guards.NOT_FINITE`` and ``FEATURE_CEILING``."""
+    """Returns a mask [N] of Gaussians with finite values within ``guards.NOT_FINITE`` and ``FEATURE_CEILING``."""
     size = means.detach().abs().sum(-1) + factors.detach().abs().sum((-2, -1)) + opacities.detach().abs()
     return (size <= NOT_FINITE) & (features.detach().abs() <= FEATURE_CEILING).all(-1)
 
@@ -163,8 +164,8 @@ def render(
 
     alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)), where d is the offset of the pixel centre from the projected mean. A
     Gaussian contributes if and only if alpha ≥ floor. Blending stops at the first Gaussian with T·(1 − alpha) < stop,
-    which is not blended. No gradient flows through the cap. Gaussians that are not ``sound`` are not rendered, and
-    their gradients are 0.
+    which is not blended. No gradient flows through the cap. Gaussians that are not ``sound`` are not rendered and have
+    zero gradients.
 
     Args:
         means: [N, 3] means, in metres.

@@ -34,7 +34,7 @@ class Moved:
 class Scene:
     """Θ_{t−1} in float64, with methods that derive Θ_t from it.
 
-    Moving Gaussians with non-finite values are held back: they stay unchanged and do not affect pivots or neighbours.
+    Moving Gaussians with non-finite values are held back: they remain unchanged and do not affect pivots or neighbours.
 
     Attributes:
         rows: [M] rows of the moving Gaussians.

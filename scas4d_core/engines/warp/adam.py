@@ -1,7 +1,7 @@
 """Adam (Kingma and Ba 2015) for tables on the device; reference: ``torch.optim.Adam``, guards: ``kernels.adam``.
 
 The kernel that computes an element's gradient also updates the element, by calling ``step_element``. This saves a
-launch and another read of the gradient.
+kernel launch and another read of the gradient.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Adam:
         columns: [columns] learning rate of each column.
         by_row: learning rate factors, [n] (one per row) or [1] (one for all rows).
         first, second: [n, columns] first and second moments.
-        guard_counts: [2] number of times that each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
+        guard_counts: [2] number of times each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
         scalars: [``SCALARS``] scalars of the current step.
         beta1, beta2: decay rates of the moments.
     """

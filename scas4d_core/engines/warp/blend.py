@@ -5,8 +5,8 @@ blends the entries whose support intersects its block. On the CPU device, a warp
 
 A few tiles account for most of the work, so lists are split into segments that are blended in parallel.
 ``blend_segments`` blends each segment as if it were the first, and ``join_segments`` combines the segments. If a pixel
-is finished within a segment, that segment is blended again for this pixel, up to the correct entry. The state at the
-start of each segment is kept for the backward pass.
+is finished within a segment, that segment is blended again for this pixel, up to the entry that finishes it. The state
+at the start of each segment is kept for the backward pass.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ONE = wp.constant(wp.uint32(1))
 
 @wp.struct
 class Spot:
-    """The pixel of a lane: position, centre, whether it is inside the image, and the first pixel centre of its warp."""
+    """A lane's pixel: position, centre, whether it is inside the image, and the first pixel centre of its warp."""
 
     x: wp.int32
     y: wp.int32
@@ -111,14 +111,16 @@ def draw_entries(
     passed: wp.float32,
     exact: wp.int32,
 ) -> Light:
-    """Blends list entries front to back, starting from a given transmittance. All lanes of a warp must call it.
+    """Blends list entries front to back, starting from a given transmittance.
+
+    All lanes of a warp must call this function.
 
     Args:
         begin, end: first entry, and last entry plus 1.
         open: 1 if the lane's pixel must be rendered, otherwise 0.
         passed: transmittance before the first entry.
-        exact: transmittance returned for a pixel that is finished here: below the stop (0), or before the entry that
-            finishes the pixel (1).
+        exact: selects the transmittance returned for a pixel that is finished here: a value below the stop (0), or the
+            value before the entry that finishes the pixel (1).
     """
     light = Light()
     light.passed = passed

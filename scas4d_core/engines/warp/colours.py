@@ -29,7 +29,7 @@ def step_colours(
 
     Args:
         weight: weight of each element's absolute change.
-        learned: [N] 1 for Gaussians whose colours are learned, otherwise 0.
+        learned: [N] flags, 1 for Gaussians whose colours are learned, otherwise 0.
         before: [N, 4] features of Θ_{t−1}.
         g_features: [N, 4] gradients of the rendering losses.
         features: [N, 4] features; the first three columns are updated.
@@ -50,7 +50,7 @@ def step_colours(
 
 
 class WarpColours:
-    """Colours that are learned during an attempt; they are the first three columns of the features.
+    """Colours learned during an attempt, i.e. the first three columns of the features.
 
     Args:
         plan: plan of the scene's updates, with a colour plan.

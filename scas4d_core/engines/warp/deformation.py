@@ -1,4 +1,4 @@
-"""Deformation on the device: cascade, per-Gaussian deltas and their loss terms, with forward and backward pass."""
+"""Deformation on the device: cascade, per-Gaussian deltas and their loss terms, with forward and backward passes."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class WarpDeformation:
             table.assign(values)
 
     def begin(self, start: AttemptStart) -> bool:
-        """Starts an attempt from the current parameters; ``restart`` must follow.
+        """Starts an attempt from the current parameters; ``restart`` must be called next.
 
         Returns:
             Whether buffers were reallocated, which invalidates captured graphs.
@@ -125,7 +125,7 @@ class WarpDeformation:
         return replaced
 
     def restart(self, start: AttemptStart) -> None:
-        """Restores the parameters from the start of the attempt, with zero moments."""
+        """Restores the parameters to their values at the start of the attempt, with zero moments."""
         betas = start.beta1, start.beta2
         for optimizer, columns in zip(self.optimizers, [*start.cluster_columns, start.delta_columns], strict=True):
             optimizer.begin(columns, betas)
@@ -133,7 +133,7 @@ class WarpDeformation:
             wp.copy(table, saved)
 
     def scalars(self, step: StepScalars) -> list[float]:
-        """Returns an iteration's scalars for ``StepRecords.write``: weights, then each optimizer's scalars."""
+        """Returns an iteration's scalars for ``StepRecords.write``: the weights, then each optimizer's scalars."""
         plan, pairs = self._plan, 1
         if self._graph is not None:
             pairs = max(1, self._sample_sizes[step.sample] * self._graph.index.shape[1])
@@ -167,8 +167,8 @@ class WarpDeformation:
             g_means: [N] vec3 gradients of the rendering losses with respect to the means.
             g_factors: [N] mat33 gradients of the rendering losses with respect to the factors.
             frozen: number of frozen layers, counted from the coarsest.
-            losses: weighted losses of each iteration, excluding rendering losses. The losses of the deformation are
-                added.
+            losses: weighted losses of each iteration, excluding rendering losses; the deformation losses are added to
+                them.
         """
         device, iteration = self._device, self._records.iteration
         if self._plan.neighbour_terms and self._graph is not None:

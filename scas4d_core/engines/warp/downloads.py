@@ -1,4 +1,4 @@
-"""Downloads from device memory that wait only once for several arrays."""
+"""Downloads of several arrays from device memory with a single wait."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GPU engine for updates in Warp, which runs each iteration in the order of algorithm 1.
+"""GPU engine for updates in Warp, which runs each iteration in the order given by algorithm 1.
 
 The kernel launches of an iteration are captured in a CUDA graph. Kernels read all values that change between iterations
 from device memory (``StepRecords``), so the host only enqueues graphs. It downloads losses and results when the update
@@ -52,17 +52,17 @@ LOG_ROWS = 1024
 ITERATIONS = "iterations"
 """Name of the update stage in which the host enqueues iterations."""
 AHEAD = 2
-"""Maximum number of pending iterations while an update checks its time limit."""
+"""Maximum number of pending iterations while an update is monitoring its time limit."""
 
 
 class Variant(NamedTuple):
-    """Parameters that determine the kernel launches of an iteration.
+    """Parameters that determine which kernels an iteration launches.
 
     Attributes:
         views: number of views.
         unchanged: number of layers whose output has not changed since the previous iteration.
         frozen: number of layers without a backward pass.
-        keeps: whether the renderings are kept.
+        keeps: whether the renderings are kept in the log.
         smooths: whether the gloss is smoothed after this iteration.
         smooths_first: whether the gloss is smoothed for the first time in this attempt.
     """
@@ -82,7 +82,7 @@ class WarpEngine:
         device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
-        renderer: renderer for states, with the background and limits of the plan.
+        renderer: renderer for states, with the plan's background and limits.
         downloads: helper that copies device arrays to the host.
     """
 
@@ -152,7 +152,7 @@ class WarpEngine:
 
     @property
     def _learnt_gloss(self) -> WarpGloss | None:
-        """The gloss if the plan learns it, otherwise None; iterations then render without gloss."""
+        """Gloss if the plan learns it; otherwise None, in which case iterations render without gloss."""
         return self._gloss if self._plan.gloss else None
 
     def set_tables(self, tables: Tables) -> None:
@@ -172,7 +172,7 @@ class WarpEngine:
         self._reset()
 
     def _reset(self) -> None:
-        """Restores everything that iterations modify to the start of the attempt."""
+        """Restores everything that iterations modify to its state at the start of the attempt."""
         wp.copy(self._features, self._previous_features)
         self._losses.zero_()
         self._log, self._history = IterationLog(), list[tuple[Sequence[int], StepScalars | None]]()
@@ -281,7 +281,7 @@ class WarpEngine:
             self._gains.leave_out(left_out)
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``. At most ``AHEAD`` iterations stay pending."""
+        """See ``UpdateEngine.wait``. At most ``AHEAD`` iterations remain pending."""
         if wp.get_device(self._device).is_cuda:
             self._events.append(wp.get_stream(self._device).record_event())
             if len(self._events) > AHEAD:
@@ -376,7 +376,7 @@ class WarpEngine:
         return self._log
 
     def _guards(self) -> dict[str, int]:
-        """Waits for the device, and returns the number of times that each guard was triggered."""
+        """Waits for the device, and returns the number of times each guard was triggered."""
         optimizers = [*self._deformation.optimizers]
         optimizers += [] if self._colours is None else [self._colours.optimizer]
         optimizers += [] if self._learnt_gloss is None else self._learnt_gloss.optimizers
@@ -418,7 +418,7 @@ class WarpEngine:
         return self._gains.finish(self._pictures.exposures)
 
     def gradients(self) -> dict[str, Array]:
-        """See ``UpdateEngine.gradients``. The gradients of frozen layers are outdated."""
+        """See ``UpdateEngine.gradients``. The gradients of frozen layers are stale."""
         *clusters, deltas = self.downloads.read(*self._deformation.gradients)
         tables = {f"cluster {k}": gradient for k, gradient in enumerate(clusters)} | {"deltas": deltas}
         if self._colours is not None:
@@ -429,14 +429,14 @@ class WarpEngine:
 
 
 def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
-    """Converts a row of the device's log to the record of a rendering."""
+    """Converts a row of the device's log to a ``ViewRecord``."""
     height, width = view.target.shape[1:]
     red, green, blue = row[SHIFT : SHIFT + LABEL].tolist()
     return ViewRecord(index, psnr_of(float(row[SQUARES]), height * width), (red, green, blue))
 
 
 def guard_counts(names: Sequence[str], values: NDArray[np.int32]) -> GuardCounts:
-    """Converts guard counts from the device."""
+    """Converts guard counts from the device to ``GuardCounts``."""
     counts = GuardCounts(*names)
     counts.add(names, values.astype(np.int64))
     return counts

@@ -77,7 +77,7 @@ class WarpFitEngine:
     """The ``FitEngine`` implementation in NVIDIA Warp. The host waits once per iteration, to read its loss.
 
     Args:
-        renderer: renderer, which also defines the device.
+        renderer: renderer to use; it also determines the device.
         mask_weight: weight of the mask loss.
     """
 

@@ -72,7 +72,7 @@ return result.number;
 def value_of_rank(
     thread: wp.int32, ratios: wp.array[wp.float32], first: wp.int32, count: wp.int32, rank: wp.int32
 ) -> wp.float32:
-    """Returns the element with a given rank among positive numbers. All threads of one block must call it."""
+    """Returns the element with a given rank among positive numbers. All threads of a block must call it."""
     ...
 
 

@@ -104,7 +104,7 @@ def apply_deltas(
     Args:
         terms: constants; only ``separate`` is used.
         rows: [M] rows of the moving Gaussians in Θ_t.
-        sound: [M] 1 for entries with finite values, otherwise 0; the Gaussians of other entries stay unchanged.
+        sound: [M] 0 for Gaussians with non-finite values, which remain unchanged; otherwise 1.
         points, jacobians, turned: [M] points, Jacobians and rotations after the cascade.
         previous_factors: [N] covariance factors of Θ_{t−1}.
         deltas: [M, 9] per-Gaussian deltas.

@@ -332,7 +332,7 @@ class GlossTables:
         scalars: [3] device array with the scalars of each of the two optimizers.
 
     Attributes:
-        glossy: as given.
+        glossy: same as the argument.
         seen: [N] vec4 features seen by the camera of the last rendering.
         g_seen: [N] vec4 gradients of ``seen``.
         tables: gloss [glossy, 3] and environment [ROWS, 3].
@@ -406,7 +406,7 @@ class WarpGloss(GlossTables):
     """Gloss and environment parameters of an attempt.
 
     Args:
-        previous: state with a gloss.
+        previous: state whose gloss is not None.
         rows: [M] rows of the moving Gaussians.
         roots: [N, 3] positions in frame 0, in metres, used to find neighbours.
         scalars, environment_scalars: [3] device arrays with the scalars of the optimizers for gloss and environment.
@@ -447,7 +447,7 @@ class WarpGloss(GlossTables):
         self.begin(self._rates)
 
     def smooth(self, first: bool) -> None:
-        """Averages gloss changes over neighbours; ``first`` is set for the first call of an attempt."""
+        """Averages gloss changes over neighbours; ``first`` must be true for the first call of an attempt."""
         gloss = self.tables[0]
         if first:
             inputs = [gloss, self._neighbours, self._weights]

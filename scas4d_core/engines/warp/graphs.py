@@ -1,4 +1,4 @@
-"""Kernel launch sequences that are captured as CUDA graphs and replayed; the CPU device launches them directly."""
+"""Kernel launch sequences that are captured as CUDA graphs and replayed, or launched directly on the CPU device."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Graphs:
         self._graphs: dict[Hashable, wp.Graph | None] = {}
 
     def forget(self) -> None:
-        """Discards all graphs. Call it after a buffer was reallocated."""
+        """Discards all graphs. Must be called after a buffer is reallocated."""
         self._graphs = {}
 
     def run(self, variant: Hashable, launch: Callable[[], None]) -> None:
-        """Runs a variant of the launch sequence, and captures it the second time.
+        """Runs a variant of the launch sequence; on a GPU, the second run captures it and later runs replay it.
 
         Args:
             variant: key that identifies the launches.

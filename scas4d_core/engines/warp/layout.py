@@ -54,7 +54,7 @@ class Raster:
         columns, rows: size of the largest image, in pixels.
         tiles_x, tiles_y: size of the largest image, in tiles.
         capacity: maximum total number of entries in the tile lists of one image.
-        alpha_floor, alpha_cap, stop, low_pass, near, margin: values of the ``Limits`` fields.
+        alpha_floor, alpha_cap, stop, low_pass, near, margin: values of the corresponding ``Limits`` fields.
         log_floor: natural logarithm of ``alpha_floor``.
         detached: 1 if the label channel's gradient only affects the labels, not the geometry; otherwise 0.
     """

@@ -2,7 +2,8 @@
 
 SSIM follows 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding. Each thread computes four pixels of
 a column. It filters the 14 rows of their windows horizontally, and accumulates each row for all four pixels. Windows
-are recomputed instead of stored, because arithmetic is cheap: all pixels of an image occupy only a tenth of a GPU.
+are recomputed instead of stored, because arithmetic is cheap: the pixels of an entire image occupy only a tenth of a
+GPU.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ return 1;
 #endif
 """)
 def leads() -> wp.int32:
-    """Returns 1 in the thread that gets the result of ``sum_over_block``; on the CPU device, in every thread."""
+    """Returns 1 in the thread that receives the result of ``sum_over_block`` (every thread on the CPU device)."""
     ...
 
 
@@ -82,7 +83,7 @@ return value;
 #endif
 """)
 def sum_over_block(value: wp.vec3) -> wp.vec3:
-    """Returns the sum over a block in its first thread. All threads of the block must call it."""
+    """Returns the sum over a block in its first thread. All threads of the block must call this function."""
     ...
 
 
@@ -498,7 +499,7 @@ class PictureLoss:
         Args:
             view: [1] index of the view.
             record: [1] row of the log.
-            drawn: rasterizer with the rendering.
+            drawn: rasterizer that contains the rendering.
             background: [1] vec4 background features.
             log: [records, ``COLUMNS``] log.
         """

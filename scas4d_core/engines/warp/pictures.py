@@ -81,7 +81,7 @@ class PicturePass:
 
     @property
     def planes(self) -> wp.array:
-        """See the class attributes."""
+        """Channels of the last rendering; see the class attributes."""
         return self._rasterizer.planes
 
     @property
@@ -90,17 +90,17 @@ class PicturePass:
 
     @property
     def cameras(self) -> wp.array:
-        """[views] cameras of all views, of type ``layout.Camera``."""
+        """Cameras of all views [views], of type ``layout.Camera``."""
         return self._loss.cameras
 
     @property
     def targets(self) -> wp.array:
-        """[views, 4, rows, columns] training images and masks."""
+        """Training images and masks [views, 4, rows, columns]."""
         return self._loss.targets
 
     @property
     def guard_counts(self) -> wp.array:
-        """[3] number of times that each guard in ``projection.COUNTED_GUARDS`` was triggered."""
+        """Number of times each guard in ``projection.COUNTED_GUARDS`` was triggered [3]."""
         return self._rasterizer.guard_counts
 
     def forget_guards(self) -> None:
@@ -136,7 +136,7 @@ class PicturePass:
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array,
     ) -> None:  # fmt: skip
-        """Renders a view into ``planes``, and writes its losses to a log row.
+        """Renders a view into ``planes``, and writes its losses to a log row. All arrays must be contiguous.
 
         Args:
             view: [1] int32 index of the view.
@@ -144,7 +144,7 @@ class PicturePass:
             means: [N] vec3 means.
             factors: [N] mat33 covariance factors.
             opacities: [N] float32 opacities.
-            features: [N] vec4 features seen by the camera. All arrays must be contiguous.
+            features: [N] vec4 features seen by the camera.
         """
         cameras, log = self._loss.cameras, self.log
         self._rasterizer.project(cameras, view, means, factors, opacities, features, record, log)

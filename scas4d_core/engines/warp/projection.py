@@ -39,7 +39,7 @@ def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.floa
 
 @wp.func
 def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
-    """Returns the sum of the absolute values of a Gaussian, which is NaN or infinite if any value is."""
+    """Returns the sum of the absolute values of a Gaussian's parameters; NaN or infinite if any of them is."""
     size = wp.abs(mean[0]) + wp.abs(mean[1]) + wp.abs(mean[2]) + wp.abs(opacity)
     for row in range(3):
         size += wp.abs(factor[row, 0]) + wp.abs(factor[row, 1]) + wp.abs(factor[row, 2])
@@ -146,9 +146,9 @@ def project(
         boxes: [N] output, bounding box of each support in tiles: x0, y0, x1, y1 (exclusive). It is undefined if the
             Gaussian is culled.
         records: [4 N] gradient records, reset to 0.
-        guard_counts: [3] number of times that each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
+        guard_counts: [3] number of times each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
         tile_counts: [tiles] number of entries in each list, accumulated.
-        starts, keys: list buffers, not used.
+        starts, keys: list buffers; unused.
     """
     i = wp.tid()
     camera = cameras[view[0]]
@@ -182,7 +182,7 @@ def project_backward(
         raster, cameras, view, means, factors: see ``project``.
         splats: [2 N] output of ``project``.
         records: [4 N] output of ``blend_backward``.
-        guard_counts: [3] number of times that each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
+        guard_counts: [3] number of times each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
         adds: 1 to add to the gradients, 0 to overwrite them.
         g_means, g_factors, g_features: [N] outputs, gradients of the Gaussians.
     """

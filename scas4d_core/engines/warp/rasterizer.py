@@ -19,7 +19,7 @@ LEAST_CAPACITY = 1 << 16
 TILES_EACH = 8
 """Initial tile-list capacity per Gaussian. On average, a Gaussian intersects two to four tiles."""
 WARPS_EACH = 24
-"""Number of warps per multiprocessor that blend segments; the registers are too small for more."""
+"""Number of warps per multiprocessor that blend segments; there are not enough registers for more."""
 
 
 class Rasterizer:
@@ -40,7 +40,7 @@ class Rasterizer:
         starts: [tiles + 1] first entry of each tile list of the last image.
         items: [capacity] Gaussian of each tile-list entry.
         tiles_x: number of tile columns.
-        guard_counts: [3] number of times that each guard in ``projection.COUNTED_GUARDS`` was triggered.
+        guard_counts: [3] number of times each guard in ``projection.COUNTED_GUARDS`` was triggered.
         capacity: maximum number of tile-list entries; an image that needs more is rendered empty (see ``grow``).
     """
 
@@ -166,5 +166,5 @@ class Rasterizer:
         wp.launch(projection.project_backward, self.count, inputs, device=self._device)
 
     def mark(self, cameras: wp.array, side: int, marks: wp.array) -> None:
-        """Marks the blocks, ``side`` pixels wide, that the projected Gaussians intersect; see ``tiles.mark_blocks``."""
+        """Marks the ``side``-pixel blocks that the projected Gaussians intersect; see ``tiles.mark_blocks``."""
         wp.launch(tiles.mark_blocks, self.count, [side, cameras, self.splats, self._boxes, marks], device=self._device)

@@ -32,7 +32,7 @@ class WarpRenderer:
         image_weight: weight of the image loss in ``compare``.
 
     Attributes:
-        device, limits, background: as given.
+        device, limits, background: same as the arguments.
     """
 
     def __init__(

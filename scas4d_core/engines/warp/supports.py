@@ -94,7 +94,7 @@ def enter_lists(
         starts: first entry of each list.
         tile_counts: [tiles] number of entries in each list, accumulated.
         keys: output, depth and row of each entry.
-        filling: 1 to add the entries, or 0 to only count them; ``starts`` and ``keys`` are then not used.
+        filling: 1 to add the entries, or 0 to only count them, in which case ``starts`` and ``keys`` are not used.
     """
     area = wp.int32(0)
     if drawn == 1:

@@ -79,7 +79,7 @@ def scan_lists(
     thread: wp.int32, capacity: wp.int32, length: wp.int32, counts: wp.array[wp.int32], starts: wp.array[wp.int32],
     segment_starts: wp.array[wp.int32],
 ) -> wp.float32:  # fmt: skip
-    """Implements ``place_lists``. All threads of one block must call it."""
+    """Implements ``place_lists``. All threads of one block must call this function."""
     ...
 
 
@@ -184,7 +184,7 @@ for (int i = 0; i < count; ++i) items.data[first + i] = (int)(list[i] & 0xffffff
 def sort_list(
     thread: wp.int32, first: wp.int32, count: wp.int32, keys: wp.array[wp.uint64], items: wp.array[wp.int32]
 ) -> None:
-    """Sorts a list. All threads of a block must call it; on the CPU device, a single thread."""
+    """Sorts a list. All threads of a block must call this function; on the CPU device, a block is a single thread."""
     ...
 
 

@@ -21,7 +21,7 @@ def translate_read_errors(name: str) -> Iterator[None]:
     """Converts exceptions raised while reading a file to an ``InputError``.
 
     Args:
-        name: name of the file, for the message.
+        name: name of the file, used in the error message.
 
     Raises:
         InputError: if the file cannot be read.

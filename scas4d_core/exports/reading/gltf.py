@@ -24,7 +24,7 @@ class GltfFrame:
 
     Args:
         data: contents of the file.
-        name: name of the file, for messages.
+        name: name of the file, used in error messages.
 
     Raises:
         InputError: if the file is not a .glb, or contains an animation of parts.
@@ -107,7 +107,7 @@ class GltfFrame:
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Returns the document and the binary chunk (glTF 2.0, section 4.4)."""
+    """Returns the JSON document and the binary chunk (glTF 2.0, section 4.4)."""
     magic, version, _ = struct.unpack_from("<4sII", data)
     if magic != b"glTF" or version != 2:
         raise ValueError("no glTF 2.0 header")

@@ -26,8 +26,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STANDS = 1e-6
-"""Displacement, relative to the extent of all Gaussians, below which a Gaussian is static; float32 resolves a tenth of
-it."""
+"""Displacement, relative to the extent of all Gaussians, below which a Gaussian counts as static; float32 resolves
+a tenth of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class _GaussianTable:
 
 @dataclass(eq=False)
 class ExportedStates:
-    """Presents a sequence of clouds as states, keeping one frame and the constant data of Gaussians in memory.
+    """Presents a sequence of clouds as states, keeping only one frame and the Gaussians' constant data in memory.
 
     Attributes:
         frames: frame indices in increasing order.

@@ -62,7 +62,7 @@ def open_usd(path: Path) -> ExportedStates:
 
 
 def _codes(stage: Any, prim: Any) -> list[float]:
-    """Collects the time codes of frames from all samples, because constant attributes have only one sample."""
+    """Collects the frames' time codes from the samples of all attributes; constant attributes have only one sample."""
     codes = {float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())}
     scope = stage.GetPrimAtPath(PARTS)
     for each in [prim, *(scope.GetChildren() if scope else ())]:

@@ -2,9 +2,9 @@
 
 Matches leave some degrees of freedom undetermined: the position, orientation and scale of the rig. Others, such as a
 slight bend of a camera ring, are nearly undetermined. Here, a Cauchy loss pulls each camera towards its calibrated
-pose. Values that the matches do not determine thus stay as calibrated, and a camera that is far off does not pull the
-others along. pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of an
-exact rig by a median of 0.6 pixels (`robot`, 2026-11-23).
+pose. Values that the matches do not determine thus keep their calibration, and a camera that is far off does not pull
+the others along. pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of
+an exact rig by a median of 0.6 pixels (`robot`, 2026-11-23).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ excludes wrong matches."""
 NOISE = 0.5
 """Scale of the Cauchy loss on reprojection errors, in pixels."""
 MIN_PRIOR_SCALE = 0.5
-"""Minimum scale of the Cauchy loss of the calibration prior, in pixels. Rotation, translation and focal length are
+"""Minimum scale of the calibration prior's Cauchy loss, in pixels. Rotation, translation and focal length are
 weighted by the image displacement that they cause. After the first round, the scale is the rig's median displacement
 if that is larger."""
 MIN_ANGLE_DEG = 1.0
@@ -147,7 +147,7 @@ class _BundleAdjustment:
         return depths
 
     def _residuals(self, cameras: Sequence[Camera], points: Float) -> tuple[Float, Float, Float]:
-        """Returns the reprojection errors [M, 2] and their Jacobians by camera [M, 2, 6 or 7] and point [M, 2, 3]."""
+        """Returns the reprojection errors [M, 2] and the Jacobians for cameras [M, 2, 6 or 7] and points [M, 2, 3]."""
         seen = self.seen
         rotation = np.array([c.rotation for c in cameras])[seen.camera]
         shift = np.array([c.translation for c in cameras])[seen.camera]

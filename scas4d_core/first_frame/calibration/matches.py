@@ -29,7 +29,7 @@ LONGEST_SIDE = 800
 errors but would take seconds per camera."""
 FEATURES, CONTRAST = 2048, 0.0067
 """Maximum number of features per image, and COLMAP's contrast threshold. On `basketball`, this gives half as many
-features as for the initial points, but the same number of matches. For images of the same size, they are a
+features as for the initial points, but the same number of matches. For images of the same size, the features are a
 bit-identical subset of the features for the initial points in 50 of 51 images. The subset cannot be selected, because
 pycolmap returns keypoints without their contrast. Features are therefore detected twice, which takes up to 1.0 s of
 CPU time for `robot` and 3.0 s for `basketball`."""
@@ -144,7 +144,7 @@ def _mutual_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> 
 
 
 def epipolar_distances(matches: Matches, pair: Pair) -> Float:
-    """Returns the [M] epipolar distances of a pair's matches, each the larger one of both images, in pixels."""
+    """Returns the [M] epipolar distances of a pair's matches in pixels, each the larger of both images' distances."""
     (a, b), rows = pair, matches.pairs[pair]
     first, second = (np.pad(matches.pixels[v][rows[:, k]], ((0, 0), (0, 1)), constant_values=1.0)
                      for k, v in enumerate((a, b)))  # fmt: skip

@@ -51,7 +51,7 @@ def calibrate_first_frame(
 
 
 def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> CalibrationReport | None:
-    """Measures the calibration error in a frame's images, or returns None if fewer than two cameras have an image.
+    """Measures the calibration error from a frame's images, or returns None if fewer than two cameras have an image.
 
     Args:
         rig: rig in the user's world, at image size.
@@ -108,7 +108,7 @@ def refine_rig(rig: Rig, matches: Matches) -> Refinement:
 
     Args:
         rig: calibrated rig, in the user's world.
-        matches: matches between its cameras' images of one frame.
+        matches: matches between the rig's cameras in one frame.
     """
     learnt, held = matches.split()
     fits = list(measure_residuals(matches)[0].values())
@@ -140,7 +140,7 @@ def _not_refined(reason: str) -> Refinement:
 
 @dataclass(frozen=True, eq=False)
 class _HeldOutTest:
-    """A comparison of two calibrations on held-out matches.
+    """Comparison of two calibrations on held-out matches.
 
     Attributes:
         cameras: cameras of the new calibration.

@@ -50,13 +50,13 @@ class RefinedCamera:
 
 @dataclass(frozen=True)
 class Refinement:
-    """The result of refining a calibration.
+    """Result of refining a calibration.
 
     Attributes:
         accepted: whether the scene uses the refined rig.
         text: user-facing explanation.
-        before: error before refinement, i.e. the epipolar distance in pixels whose loss is the mean over held-out
-            matches.
+        before: error before refinement, i.e. the epipolar distance in pixels whose loss equals the mean loss of the
+            held-out matches.
         after: the same error after refinement.
         matches: number of held-out matches.
         cameras: refined cameras, keyed by name; empty if the refinement was not accepted.

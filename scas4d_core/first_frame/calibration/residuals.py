@@ -13,16 +13,16 @@ from scas4d_core.first_frame.calibration.report import CameraResidual
 from scas4d_core.posed_pictures import Float
 
 NEAR, FAR = 16.0, 80.0
-"""Epipolar distances in pixels. Matches below the first are correct except for some chance matches. Matches between the
-two are wrong and uniformly distributed; their density per pixel estimates the number of chance matches."""
+"""Epipolar distance bounds, in pixels. Matches below the first are correct, except for some chance matches. Matches
+between the two are wrong and uniformly distributed; their density per pixel estimates the number of chance matches."""
 MIN_INLIERS = 30
-"""Minimum number of correct matches of a camera for an estimate."""
+"""Minimum number of correct matches needed to estimate a camera's residual."""
 MIN_INLIER_SHARE = 0.5
 """Minimum fraction of correct matches among those below ``NEAR``; otherwise the distances are due to chance."""
 MAX_RESIDUAL, MAX_TIMES_MEDIAN = 0.9, 2.0
 """A camera is off if its residual exceeds both this number of pixels, at the image size of feature detection, and this
-multiple of the rig's median. Correct captures have 0.1 to 0.6 pixels, up to 1.6 times the median; a camera rotated by
-two pixels has 0.9 to 2.2 (docs/calibration.md)."""
+multiple of the rig's median. Correct captures have residuals of 0.1 to 0.6 pixels, up to 1.6 times the median; a
+camera rotated by two pixels has 0.9 to 2.2 pixels (docs/calibration.md)."""
 
 
 class ResidualEstimate(NamedTuple):

@@ -1,4 +1,4 @@
-"""Finds points on which cameras agree, using features, stereo, the visual hull and fitted surfaces."""
+"""Finds points that several cameras agree on, using features, stereo, the visual hull and fitted surfaces."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class PointSearch:
 
     Attributes:
         labelled: views with the given masks, if any.
-        views: the same views, or with silhouettes in front of a backdrop as masks.
+        views: the same views; if there is a backdrop, their masks are the silhouettes in front of it.
         tracks: feature tracks.
         backdrop: whether the masks of ``views`` are silhouettes in front of a backdrop.
         min_views: number of cameras that must agree on a point.
@@ -123,7 +123,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
-    """Returns whether each triangulated point is in the masks of most cameras that observed it, [P]."""
+    """Returns whether each triangulated point is inside the masks of most cameras that observed it, [P]."""
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for view, seen in zip(views, triangulated.views.T, strict=True):

@@ -22,7 +22,7 @@ from scas4d_core.posed_pictures import (
 SPACING = 1.5
 """Spacing of neighbouring points, in pixels at the scene centre; twice that on the background."""
 COLOUR_SPREAD = 0.12
-"""Median deviation between cameras' colours (0…1) above which a point that stereo did not confirm is misplaced."""
+"""Median deviation between cameras' colours (0…1) above which a point not confirmed by stereo is rejected."""
 CROWD = 4
 """Minimum number of stereo points in the 27 cells around a point: many pixels see true surfaces, few see outliers."""
 
@@ -40,7 +40,7 @@ def merge_candidates(
 
     Args:
         labelled: views with the given masks, if any.
-        views: the same views, or with silhouettes in front of a plain background as masks.
+        views: the same views; if the background is plain, their masks are the silhouettes in front of it.
         sources: points on which cameras agree, hull points, and points on fitted surfaces. A point is used only if no
             earlier source has a point nearby.
         pixel: size of a pixel at the scene centre, in world units.
@@ -104,7 +104,7 @@ def merge_candidates(
 
 
 def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
-    """Returns the fraction of the cameras that may see a point whose masks contain it, [P], or None without masks."""
+    """Returns, per point [P], the fraction of its possible observers whose masks contain it; None without masks."""
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):
         if view.mask is None:

@@ -18,7 +18,7 @@ from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 REACH = 2
 """Number of samples on either side of the centre of a patch: 5 × 5 in total."""
 STEP = 2
-"""Spacing of the samples in pixels: a window of 9 pixels at the cost of 25 samples."""
+"""Spacing of the samples in pixels; covers a 9-pixel-wide window at the cost of 25 samples."""
 TEXTURE = 0.012
 """Minimum standard deviation of a patch (0…1) for a meaningful match: three levels of an 8-bit image."""
 NO_MATCH = 2.0
@@ -246,7 +246,7 @@ def patch_match(
         far: maximum depth, in world units.
         iterations: number of rounds.
         best: number of neighbours that must match well, 1 to 3.
-        seed: random seed of the planes.
+        seed: random seed for sampling planes.
 
     Returns:
         Depths [H, W] float64 (0 if there is no match), normals [H, W, 3] in camera axes, and costs 1 − NCC [H, W].

@@ -53,7 +53,7 @@ to 4.7 on six rigs with a floor or table, and 0.9 to 1.6 on three rigs without o
 MIN_CELLS = 40
 """Minimum number of cells of a plane on which cameras agree."""
 MAX_VIEWS = 6
-"""Maximum number of views that are compared, evenly spaced in the rig's order."""
+"""Maximum number of compared views, evenly spaced in the rig's order."""
 CLOSED = 15
 """Maximum width, in cells, of gaps between agreeing cells that are filled."""
 
@@ -172,7 +172,7 @@ def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
 
 
 def _best(views: Sequence[PosedPicture], start: Plane, refine: bool = True) -> tuple[float, Plane]:
-    """Returns the score of the best plane near a start plane, and the plane."""
+    """Returns the score of the best plane near a start plane, and that plane."""
     smooth = _smooth(views, start, CELLS)
 
     def scores_of(moves: Float) -> Float:

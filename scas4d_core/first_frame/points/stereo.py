@@ -1,4 +1,4 @@
-"""Computes dense stereo points on which the depths of several cameras agree and that few cameras see through."""
+"""Computes dense stereo points that several cameras' depths agree on and that few cameras see through."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved, pixels
 WIDTH = 320
 """Maximum image width, in pixels; wider images are halved repeatedly."""
 PACE_WIDTH = 80
-"""Image width for measuring the pace, which takes a thirtieth of the work for one image."""
+"""Image width for measuring the pace; measuring it takes a thirtieth of the work for one image."""
 PLANES_FIRST, PLANES_EACH = 3, 12
-"""Number of planes that are tried per pixel, initially and in each round (``patch_match``)."""
+"""Number of planes tried per pixel, initially and in each round (``patch_match``)."""
 NEIGHBOURS = 4
 """Number of other cameras with which each image is compared."""
 MIN_NEIGHBOURS = 2
@@ -152,7 +152,7 @@ def depth_maps(
         active: [H, W] pixels to compute in each view.
         middle: [3] scene centre, about which angles between cameras are measured.
         iterations: number of rounds of PatchMatch.
-        seed: random seed of the planes.
+        seed: random seed for sampling planes.
         hull: hull of the masks; depths of masked pixels outside of it are rejected.
         fewest: minimum number of neighbours of an image.
         progress: function called with (completed views, number of views).
@@ -226,7 +226,7 @@ def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.f
 
 
 def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
-    """Clears depths of masked pixels in place if they are not near the hull, because no foreground is there."""
+    """Clears, in place, depths of foreground pixels that are not near the hull, which contains all foreground."""
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
         return
@@ -258,7 +258,7 @@ def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: in
 
 
 def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
-    """Returns [P, 3] points of all depth maps on which ``min_views`` cameras agree and that few see through.
+    """Returns the [P, 3] points of all depth maps that ``min_views`` cameras agree on and few see through.
 
     A camera sees through a point if its trusted depth is clearly behind the point. A point is rejected as a floater if
     the number of cameras that see through it exceeds ``max_violations`` times the number of cameras that agree on it

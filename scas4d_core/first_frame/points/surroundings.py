@@ -22,7 +22,7 @@ cameras and the shared volume."""
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The ball that contains the cameras and the shared volume.
+    """Ball that contains the cameras and the shared volume.
 
     Attributes:
         middle: [3] centre in the world.
@@ -34,7 +34,7 @@ class Stage:
 
     @classmethod
     def of(cls, views: Sequence[PosedPicture], distances: Sequence[float]) -> Stage:
-        """Returns the stage of cameras with the given distances from the scene centre, in world units."""
+        """Returns the stage for cameras at the given distances from the scene centre, in world units."""
         return cls(look_at_point(views), STAGE * max(distances))
 
     def holds(self, points: NDArray[np.floating]) -> Bool:

@@ -71,7 +71,7 @@ class VisualHull:
 
     @cached_property
     def _surroundings(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """A grid at half resolution: lowest cell, size, strides, and sorted keys of the cells in or next to the hull.
+        """Half-resolution grid: lowest cell, size, strides, and sorted keys of the cells in or next to the hull.
 
         The grid is cached, because stereo uses it for every image and the hull may have millions of voxels.
         """
@@ -117,7 +117,7 @@ def carve(
         views: views of the cameras; views without a mask are ignored.
         voxel_pixels: maximum edge length of the smallest voxels, in pixels at the scene centre; voxels are halved until
             it is reached.
-        misses: fraction of the cameras seeing a voxel whose masks may miss it.
+        misses: maximum fraction of the cameras seeing a voxel whose masks do not contain it.
         min_views: minimum number of cameras that see a voxel; at least ``SEEN_SHARE`` of the masked cameras must see it
             too.
     """
@@ -156,7 +156,7 @@ def count_contradictions(
         views: views of the cameras; views without a mask are ignored.
         hull: hull of the masks.
         points: [P, 3] points in the world.
-        misses: fraction of the masks that may miss a foreground point.
+        misses: maximum fraction of the masks that may miss a foreground point.
     """
     surface = hull.centres[hull.surface()]
     against, missed, seen = (np.zeros(len(points), dtype=np.intp) for _ in range(3))
@@ -189,7 +189,7 @@ def _inside_silhouettes(
     min_views: int,
     last: bool,
 ) -> Bool:
-    """Returns whether at most a fraction ``misses`` of the cameras of each voxel see it outside the silhouette, [M]."""
+    """Returns, per voxel [M], whether at most a fraction ``misses`` of its cameras see it outside the silhouette."""
     missed = np.zeros(len(centres), dtype=np.int32)
     seen = np.zeros(len(centres), dtype=np.int32)
     may_see = np.zeros(len(centres), dtype=np.int32)

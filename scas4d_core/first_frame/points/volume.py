@@ -85,7 +85,7 @@ def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:
 
 
 def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) -> list[float]:
-    """Returns each camera's distance to the scene: to known points or, if there are none, to where optical axes meet.
+    """Returns each camera's distance to the scene: to known points or, without any, to where the optical axes meet.
 
     Args:
         views: views of the cameras.

@@ -10,8 +10,8 @@ stays fixed in the world while objects rotate. The direction to a nearby light d
 The lookup accounts for this with the inverse distance k of the light and the centre x₀ of the scene. The sheen is the
 reflection at grazing angles, where diffuse light decreases.
 
-Reference implementation: ``engines.torch.gloss``. Gradients to positions and rotations are omitted. The direction to
-a camera hardly changes during an update, and rotations are determined by texture and silhouettes.
+Reference implementation: ``engines.torch.gloss``. Gradients with respect to positions and rotations are omitted. The
+direction to a camera hardly changes during an update, and rotations are determined by texture and silhouettes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, parallel_kernel
 
 SIDE = 16
-"""Cells per side of the grid. A cell covers 12 degrees, about the width of a lamp's highlight on a glazed surface."""
+"""Cells per side of the grid. Each covers 12 degrees, about the width of a lamp's highlight on a glazed surface."""
 CELLS = SIDE * SIDE
 SHEEN, MIDDLE, NEARNESS = CELLS, CELLS + 1, CELLS + 2
-"""Rows of an environment that follow the cells: RGB of the sheen, x₀, and (k, 0, 0)."""
+"""Indices of the environment rows that follow the cells: sheen (RGB), x₀, and (k, 0, 0)."""
 ROWS = CELLS + 3
 FALL = np.float32(0.9)
 """Fraction of the diffuse light that is lost at grazing angles."""
