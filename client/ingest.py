@@ -67,7 +67,7 @@ class IngestSocket:
         masks: Mapping[str, bytes] | None = None,
         time: float | None = None,
     ) -> FrameReceipt:
-        """Sends a frame with the images of all cameras, see `Client.put_frame`."""
+        """Sends a frame with the images of all cameras; see `Client.put_frame`."""
         receipt = self._send(frame_chunks(index, images, masks, time))
         assert isinstance(receipt, FrameReceipt)
         return receipt
@@ -75,7 +75,7 @@ class IngestSocket:
     def put_camera(
         self, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
     ) -> CameraReceipt:
-        """Sends one camera's image of a frame, see `Client.put_camera`."""
+        """Sends one camera's image of a frame; see `Client.put_camera`."""
         masks = {} if mask is None else {camera: mask}
         receipt = self._send(frame_chunks(index, {camera: image}, masks, time, part=True))
         assert isinstance(receipt, CameraReceipt)

@@ -276,7 +276,7 @@ class AsyncClient(_ClientBase):
         await self._http.aclose()
 
     async def send(self, call: Call[T]) -> T:
-        """Sends a call with retries, see `Client.send`."""
+        """Sends a call with retries; see `Client.send`."""
         retries = self._retries(call)
         while True:
             wait: float | None
@@ -339,7 +339,7 @@ class AsyncClient(_ClientBase):
     async def watch(
         self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2
     ) -> AsyncIterator[SceneStatus]:
-        """Yields the scene's status until a frame is finished, see `Client.watch`."""
+        """Yields the scene's status until a frame is finished; see `Client.watch`."""
         until = time.monotonic() + seconds
         while True:
             status = await self.scene(id)
@@ -351,7 +351,7 @@ class AsyncClient(_ClientBase):
             await asyncio.sleep(every)
 
     async def wait(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> FrameReportModel:
-        """Waits until a frame is finished, see `Client.wait`."""
+        """Waits until a frame is finished; see `Client.wait`."""
         async for _ in self.watch(id, index, seconds=seconds, every=every):
             pass
         return await self.frame(id, index)

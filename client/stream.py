@@ -74,7 +74,7 @@ CONNECTION_ERRORS = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
 class Stream:
     """Live stream of a scene, used as a context manager and an iterator over events.
 
-    `subscribe`, `update` and `unsubscribe` may be called from a different thread than the one that iterates. Iteration
+    `subscribe`, `update` and `unsubscribe` may be called from a thread other than the one that iterates. Iteration
     can continue after a `ServiceError`.
 
     Args:
@@ -218,15 +218,15 @@ class AsyncStream:
             await self._connection.close()
 
     async def subscribe(self, id: str, wanted: SubscriptionRequest, *, tag: int | None = None) -> None:
-        """Starts a subscription, see `Stream.subscribe`."""
+        """Starts a subscription; see `Stream.subscribe`."""
         await self._send(self._session.subscribe(id, wanted, tag))
 
     async def update(self, id: str, *, tag: int | None = None, **request: Any) -> None:
-        """Changes fields of a subscription's request, see `Stream.update`."""
+        """Changes fields of a subscription's request; see `Stream.update`."""
         await self._send(self._session.update(id, tag, request))
 
     async def unsubscribe(self, id: str) -> None:
-        """Ends a subscription, see `Stream.unsubscribe`."""
+        """Ends a subscription; see `Stream.unsubscribe`."""
         await self._send(self._session.unsubscribe(id))
 
     async def receive(self) -> Event | None:

@@ -1,4 +1,4 @@
-"""Measurements in a separate process, so that memory and caches of earlier work do not affect them."""
+"""Runs measurements in a separate process, so that memory and caches from earlier work do not affect them."""
 
 from __future__ import annotations
 

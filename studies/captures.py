@@ -1,4 +1,4 @@
-"""Captures of any layout for studies, with cameras to measure on."""
+"""Opens captures of any layout for studies and selects the cameras to measure on."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS,
 
     Args:
         folder: capture folder.
-        options: how the capture is read.
-        more: further arguments, as for `open_source`.
+        options: options for reading the capture.
+        more: additional arguments for `open_source`.
 
     >>> open_measured("samples/robot").full_test_rig.names
     ('4', '11')

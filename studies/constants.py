@@ -12,7 +12,7 @@ from typing import Any
 def varied(place: str, value: Any) -> Iterator[None]:
     """Temporarily sets a module's constant to another value, in this process.
 
-    A constant that a compiled kernel reads keeps the value that the kernel was compiled with.
+    A compiled kernel keeps using the value with which it was compiled.
 
     Args:
         place: dotted name, such as ``"scas4d_core.update.rates.LAYER_STARTS"``.

@@ -18,7 +18,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 def machine() -> dict[str, Any]:
-    """Returns the processor, usable cores, memory, system and Python version, for a row of a study."""
+    """Returns a description of the machine (hardware, operating system, Python version) for a row of results."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     facts: dict[str, Any] = {"processor": processor(), "cores": cores}
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
@@ -61,7 +61,7 @@ def resident_mb(pid: int | None = None) -> float:
 def core_version() -> str:
     """Returns eight hexadecimal digits that identify the sources of the method (all of ``scas4d_core``).
 
-    Settings identify a row; this version shows which rows come from the same code.
+    A row is identified by its settings; this version shows which rows were produced by the same code.
     """
     root = Path(scas4d_core.__file__).parent
     hasher = hashlib.sha256()

@@ -33,7 +33,7 @@ Again = Annotated[
 def write_part(path: Path, text: str) -> None:
     """Replaces the part of a page between two markers, which are the first and the last line of ``text``.
 
-    The rest of the page is kept. If the markers are missing, the text is appended.
+    The rest of the page is left unchanged. If the markers are missing, the text is appended.
     """
     begin, end = text.splitlines()[0], text.splitlines()[-1]
     old = path.read_text() if path.exists() else ""

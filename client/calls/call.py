@@ -53,7 +53,7 @@ def json_reader(model: type[M]) -> Callable[[httpx.Response], M]:
 
 
 def nothing(response: httpx.Response) -> None:
-    """Ignores a response without a body."""
+    """Parses a response that has no body; returns None."""
 
 
 def body(model: BaseModel) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Calls for frames: upload (whole or per camera), closing, declaring missing, reports and downloads."""
+"""Calls for frames: uploading (whole or per camera), closing, declaring missing, reporting and downloading."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def close_frame(id: str, index: int) -> Call[FrameReceipt]:
 
 
 def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportModel]:
-    """Declares the next expected frame, which `index` must match, permanently missing, so that the scene moves past it.
+    """Declares the next expected frame, `index`, permanently missing, so that the scene continues without it.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.declare_missing(open_scene, n, "cable").state
@@ -107,7 +107,7 @@ def _framed(
 
 
 def frame(id: str, index: int) -> Call[FrameReportModel]:
-    """Returns the report of a frame.
+    """Returns a frame's report.
 
     >>> report = client.frame(scene, 1)
     >>> report.state, report.used_cameras

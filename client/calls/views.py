@@ -34,7 +34,7 @@ def render(
         kind: type of image: colour, depth, alpha or parts.
         format: transfer format: png, jpeg or webp.
         background: RGB in 0…1; None for the scene's background.
-        width: image width in pixels, to which the camera is scaled; None for the camera's own width.
+        width: image width in pixels; the camera is scaled to match. None for the camera's own width.
         parts: number of parts; None to choose it automatically.
 
     >>> client.render(scene, "c0").shape
@@ -57,7 +57,7 @@ def render_file(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[bytes]:
-    """Renders a view and returns the encoded file; takes the arguments of `render` and any format of the service.
+    """Renders a view and returns the encoded file; takes the arguments of `render`, with any format of the service.
 
     >>> client.render_file(scene, "c0", format="jpeg")[:2].hex()
     'ffd8'

@@ -30,11 +30,11 @@ PREPARING = "preparing the kernels"
 def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
     """Runs a service on the loopback interface and yields its URL.
 
-    The service listens on `port`, or on any free port if `port` is taken. Its very first start compiles the kernels for
-    the first frame, so this waits without a timeout while the process is alive.
+    The service listens on `port`, or on any free port if `port` is taken. The very first start compiles the kernels for
+    the first frame, so there is no timeout as long as the process is alive.
 
     Raises:
-        RuntimeError: the service exited or cannot become ready; the message contains the reason and the log path.
+        RuntimeError: the service exited or could not become ready; the message contains the reason and the log path.
         ModuleNotFoundError: the service is not installed.
     """
     need_server()

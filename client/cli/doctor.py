@@ -27,9 +27,9 @@ class Check:
     """Result of one check.
 
     Attributes:
-        name: what was checked.
+        name: name of the checked item.
         text: result of the check, with a remedy if something is missing.
-        fault: whether the problem prevents the service from running.
+        fault: whether the check found a problem that prevents the service from running.
     """
 
     name: str

@@ -23,7 +23,7 @@ def export(
     """Exports frames to a file or folder, holding one state in memory at a time.
 
     Args:
-        source: source of the states, see `opened`.
+        source: source of the states; see `opened`.
         format: format name from docs/exports.md.
         out: output folder or `.zip` for numbered files, otherwise output file. If None, the name is derived from source
             and format, and the output is written next to the source, or to the current folder for a scene.

@@ -43,7 +43,7 @@ def make_recording(
     """Writes a Rerun recording, holding one state in memory at a time, and returns its path.
 
     Args:
-        source: source of the states, see `opened`.
+        source: source of the states; see `opened`.
         out: path that ends in `.rrd`; None for a file next to the source, named after it.
         frames: inclusive range `A:B`; None for all frames.
         tracks: number of moving Gaussians whose trajectories are drawn.

@@ -80,7 +80,7 @@ class DistortionCurve:
         return rays * np.where(radius > 0, bends / np.maximum(radius, 1e-12), 1.0) + _tangential_offset(self.lens, rays)
 
     def undistort(self, bent: Float) -> Float:
-        """Inverts `distort`, [P, 2] to [P, 2].
+        """Maps distorted points [P, 2] back to rays [P, 2]; the inverse of `distort`.
 
         Returns ±infinity beyond 89° for a fisheye, and NaN for points that no trusted ray reaches.
         """
@@ -93,7 +93,7 @@ class DistortionCurve:
         return np.where(close[:, None], rays, np.nan)
 
     def _undistort_radial(self, bent: Float) -> Float:
-        """Inverts the radial part alone."""
+        """Inverts only the radial part of the distortion."""
         radius = np.linalg.norm(bent, axis=-1)
         of = np.interp(radius, self.bends, self.samples)
         for _ in range(NEWTON):
@@ -126,12 +126,12 @@ def _profile(lens: LensCamera, of: Float) -> tuple[Float, Float]:
 
 
 def _tangential(lens: LensCamera) -> Float:
-    """Returns OpenCV's p1 and p2, [2]."""
+    """Returns OpenCV's coefficients p1 and p2 as an array [2]."""
     return np.zeros(2) if lens.fisheye else lens.distortion[2:4]
 
 
 def _tangential_offset(lens: LensCamera, rays: Float) -> Float:
-    """Returns the offset due to tangential distortion, [P, 2]."""
+    """Returns the offset [P, 2] of each ray due to tangential distortion."""
     p1, p2 = _tangential(lens)
     x, y = rays[:, 0], rays[:, 1]
     r2 = x * x + y * y

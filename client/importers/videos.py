@@ -81,8 +81,9 @@ class Video:
     def frame(self, index: int) -> Picture:
         """Decodes frame `index`: [H, W, 3] sRGB values, read-only.
 
-        Caches the last frame, and the last frame that was requested by stepping back. Scoring compares every frame with
-        frame 0; without this cache, each comparison would decode everything since the preceding keyframe again.
+        Caches the most recent frame, and the most recent frame that was requested by stepping back. Scoring compares
+        every frame with frame 0; without this cache, each comparison would decode everything since the preceding
+        keyframe again.
 
         Raises:
             CaptureError: the frame cannot be decoded, or the video's metadata rotates it.

@@ -35,7 +35,7 @@ def ping_pong(index: int, count: int) -> int:
 class Sequence:
     """Frames of a capture as frames of a scene, starting at `start`; with `loop`, they run back and forth endlessly.
 
-    Playback reverses at the ends, because jumping from the last frame to the first is not plausible motion.
+    Playback reverses at the ends, because a jump from the last frame to the first would not be plausible motion.
     """
 
     def __init__(self, source: Capture, *, start: int = 0, loop: bool = False) -> None:

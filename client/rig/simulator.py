@@ -60,7 +60,7 @@ def push(
         websocket: whether to use a WebSocket (one per camera with `per_camera`) instead of HTTP requests.
         preset: settings preset name.
         settings: nested settings that override the preset.
-        ingest: rules by which a new scene accepts frames; None for the defaults.
+        ingest: rules for accepting frames in a new scene; None for the defaults.
         nodes: labels that a cluster node must have in order to run a new scene.
         on_progress: receives the stages of frame 0, then "frames" with the number of finished frames.
         on_message: receives messages about outages, lost frames and the frame at which sending continues.

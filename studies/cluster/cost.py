@@ -1,4 +1,4 @@
-"""``scripts/bench cluster``: overhead of Ray for updates and views, and scenes on three nodes versus one machine.
+"""``scripts/bench cluster``: Ray's overhead for updates and views, and throughput on three nodes versus one machine.
 
 Both services run on this machine and take turns. They differ only in how processes start and how messages are sent.
 """
@@ -41,15 +41,15 @@ class CostFigures:
 def measure(
     study: Study, address: str, *, scenes: int, turns: int, views: int, echo: Echo = print
 ) -> dict[str, CostFigures]:
-    """Measures both placements, in alternation.
+    """Measures both placements alternately.
 
     Args:
         study: study whose frames are sent to each scene.
         address: address of the Ray cluster.
-        scenes: number of scenes for the throughput.
-        turns: repetitions of each placement.
-        views: views rendered per turn.
-        echo: prints the progress.
+        scenes: number of concurrent scenes in the throughput measurement.
+        turns: number of measurements of each placement.
+        views: number of views rendered per turn.
+        echo: callback that prints progress messages.
     """
     figures = {name: CostFigures() for name in PLACEMENTS}
     services = {
@@ -79,7 +79,7 @@ def measure(
 
 
 def summarize(found: dict[str, CostFigures], scenes: int) -> str:
-    """Formats the figures as Markdown."""
+    """Formats the measurements as Markdown."""
     local, ray = found["local"], found["ray"]
     ratios = [there / here for here, there in zip(local.updates, ray.updates, strict=True)]
     rows = [
@@ -109,7 +109,7 @@ def _begun(study: Study, service: Service) -> str:
 
 
 def _views(service: Service, scene: str, camera: str, count: int) -> list[float]:
-    """Returns the seconds of each view of an idle scene, excluding the first view."""
+    """Returns the time in seconds of each view of an idle scene, excluding the first view."""
     seconds = []
     for _ in range(count + 1):
         began = time.monotonic()
@@ -121,7 +121,7 @@ def _views(service: Service, scene: str, camera: str, count: int) -> list[float]
 
 
 def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str, str]) -> dict[str, list[float]]:
-    """Returns the seconds of each update of one scene per service; the services take turns, frame by frame."""
+    """Returns the seconds of each update, keyed by service; the services take turns, frame by frame."""
     seconds: dict[str, list[float]] = {name: [] for name in scenes}
     for index in range(1, len(study.frames)):
         for name in (PLACEMENTS, PLACEMENTS[::-1])[index % 2]:
@@ -135,7 +135,7 @@ def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str,
 
 
 def _together(study: Study, service: Service, scenes: int) -> float:
-    """Returns the combined frames per second that several scenes commit after their first frames."""
+    """Returns the combined throughput of several scenes after their first frames, in frames per second."""
     ids = [_begun(study, service) for _ in range(scenes)]
     threads = [threading.Thread(target=_send_all, args=(study, service, id)) for id in ids]
     for id in ids:

@@ -37,7 +37,7 @@ SWEPT_S = 180.0
 def killed_nodes(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Kills the node of the scene's worker with `kill -9`, `count` times at random; a new node joins each time."""
+    """Kills the node of the scene's worker with `kill -9` at `count` random moments; a new node joins each time."""
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []
@@ -203,7 +203,7 @@ def _changed(folder: Path) -> dict[str, int]:
 
 
 def _fill(study: Study, service: Service) -> list[str]:
-    """Creates scenes until a worker finds no room; returns the scene ids."""
+    """Creates scenes until no node has room for another worker; returns the scene ids."""
     scenes: list[str] = []
     while not scenes or not _waits(service, scenes[-1]):
         scenes.append(study.create(service))
@@ -224,7 +224,7 @@ def _waits(service: Service, scene: str) -> bool:
 def _faults_of_kills(
     service: Service, scene: str, sender: FrameSender, expected: Mapping[int, str], pauses: Sequence[float]
 ) -> list[str]:
-    """Returns the faults after nodes were killed: lost frames, differing states, blamed frames and long pauses."""
+    """Returns the faults after node kills: lost frames, differing states, wrongly blamed frames, long pauses."""
     faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
     if blamed := service.deaths(scene):
         faults.append(f"a frame was blamed for the loss of {blamed} nodes")
@@ -253,15 +253,15 @@ AS_LOCALLY = ("kills", "beginnings", "log", "bits")
 
 
 def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
-    """Runs the node scenarios on three nodes and those of `local`; compares the states with a single-machine run.
+    """Runs the node scenarios on three nodes, and `local`; compares the states with a single-machine run.
 
     Args:
         study: study that defines the frames and the service.
         count: number of kills.
-        seed: seed of the random moments.
+        seed: random seed for the moments of the kills.
         parts: names of the scenarios to run.
-        local: runs the named scenarios of a study whose service uses the cluster.
-        echo: prints the progress.
+        local: function that runs the named scenarios of a study whose service uses the cluster.
+        echo: callback that prints progress messages.
     """
     outcomes = []
     if set(parts) & {*ON_NODES, OF_THE_HEAD}:

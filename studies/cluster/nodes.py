@@ -21,7 +21,7 @@ STORE_BYTES = 80 * 2**20
 
 
 class Nodes:
-    """A Ray cluster: a head without room for scenes, and several nodes.
+    """A Ray cluster: a head without resources for scenes, and several nodes.
 
     Args:
         count: number of nodes besides the head.
@@ -79,7 +79,7 @@ class Nodes:
         return None
 
     def kill(self, node: int) -> None:
-        """Kills all processes of a node with `kill -9`; the node does not come back."""
+        """Kills all processes of a node with `kill -9`; the node does not restart."""
         tree = [node, *_below(node)]
         for pid in tree:
             _signal(pid, signal.SIGKILL)
@@ -106,7 +106,7 @@ class Nodes:
         self._cluster.head_node.start_gcs_server()
 
     def resume(self, node: int) -> None:
-        """Resumes a node with SIGCONT: workers first, before their raylet learns that the node was given up."""
+        """Resumes a node with SIGCONT: workers first, before their raylet learns that the node was declared dead."""
         for pid in (*reversed(_below(node)), node):
             _signal(pid, signal.SIGCONT)
 

@@ -1,6 +1,6 @@
-"""``scripts/bench head``: downtime of a cluster's head that a supervisor restarts whenever it ends.
+"""``scripts/bench head``: downtime of a cluster head that a supervisor restarts whenever it exits.
 
-The head, which uses Redis, and a node run on this machine. Each has its own process namespace and address, as on two
+The head, which uses Redis, and a node run on this machine. Each has its own process namespace and address, as if on two
 machines, because `ray start --head` refuses to start next to processes of another node.
 """
 
@@ -33,7 +33,7 @@ NOT_STARTED = "the cluster did not start"
 
 
 class SupervisedCluster:
-    """A head that is restarted whenever it ends, and a node."""
+    """A cluster with one node, and a head that is restarted whenever it exits."""
 
     def __init__(self) -> None:
         if os.geteuid() != 0:
@@ -125,7 +125,7 @@ def silences(count: int, echo: Callable[[str], None]) -> list[float]:
 
 
 def summarize(found: Sequence[float]) -> str:
-    """Formats the result as a sentence."""
+    """Formats the measured downtimes as a sentence."""
     ordered = sorted(found)
     return (
         "An actor requested right after the head was killed responded after a median of "

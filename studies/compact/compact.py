@@ -42,13 +42,13 @@ class CompactFigures:
         gaussians: number of Gaussians.
         moving: number of moving Gaussians.
         frames: number of frames in the file.
-        exact: bytes per frame of the exact states on disk.
-        size: bytes per frame of the compact file, including its header, births and index.
+        exact: size of the exact states on disk, in bytes per frame.
+        size: size of the compact file including its header, births and index, in bytes per frame.
         sizes: mean size of a record in bytes, keyed by record kind.
         psnr: mean PSNR on the test cameras minus that of the exact states, over ``VIEWS`` frames, in dB. None without
             test cameras.
-        worst: lowest such PSNR difference of a single frame, in dB.
-        tracks: median distance between decoded and exact tracks over points and frames, in % of the moving extent.
+        worst: lowest PSNR difference of a single frame, in dB.
+        tracks: median distance, over points and frames, between decoded and exact tracks, in % of the moving extent.
         write: median CPU time to write a frame, in ms.
         read: median CPU time to read a random frame, in ms.
         read_worst: longest CPU time to read a random frame, in ms.
@@ -87,7 +87,7 @@ def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
 def measure(
     folder: Path, states: Path, frames: int, bounds: Mapping[str, float], key_every: int | None
 ) -> CompactFigures:
-    """Writes the states of a capture back and forth to a compact file, and compares the file with them."""
+    """Writes a capture's states, played back and forth, to a compact file and compares it with the states."""
     capture = open_source(folder)
     history = History.load(states)
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
@@ -139,7 +139,7 @@ def measure(
 
 
 def summarize(found: CompactFigures) -> str:
-    """Formats the figures as Markdown."""
+    """Formats the measurements as Markdown."""
     kinds = ", ".join(f"{name} {size / 1e3:.1f}" for name, size in found.sizes.items())
     errors = ", ".join(f"{name} {value:.4f}" for name, value in found.errors.items())
     pictures = "–" if found.psnr is None else f"{found.psnr:+.3f} (worst frame {found.worst:+.3f})"
@@ -160,7 +160,7 @@ def summarize(found: CompactFigures) -> str:
 
 
 def _write(file: Path, head: FileHeader, states: Iterator[Gaussians], key_every: int) -> list[float]:
-    """Returns the CPU seconds for each frame after the first."""
+    """Returns the CPU time to write each frame after the first, in seconds."""
     seconds = []
     with CompactWriter(file, head, key_every) as writer:
         for place, state in enumerate(states):
@@ -177,7 +177,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _reads(reader: CompactReader) -> list[float]:
-    """Returns the CPU seconds of reading frames in random order, after the last frame has been read once."""
+    """Returns the CPU seconds per frame read in random order, after the last frame has been read once."""
     draw = np.random.default_rng(0)
     seconds = []
     reader.state(reader.frames[-1])

@@ -22,7 +22,7 @@ EXACT, TURNS, READS = 48, 5, 200
 
 
 def opening(frames: int) -> str:
-    """Creates a history of ``frames`` frames and measures it; returns the figures as a sentence."""
+    """Creates a history of ``frames`` frames, times opening and reading it, and returns the result as a sentence."""
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "states"
         _fill(folder, frames)

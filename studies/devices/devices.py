@@ -26,7 +26,7 @@ DEVICES: tuple[Device, ...] = ("cpu", "gpu")
 
 @dataclass(frozen=True)
 class DeviceRow:
-    """Comparison of one frame.
+    """Comparison of the two devices on one frame.
 
     Attributes:
         capture: capture name.
@@ -36,7 +36,7 @@ class DeviceRow:
         gaussians: number of Gaussians present, keyed by device.
         distance: median distance between the positions of the same moving Gaussian on both devices, divided by the
             extent of the scene.
-        tracks: median track error over all frames, in percent of the extent, keyed by device; only given for the last
+        tracks: median track error over all frames, in percent of the extent, keyed by device; only present for the last
             frame of a capture with ground truth.
     """
 
@@ -55,7 +55,7 @@ class DeviceRow:
 
 
 def use_cpu_without_gpu() -> str:
-    """Lets device "gpu" run on Warp's CPU device if there is no GPU; returns what "gpu" stands for.
+    """Maps device "gpu" to Warp's CPU device if there is no GPU; returns a description of the device in use.
 
     Raises:
         SystemExit: NVIDIA Warp is not installed.
@@ -71,7 +71,7 @@ def use_cpu_without_gpu() -> str:
 def compare(
     folder: Path, scale: float, frames: int, iterations: int, static: int, seed: int = 0, itself: bool = False
 ) -> list[DeviceRow]:
-    """Returns a row for each updated frame.
+    """Updates a capture on both devices and returns a row for each updated frame.
 
     Args:
         folder: capture folder.
@@ -81,7 +81,7 @@ def compare(
         static: iterations of frame 0, which is fitted on the CPU.
         seed: seed of the updates.
         itself: whether to compare the CPU with itself instead, from a frame 0 whose positions differ in the last bit.
-            This is the difference that rounding alone may cause.
+            This measures the difference that rounding alone can cause.
     """
     capture = open_measured(folder, image_scale=scale)
     changes = {
@@ -131,7 +131,7 @@ def track_errors(scenes: dict[Device, Reconstruction], capture: Capture, last: i
 
 
 def distances(scenes: dict[Device, Reconstruction], index: int) -> NDArray[np.float64]:
-    """Returns the distances in metres between the moving Gaussians that both states share."""
+    """Returns the distance in metres between the two positions of each moving Gaussian that both states share."""
     mine, true = (scenes[device].history.gaussians(index) for device in ("gpu", "cpu"))
     _, here, there = np.intersect1d(mine.ids[mine.moving], true.ids[true.moving], return_indices=True)
     away: NDArray[np.float64] = np.linalg.norm(

@@ -40,7 +40,7 @@ COUNTED_FROM = 2
 
 @dataclass
 class Kept:
-    """Frames measured under one budget: seconds, iterations and seconds per iteration of each frame."""
+    """Measurements under one budget: seconds, iterations and seconds per iteration of each frame."""
 
     milliseconds: float
     seconds: list[float] = field(default_factory=list)
@@ -48,7 +48,7 @@ class Kept:
     each: list[float] = field(default_factory=list)
 
     def off(self) -> list[float]:
-        """Returns the deviation of each frame from the budget, in milliseconds."""
+        """Returns the deviation of each frame's time from the budget, in milliseconds."""
         return [1000 * seconds - self.milliseconds for seconds in self.seconds]
 
     def allowed(self) -> list[float]:
@@ -75,14 +75,14 @@ def measure_budgets(
 ) -> Row:
     """Plays a capture back and forth under each budget; writes ``out/effort/<capture>-budgets.json``.
 
-    The time of a frame runs from before its images are decoded until its commit is synced to disk.
+    A frame's time is measured from the start of image decoding until its commit is synced to disk.
 
     Args:
         folder: capture folder.
         out: folder of a study that contains the states of frame 0.
-        milliseconds: time budgets.
-        frames: number of frames played under each budget.
-        report: prints the progress.
+        milliseconds: time budgets in milliseconds.
+        frames: number of frames to play under each budget.
+        report: callback that prints progress messages.
     """
     capture = open_measured(folder)
     kept = []
@@ -121,9 +121,9 @@ def measure_adaptive(
         folder: capture folder with test cameras.
         out: folder of a study that contains the states of frame 0.
         name: adaptive preset name.
-        updates: number of updates of the capture.
-        seeds: number of seeds for the capture as recorded, because results of the first update vary by chance.
-        report: prints the progress.
+        updates: number of updates to run on the capture.
+        seeds: number of seeds for the capture as recorded, because the results of the first update vary with the seed.
+        report: callback that prints progress messages.
     """
     capture = open_measured(folder)
     few = min(updates, FEW)
@@ -147,7 +147,7 @@ def measure_adaptive(
 
 
 class Turns:
-    """Two settings that process the same frames in alternation, with the seconds and PSNR of each frame.
+    """Two settings that process the same frames alternately, with the seconds and PSNR of each frame.
 
     Args:
         names: names of the two settings; the first is the baseline.
@@ -215,7 +215,7 @@ def changed(settings: Settings, **changes: Any) -> Settings:
 
 
 def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
-    """Writes a result to ``out/effort/<name>.json``, with the machine and source version it was measured on."""
+    """Writes a result to ``out/effort/<name>.json``, with the machine and the source version."""
     from scas4d_core.kernels.jit import threads
 
     row: Row = {

@@ -122,5 +122,5 @@ def _gain(one: Row) -> float:
 
 
 def _told(one: Row, name: str) -> str:
-    """Returns the PSNR of a setting in dB, and its standard deviation over seeds."""
+    """Formats the PSNR of a setting in dB, with its standard deviation over seeds."""
     return f"{one['psnr'][name]:.2f} ± {np.std(one['psnr_each'][name]):.2f}"

@@ -1,9 +1,9 @@
-"""Cost of an update's report: the share of its stage, and a check that the stage covers the whole cost.
+"""Cost of an update's report: its stage's share of the time, and a check that the stage covers the whole cost.
 
 The stage ``report`` covers the stage timers, losses that are computed only for the curve, the cameras' colour shifts,
 and assembling and writing the record. Publishing the record, as a worker does, is timed here and added to the stage.
 The work that is interleaved with the iterations can be switched off (``FrameUpdate.curve``). Running the same frames
-with and without it, in alternation, measures its whole cost independently of the timers.
+alternately with and without it measures its whole cost independently of the timers.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     Args:
         folder: capture folder.
         out: folder of a study that contains the states of frame 0.
-        updates: number of updates of the capture; the first ones are not counted.
-        report: prints the progress.
+        updates: number of updates to run on the capture; the first ones are not counted.
+        report: callback that prints progress messages.
     """
     from scas4d_core.update.frame_update import FrameUpdate
 
@@ -86,7 +86,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
 
 
 def _published(scene: Any, index: int) -> float:
-    """Returns the seconds a worker takes to publish a record: reading it from the commit and pickling it."""
+    """Returns the seconds that a worker takes to publish a record: to read it from the commit and pickle it."""
     began = time.perf_counter()
     ForkingPickler.dumps(scene.history.report(index))  # as for a pipe
     return time.perf_counter() - began

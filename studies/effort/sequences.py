@@ -36,13 +36,13 @@ def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
 
 
 def as_it_is(capture: Capture, updates: int) -> Iterator[Shown]:
-    """Yields the first updates of a capture."""
+    """Yields the first ``updates`` frames of a capture after frame 0."""
     for index in range(1, min(updates + 1, capture.frame_count)):
         yield Shown(capture.frame(index), _truth(capture, index))
 
 
 def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
-    """Yields every frame twice, as from a camera at half the rate, and frame 3 four times."""
+    """Yields every frame twice, as if recorded at half the frame rate, and frame 3 four times."""
     step = capture.frame(1).time - capture.frame(0).time
     number = 0
     for index in range(1, min(updates + 1, capture.frame_count)):
@@ -54,9 +54,9 @@ def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
 
 
 def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterator[Shown]:
-    """Renders a capture at a third of its speed from its reconstruction, with interpolated states.
+    """Renders a slowed-down capture (by default, to a third of its speed) from interpolated reconstructed states.
 
-    Both the training images and the truth are rendered, so the results are comparable only with each other.
+    Both the training images and the ground truth are rendered, so the results are comparable only with each other.
     """
     source = started(capture, settings_of("scas4d"), out)
     for index in range(1, min(updates + 1, capture.frame_count)):

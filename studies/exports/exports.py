@@ -69,9 +69,9 @@ class ExportFigures:
     Attributes:
         format: format name.
         size: file size in bytes.
-        psnr: PSNR of its render against the render of the state, averaged over cameras, in dB.
+        psnr: PSNR between the renders of the export and of the state, averaged over cameras, in dB.
         reader: reader name.
-        picture: state | export | difference in the first camera.
+        picture: image of state | export | difference, as seen by the first camera.
     """
 
     format: str
@@ -84,7 +84,7 @@ class ExportFigures:
 def measure(folder: Path, states: Path) -> list[ExportFigures]:
     """Exports the last committed state of a capture in every format, and renders what the readers return.
 
-    It renders all test cameras. In `glb-parts`, the last state is the first one moved to the end of the animation.
+    All test cameras are rendered. In `glb-parts`, the last state is the first one, moved to the end of the animation.
     """
     capture = open_source(folder)
     history = History.load(states)
@@ -112,13 +112,13 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
 
 
 def summarize(figures: list[ExportFigures]) -> str:
-    """Formats the figures as Markdown."""
+    """Formats the measurements as Markdown."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
     return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])
 
 
 def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
-    """Draws a contact sheet of state, export and difference for each format, in the first test camera."""
+    """Draws a contact sheet of state, export and difference for each format, as seen by the first test camera."""
     high, wide = figures[0].picture.shape[:2]
     rows = -(-len(figures) // columns)
     made = Image.new("RGB", (columns * (wide + GAP), rows * (high + TITLE)), "white")

@@ -1,8 +1,8 @@
 """Comparison of the moving parts of an exported asset, read back with pygltflib, with their true poses.
 
 Each true part is matched one to one (Hungarian algorithm) with the node that contains most of its points in frame 0.
-The comparison covers the motion since frame 0: the angle of the residual rotation, and the mean distance at the points
-of the part.
+The comparison covers the motion since frame 0: the angle of the residual rotation, and the mean position error over the
+points of the part.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class PartFigures:
     Attributes:
         part: part name.
         static: whether the part is static in the ground truth.
-        points: number of its points.
+        points: number of points of the part.
         node: name of the matching node of the asset, or "none".
-        share: share of the points that the node contains.
+        share: fraction of the part's points that the node contains.
         degrees: [T − 1] rotation error in each frame after the first.
-        percent: [T − 1] mean distance at the points in each frame after the first, in percent of the extent.
+        percent: [T − 1] mean position error over the points in each frame after the first, in percent of the extent.
     """
 
     part: str
@@ -72,7 +72,7 @@ class PartFigures:
 
 @dataclass(frozen=True, eq=False)
 class AssetFigures:
-    """Measurements of an asset: how its number of parts was chosen, that number, and the errors of the true parts."""
+    """Measurements of an asset: how the number of parts was chosen, the number, and the errors of the true parts."""
 
     count: str
     nodes: int
@@ -92,11 +92,11 @@ class AssetFigures:
 
 
 def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
-    """Exports the asset of a whole capture, with the number of parts chosen by rule and then as in the ground truth.
+    """Exports the asset of a whole capture, first with the number of parts chosen by rule, then with the true number.
 
     Args:
         folder: capture folder. Without ground truth of moving rigid parts, the result is empty.
-        states: folder of its committed states.
+        states: folder that contains the capture's committed states.
     """
     capture = open_source(folder)
     truth = capture.ground_truth
@@ -126,7 +126,7 @@ def read_asset(file: Path, seconds: Float) -> list[Node]:
 
     Args:
         file: file in format `glb-parts`.
-        seconds: [T] time of each frame since the first, which is 0.
+        seconds: [T] time of each frame in seconds, relative to the first.
     """
     from pygltflib import GLTF2
 
@@ -178,7 +178,7 @@ def compare(
 
     Args:
         nodes: nodes of the asset.
-        wanted: parts of the ground truth.
+        wanted: ground truth parts.
         points: [P, 3] true points in frame 0.
         part_id: [P] part of each point.
         frames: the T frames of the capture.
@@ -207,7 +207,7 @@ def compare(
 
 
 def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Float, Float]:
-    """Returns the errors after frame 0: [T − 1] in degrees, and [T − 1] at the points in percent of the extent.
+    """Returns [T − 1] rotation errors in degrees and [T − 1] position errors in percent of the extent, after frame 0.
 
     Args:
         found: [T, 4, 4] reconstructed motion.
@@ -229,7 +229,7 @@ def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Flo
 
 
 def told_asset(figures: list[AssetFigures]) -> str:
-    """Formats the figures as Markdown: one row per part, and one row for all covered parts."""
+    """Formats the measurements as Markdown: one row per part, and one row for all covered parts."""
     head = "| parts | true part | points | in the node | rotation, median (worst) | at its points, median (worst) |"
     rows = [head, "|---|---|---|---|---|---|"]
     for one in figures:

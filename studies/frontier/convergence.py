@@ -55,14 +55,14 @@ class WatchedEngine:
 def measure_convergence(
     folder: Path, out: Path, *, updates: int = 5, variants: Sequence[Variant] = (), report: Report = print
 ) -> Row:
-    """Observes the first updates of a capture and writes the curves to ``out/convergence/<capture>.json``.
+    """Records how a capture's first updates converge; writes the curves to ``out/convergence/<capture>.json``.
 
     Args:
         folder: capture folder with test cameras.
         out: study folder, which contains the states of frame 0.
         updates: number of updates over which the curves are averaged.
         variants: settings to measure; ``WATCHED`` if empty.
-        report: prints the progress.
+        report: callback that prints progress messages.
     """
     compile_in_processes()
     capture = open_measured(folder)

@@ -2,9 +2,9 @@
 
 The study varies the iterations of each method, and one axis at a time around the default of 100 iterations of
 ``scas4d``. A row is one capture, one setting and one seed over the same first updates, so that all rows of a capture
-are comparable. Rows are those of ``studies.quality``, and rows on disk are not measured again. Frame 0 is fitted once
-per capture and Gaussian budget. The reported seconds come from ``studies.frontier.timing``, which measures settings in
-alternation, so rows may be measured on a busy machine.
+are comparable. Rows are measured as in ``studies.quality``, and rows already on disk are not measured again. Frame 0 is
+fitted once per capture and Gaussian budget. The reported seconds come from ``studies.frontier.timing``, which measures
+settings alternately, so rows may be measured on a busy machine.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Variant:
         changes: further settings, such as ``"update.clusters=[64]"``.
         seed: seed of the updates; frame 0 is the same for all seeds.
         whole: whether to process all frames of the capture.
-        constants: changed constants of the method, as pairs of dotted name and value (``studies.constants``).
+        constants: overridden constants of the method, as pairs of dotted name and value (``studies.constants``).
     """
 
     label: str
@@ -63,7 +63,7 @@ class Variant:
         return settings_of(self.preset, self.iterations, changes=[f"update.seed={self.seed}", *self.changes])
 
     def job(self, capture: Path, updates: int) -> Job:
-        """Returns the job that measures a capture with this setting, over a number of updates or all frames."""
+        """Returns the job that measures a capture with this setting, over ``updates`` updates or all frames."""
         frames = None if self.whole else updates + 1
         return Job(capture, self.preset, self.settings, frames, pictures=(-1,), constants=self.constants)
 
@@ -119,7 +119,7 @@ each Gaussian start immediately, with the first layer.
 
 
 def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
-    """Returns the settings of some axes without duplicates, the default first; of all axes if none are given.
+    """Returns the distinct settings of the given axes, default first; of all axes if none are given.
 
     Args:
         axes: names from ``AXES``.
@@ -146,7 +146,7 @@ def measure_frontier(
     most_iterations: int | None = None,
     report: Report = print,
 ) -> list[Row]:
-    """Measures the missing rows, starting with the cheapest over all captures.
+    """Measures the missing rows of all captures, cheapest first.
 
     Args:
         captures: folders of captures with test cameras.
@@ -154,7 +154,7 @@ def measure_frontier(
         axes: names from ``AXES``; all axes if empty.
         updates: updates per row, except on the axis "drift", which covers whole captures.
         most_iterations: settings with more iterations are left out.
-        report: prints the progress.
+        report: callback that prints progress messages.
 
     Returns:
         The rows measured by this call; failed rows have an ``error`` and are retried next time.

@@ -63,7 +63,7 @@ def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UP
 
     Args:
         out: study folder.
-        captures: names of captures; those without rows are left out.
+        captures: capture names; captures without rows are left out.
         page: Markdown file to write.
         updates: number of updates that the rows cover.
 
@@ -134,7 +134,7 @@ def equal_table(compared: Sequence[EqualSeconds]) -> str:
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
-    """Describes at how many budgets ``scas4d`` leads, and its smallest lead."""
+    """Returns a sentence on the number of budgets at which ``scas4d`` leads, and on its smallest lead."""
     leads = [one.lead for one in compared if one.lead is not None]
     missing = len(compared) - len(leads)
     if not leads:
@@ -166,7 +166,7 @@ def _draw(
 
 
 def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
-    """Returns, per method, the standard deviation of the mean over captures in dB, over independent seeds."""
+    """Returns each method's standard deviation in dB, over independent seeds, of the mean over captures."""
     deviations = {method: [spread(points, method, name) for name in captures] for method in METHODS}
     return {
         method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)

@@ -1,8 +1,9 @@
 """Plots of the frontier as PNG files: accuracy against time, within an update and over frames, and time per stage.
 
 Each plot is as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that
-width. The palette of Okabe and Ito is distinguishable with any colour vision; shapes and labels repeat it. In every
-plot, a colour stands for the same method, axis or stage, and a dash pattern for the same number of iterations.
+width. The palette of Okabe and Ito is distinguishable with any colour vision; shapes and labels carry the same
+information. In every plot, a colour stands for the same method, axis or stage, and a dash pattern for the same number
+of iterations.
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def _draw_about_default(
     plt: Any, axes: Any, points: Sequence[Point], others: Mapping[str, list[Point]], best: Sequence[Point],
     deviation: float | None,
 ) -> None:  # fmt: skip
-    """Plots one setting at a time with labels, and the curve through the default."""
+    """Plots the variations of one setting at a time with labels, and the curve through the default."""
     method = METHODS[0]
     _steps(axes, best)
     _curve(axes, points, method, best, deviation)
@@ -325,7 +326,7 @@ def _steps(axes: Any, best: Sequence[Point]) -> Any:
 def _curve(
     axes: Any, points: Sequence[Point], method: str, best: Sequence[Point], deviation: float | None, size: float = 24
 ) -> Any:
-    """Draws a method by iterations, with error bars at the default's iterations; returns its legend entry."""
+    """Draws a method's curve over iterations, with error bars at the default; returns its legend entry."""
     line, colour = curve(points, method), COLOURS[method]
     axes.plot([p.seconds for p in line], [p.psnr for p in line], color=colour, linewidth=1.2, zorder=2)
     _markers(axes, line, best, MARKERS[method], colour, size)

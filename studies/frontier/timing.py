@@ -1,4 +1,4 @@
-"""Times of settings, measured in alternation so that other load on the machine affects all of them equally.
+"""Times of settings, measured alternately so that other load on the machine affects all of them equally.
 
 Each setting has its own reconstruction, all in one process, starting from the frame 0 that the rows of the study share.
 In each round, every setting processes the next frame, in an order that rotates from round to round. The first round is
@@ -44,7 +44,7 @@ class TimedVariant:
     stages: list[dict[str, float]] = field(default_factory=list)
 
     def step(self, capture: Capture, index: int, *, counts: bool) -> float:
-        """Reads a frame and updates the reconstruction; returns the seconds, and records them if it ``counts``."""
+        """Reads a frame and updates the reconstruction; returns the seconds, and records them if ``counts`` is true."""
         started, cpu = time.perf_counter(), time.process_time()
         with all_varied(self.variant.constants):
             done = self.reconstruction.step(capture.frame(index))
@@ -61,17 +61,18 @@ def measure_times(
 ) -> Row:
     """Times settings on a capture and writes the result to ``out/timing/<capture>.json``.
 
-    Settings that only an earlier run measured are kept. Their times are scaled like that of the first setting.
+    Results that only an earlier run measured are kept. Their times are scaled by the change in the first setting's
+    time.
 
     Args:
         folder: capture folder.
         variants: settings to time; the first is the baseline. A missing frame 0 is fitted.
         out: study folder.
         rounds: number of counted rounds.
-        report: prints the progress.
+        report: callback that prints progress messages.
 
     Raises:
-        ValueError: there is no setting, fewer than 1 round, or a capture of fewer than 3 frames.
+        ValueError: no settings were given, there is less than one round, or the capture has fewer than 3 frames.
     """
     if not variants:
         raise ValueError("variants is empty; pass at least one setting to time")

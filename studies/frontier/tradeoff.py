@@ -1,9 +1,10 @@
 """Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal time.
 
 Accuracy comes from the rows, which cover the same updates for all settings of a capture. Seconds come from
-``studies.frontier.timing``. A setting that was not timed has the seconds of its row: CPU seconds if the row ran on one
-thread, because other load on the machine hardly affects them. If the default was timed on the capture, these seconds
-are scaled by the ratio of its timed seconds to the seconds of its row, so that all times of a capture are comparable.
+``studies.frontier.timing``. For a setting that was not timed, the seconds of its row are used: CPU seconds if the row
+ran on one thread, because other load on the machine hardly affects them. If the default was timed on the capture, these
+seconds are scaled by the ratio of its timed seconds to the seconds of its row, so that all times of a capture are
+comparable.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ class Point:
 
     Attributes:
         variant: the setting.
-        capture: capture name, or a list of the averaged captures.
+        capture: capture name, or the names of the averaged captures.
         updates: number of updates that the scores cover.
-        seconds: seconds per update, see the module docstring.
+        seconds: seconds per update; see the module docstring.
         cpu_seconds: CPU seconds per update over all threads; None if not measured.
-        timed: whether the seconds were measured in alternation.
+        timed: whether the seconds were measured by alternating between settings.
         stages: median seconds of each stage.
         gaussians: number of Gaussians in the scene.
         scores: value of each of ``SCORES``; None if the capture has no ground truth for it.
@@ -111,7 +112,7 @@ def curve(points: Iterable[Point], method: str, capture: str | None = None) -> l
 
 
 def undominated(points: Sequence[Point]) -> list[Point]:
-    """Returns the points for which no other is as fast and more accurate, in ascending order of seconds."""
+    """Returns the points for which no other point is as fast and more accurate, in ascending order of seconds."""
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, -point.psnr)):
         if not best or point.psnr > best[-1].psnr:
@@ -122,8 +123,8 @@ def undominated(points: Sequence[Point]) -> list[Point]:
 def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
     """Interpolates the PSNR of a curve in dB at a given time, linearly in log time; None outside the curve.
 
-    Settings that take longer than a better one are excluded. With very few iterations, updates end so far off that the
-    search for lost objects takes longer than the iterations that would have found them.
+    Settings that take longer than a better one are excluded. With very few iterations, updates end so far from the
+    solution that the search for lost objects takes longer than the iterations that would have found them.
     """
     ordered = undominated(points)
     if not ordered or not ordered[0].seconds <= seconds <= max(point.seconds for point in points):
@@ -133,7 +134,7 @@ def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
 
 @dataclass(frozen=True)
 class EqualSeconds:
-    """Both methods at the time that the baseline takes for a number of iterations.
+    """Comparison of both methods at the time that the baseline takes for a number of iterations.
 
     Attributes:
         capture: capture name.

@@ -1,4 +1,4 @@
-"""Measurements of the GPU check; each returns plain values for the JSON file and the page."""
+"""Measurements of the GPU check; each function returns plain values for the JSON file and the page."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Row = dict[str, Any]
 
 
 def graphics_card() -> Row:
-    """Returns the name, memory, driver and versions."""
+    """Returns the GPU's name, memory and architecture, and the versions of the driver and of Warp."""
     import warp
 
     device = warp.get_device(warp_device())
@@ -54,7 +54,7 @@ def graphics_card() -> Row:
 
 
 def run_tests(root: Path, seconds: float) -> Row:
-    """Runs the tests of the engine on the device, with a time limit; returns their last line."""
+    """Runs the engine's tests on the device with a time limit; returns the last line of their output."""
     command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *TESTS]
     began = perf_counter()
     try:
@@ -107,7 +107,7 @@ def measured(scene: Reconstruction, capture: Capture, index: int) -> float:
 
 
 def one_size(size: Size, views: int, iterations: int = 100, updates: int = 4) -> Row:
-    """Returns the median seconds of an update, and the microseconds of each kernel in one more."""
+    """Returns the median seconds of an update, and the microseconds per kernel in one more update."""
     state, cameras = wall(size), rig(size)
     changes = {"iterations": iterations, "views": views, "stop_gain": 0, "skip_tolerance": 0}
     settings = preset("scas4d", {"device": "gpu", "scene": SCENE, "update": changes})
@@ -130,7 +130,7 @@ def one_size(size: Size, views: int, iterations: int = 100, updates: int = 4) ->
 
 @contextmanager
 def kernel_times() -> Iterator[Row]:
-    """Yields a dictionary that is filled with the launches and microseconds of each kernel inside the context."""
+    """Yields a dictionary that receives the launches and microseconds of each kernel used within the context."""
     import warp
 
     times: Row = {}
@@ -146,7 +146,7 @@ def kernel_times() -> Iterator[Row]:
 
 
 def spread(folder: Path, runs: int, frames: int, **changes: Any) -> Row:
-    """Repeats the same reconstruction; returns the range of the PSNR, and whether the states have the same bits."""
+    """Repeats the same reconstruction; returns the range of the PSNR, and whether the states are bit-identical."""
     ends, digests = [], set()
     for _ in range(runs):
         capture = open_capture(folder)
@@ -161,7 +161,7 @@ def spread(folder: Path, runs: int, frames: int, **changes: Any) -> Row:
 
 
 def view_time(size: Size, repeats: int = 20) -> Row:
-    """Returns the median milliseconds of a rendered view, upload of the state included."""
+    """Returns the median time to render a view in milliseconds, including the upload of the state."""
     from scas4d_core.engines.choose import renderer_of
     from scas4d_core.engines.limits import scene_limits
     from scas4d_core.engines.views import CameraArrays

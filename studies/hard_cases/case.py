@@ -18,12 +18,12 @@ CPU, TORCH = "cpu", "torch float32"
 
 @dataclass(frozen=True, eq=False)
 class BackendResult:
-    """Result of one backend for a case.
+    """Result of one backend for one case.
 
     Attributes:
         values: output arrays, keyed by name.
         gradients: gradient arrays, keyed by name.
-        guards: how often each guard acted.
+        guards: number of times each guard was triggered, keyed by name.
     """
 
     values: Values
@@ -51,12 +51,12 @@ class HardCase:
 
     Attributes:
         name: case name.
-        what: what makes it hard, what its size means, and what must hold besides the shared checks.
-        source: its origin: the literature, users' reports (repository#thread), or the equations.
-        sizes: sizes at which it is run.
-        make: creates the problem at a given size.
-        holds: returns violations of the requirements specific to this case.
-        slow: whether to skip it when only fast cases are run.
+        what: description of the difficulty, the meaning of the size, and requirements besides the shared checks.
+        source: origin of the case: the literature, users' reports (repository#thread), or the equations.
+        sizes: sizes at which the case is run.
+        make: function that creates the problem at a given size.
+        holds: function that returns violations of the requirements specific to this case.
+        slow: whether the case is skipped when only fast cases are run.
     """
 
     name: str
@@ -96,7 +96,7 @@ def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> flo
 def unexpected_counts(
     outcome: BackendResult, expected: Mapping[str, int] | None, silent: Sequence[str] = ()
 ) -> list[str]:
-    """Returns a line if the CPU guards acted differently than expected; None accepts any counts."""
+    """Returns a line if the CPU guard counts are not as expected; None accepts any counts."""
     if expected is None:
         return []
     counts = {name: count for name, count in outcome.guards.items() if count and name not in silent}

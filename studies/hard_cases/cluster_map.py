@@ -16,7 +16,7 @@ COUNT, COARSE, FINE = 120, 3, 12
 
 
 def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: float = 0.05) -> Deforming:
-    """Creates a cloud of 1 m in nested clusters of similar size, with every parameter slightly off the identity."""
+    """Creates a cloud of 1 m in nested clusters of similar size, with every parameter near the identity."""
     rng = np.random.default_rng(count)
     means = rng.uniform(-0.5, 0.5, (count, 3))
     fine = np.arange(count) * sizes[-1] // count if sizes else np.zeros(count)
@@ -34,7 +34,7 @@ def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: 
 
 
 def first_cluster(column: slice | int, to: Any, **changes: Any) -> Deforming:
-    """Creates an ordinary case with one parameter of the first cluster of the finest layer replaced."""
+    """Creates an ordinary case in which one parameter of the finest layer's first cluster is replaced."""
     made = ordinary()
     made.clusters[-1][0, column] = to
     return replace(made, **changes)
@@ -203,7 +203,7 @@ def _not_finite(value: float, what: str = "means", count: int = 3) -> Deforming:
 
 
 def _apart(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that rows held back get no gradient of their own."""
+    """Checks that rows that are held back have no gradient with respect to their own parameters."""
     own = outcomes[CPU].gradients["own"][problem.bad]
     return [] if np.all(own == 0) else ["cpu: a row that is held back has a nonzero gradient"]
 

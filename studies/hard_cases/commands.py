@@ -82,7 +82,7 @@ def _frame_studies(
 
     Args:
         captures: folders of captures for the frame cases; synthetic footage if empty.
-        store: results folder. The soak test continues in it; everything else starts from scratch.
+        store: results folder. A soak test is resumed from it; everything else starts from scratch.
         cases: substrings of the names of the cases to run; all if empty.
         service: whether to run the frame cases through a service.
         soak: number of frames of the soak test, or None.

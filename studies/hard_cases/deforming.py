@@ -43,14 +43,15 @@ class Deforming:
         labels: [M] ascending cluster labels per layer, coarse to fine and nested.
         clusters: [K, 10] cluster parameters per layer.
         deltas: [M, 9] parameters of each Gaussian.
-        bad: [M] rows that are not finite. They stay unchanged, and the others behave as if these were absent.
+        bad: [M] mask of rows with non-finite values. They stay unchanged, and the other rows behave as if they were
+            absent.
         guards: expected counts of the guards; None accepts any counts.
         value: tolerance of the means in metres; 100 times this value is the relative tolerance of the factors.
             No check if None.
         turn: tolerance of the rotations in radians. No check if None.
         gradient: relative tolerance of the gradients. No check if None.
         bound: largest allowed gradient.
-        kind: which cluster map is used.
+        kind: cluster map to use.
     """
 
     means: Array

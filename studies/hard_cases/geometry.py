@@ -1,4 +1,4 @@
-"""Hard cases of Gaussians: unusual positions, sizes and opacities, and values that are not finite."""
+"""Hard cases of Gaussians: unusual positions, sizes and opacities, and non-finite values."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ TOGETHER = 100
 
 
 def _culling_is_exact(problem: Rendering) -> list[str]:
-    """Checks that the bits equal those of tile lists that contain every Gaussian in every block."""
+    """Checks for bit-identical results if tile lists contain every Gaussian in every block."""
     changed = 0
     for first in range(0, len(problem.means), TOGETHER):
         rows = slice(first, first + TOGETHER)
@@ -205,7 +205,7 @@ def _equal_depths(count: int) -> Rendering:
 
 
 def _by_row(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that ties follow the row order: swapping tied rows changes the image, and repetition does not."""
+    """Checks that row order breaks ties: swapping tied rows changes the image, and rendering it again does not."""
     again = problem.run(CPU)
     assert again is not None
     same = np.array_equal(again.values["features"], outcomes[CPU].values["features"])
@@ -257,7 +257,7 @@ def _few(count: int) -> Rendering:
 
 
 def _steep(weight: float) -> Rendering:
-    """Uses pixel weights that are so large that gradients overflow in float32, and only there."""
+    """Uses pixel weights so large that gradients overflow in float32 and only in float32."""
     return replace(
         ordinary(), weight=weight, bound=1e38, value=2e-4, gradient=None, guards=None, why="beyond the range of float32"
     )

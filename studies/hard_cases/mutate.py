@@ -177,7 +177,7 @@ def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[st
 
     Args:
         store: results folder; results for the same sources are reused.
-        echo: prints the progress.
+        echo: callback that prints progress messages.
 
     Raises:
         MutationError: a case fails on the unchanged copy, or a mutation cannot be made.

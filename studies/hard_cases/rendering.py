@@ -26,7 +26,7 @@ KINK_SHARE = 0.005
 class Rendering:
     """Gaussians in front of a camera.
 
-    The loss is a sum of the picture's features and its alpha, each pixel with a random weight.
+    The loss is a sum of the image's features and alpha, with a random weight for each pixel.
 
     Attributes:
         means: [N, 3] float32 means.
@@ -34,14 +34,14 @@ class Rendering:
         opacities: [N] float32 opacities.
         features: [N, 4] float32 features.
         camera: camera in internal world coordinates.
-        bad: [N] rows that must be left out: they get no gradient, and the others behave as if these were absent.
+        bad: [N] rows that must be excluded: they receive no gradient, and the other rows behave as if they were absent.
         guards: expected counts of the CPU guards; None accepts any counts.
         value: tolerance of a pixel against float64, relative to the range of the features. No check if None.
         gradient: tolerance of each gradient against float64, relative to its norm. No check if None.
         bound: largest allowed gradient, for weights of 1.
         weight: standard deviation of the pixel weights.
         limits: rasterizer limits.
-        why: reason if agreement is not checked.
+        why: reason for not checking agreement, if it is not checked.
     """
 
     means: Array

@@ -31,7 +31,7 @@ BEGIN, END = "<!-- scripts/bench stability: begin -->", "<!-- scripts/bench stab
 
 @dataclass
 class CaseResult:
-    """Result of a case at one size: tested backends, guards triggered on the CPU, and violated checks."""
+    """Result of one case at one size: tested backends, guards triggered on the CPU, and violated checks."""
 
     case: str
     size: str
@@ -100,7 +100,7 @@ def in_words(guards: dict[str, int]) -> str:
 
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
-    """Returns a table with one row per section: number of cases, without and with sizes, and the failing ones."""
+    """Returns a table with one row per section: number of cases, number including sizes, and failing cases."""
     text = ["| section | cases | counting sizes | failures |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
         names = {case.name for case in cases}

@@ -27,8 +27,8 @@ class HardScene:
     Attributes:
         rig: rig that takes the images, in the world in which the ball has a radius of 0.25 m.
         user: conversion between that world and the user's coordinates.
-        metres_per_unit: the value that the user specifies.
-        least: PSNR in dB that the last update must reach on its own views, about that of the same scene in metres.
+        metres_per_unit: value of this setting as specified by the user.
+        least: minimum PSNR in dB of the last update on its own views, close to the PSNR of the same scene in metres.
     """
 
     rig: Rig

@@ -33,14 +33,14 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class HardStep:
-    """A function of arrays, on the CPU and, if available, in float64.
+    """A function of arrays, computed on the CPU and, if available, in float64.
 
     Attributes:
         compute: functions that compute the result, keyed by backend.
         agreement: tolerance of each array against float64, relative to its norm. No check if None.
         bound: largest allowed gradient.
         guards: expected counts of the guards; None accepts any counts.
-        more: returns violations of further requirements.
+        more: function that returns violations of further requirements.
     """
 
     compute: Mapping[str, Callable[[], BackendResult]]
@@ -188,7 +188,7 @@ def _activation(
 
 
 def _opposite(scale: float) -> HardStep:
-    """Compares q and −q of any length, which must give the same Gaussian and opposite gradients."""
+    """Compares quaternions q and −q of any length, which must give the same Gaussian and opposite gradients."""
     rng = np.random.default_rng(13)
     table = rng.normal(size=(64, activation.COLUMNS)).astype(np.float32)
     table[:, 3:7] *= np.float32(scale)

@@ -28,7 +28,7 @@ Fault = Callable[[Picture, Any], Picture]
 
 
 def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
-    """Returns the fault cases, all for the same camera of a footage."""
+    """Returns the fault cases, all for the same camera."""
     name = two_cameras(footage)[0]
 
     def case(title: str, what: str, sizes: tuple[Any, ...], fault: Fault) -> FrameCase:
@@ -96,13 +96,13 @@ def scaled(picture: Picture, factor: Any) -> Picture:
 
 
 def noisy(picture: Picture, levels: float) -> Picture:
-    """Adds noise with a standard deviation in levels of 255, different for each image."""
+    """Adds noise with a standard deviation given in 8-bit levels, different for each image."""
     rng = np.random.default_rng(int(picture.sum()))
     return (picture + rng.normal(0, levels, picture.shape)).round().clip(0, 255).astype(np.uint8)
 
 
 def dirty(picture: Picture, white: float) -> Picture:
-    """Simulates dirt on the lens over the middle ninth, which is blurred and brightened by scattered light."""
+    """Simulates dirt on the lens: the middle ninth of the image is blurred and brightened by scattered light."""
     height, width = picture.shape[:2]
     middle = slice(height // 3, 2 * height // 3), slice(width // 3, 2 * width // 3)
     smeared = gaussian_filter(picture[middle].astype(np.float32), (SMEARED * width, SMEARED * width, 0))

@@ -33,7 +33,7 @@ def shares(reports: Sequence[FrameReport]) -> Share:
 
 
 def cost(footage: AnyFootage, updates: int = 8) -> Share:
-    """Returns the cost over a number of updates of a footage, excluding the first one, which is a cold start."""
+    """Returns the cost over a number of updates of some footage, excluding the first one, which is a cold start."""
     with TemporaryDirectory() as folder:
         scene = footage.start(Path(folder) / "states")
         reports = [scene.step(footage.frame(index)) for index in range(1, updates + 2)]

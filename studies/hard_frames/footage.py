@@ -116,7 +116,7 @@ class CapturedFootage:
     Args:
         capture: the capture.
         settings: reconstruction settings.
-        study: folder of a study that stores frame 0, such as that of ``scripts/bench quality``.
+        study: study folder in which frame 0 is stored, such as the one of ``scripts/bench quality``.
     """
 
     constants = ()

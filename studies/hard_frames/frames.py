@@ -49,7 +49,7 @@ class Sent:
 
     Attributes:
         frame: the frame; its index and time are set when it is sent.
-        like: frame of the footage that it should resemble, which is looked up in the undisturbed run.
+        like: index of the footage frame that the result should resemble, which is looked up in the undisturbed run.
         truth: images of the held-out cameras at that moment.
         good: whether the frame is undisturbed.
     """
@@ -67,7 +67,7 @@ class FrameStep:
     Attributes:
         sent: the frame that was sent.
         report: the frame's report.
-        kept: whether the state has the same bits as before the frame.
+        kept: whether the state is bit-identical to the state before the frame.
         sound: whether the state is finite and its rotations have unit norm.
         psnr: PSNR of the held-out cameras in dB.
         usual: the same PSNR in the undisturbed run.
@@ -92,12 +92,13 @@ class FrameCase:
     Attributes:
         name: case name.
         what: meaning of the size, and other details of the case.
-        source: its origin in the literature or in users' reports.
-        sizes: sizes at which it is run.
-        make: creates the frames to send, for a start frame and a size; None if the footage cannot show the case.
-        holds: returns violations by the faulty frames, besides those of the shared checks.
-        alarms: whether the faulty frames of a size must raise an alarm. Frames that resemble a resting or a faster
-            scene cannot raise one.
+        source: origin of the case in the literature or in users' reports.
+        sizes: sizes at which the case is run.
+        make: function that creates the frames to send, given a start frame and a size; returns None if the footage
+            cannot show the case.
+        holds: function that returns the checks violated by the faulty frames, besides the shared checks.
+        alarms: function that returns whether the faulty frames of a given size must raise an alarm. Frames that
+            resemble a resting or a faster scene cannot raise one.
     """
 
     name: str
@@ -277,7 +278,7 @@ def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def capped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Blanks a number of cameras for two frames."""
+    """Blanks the images of a number of cameras for two frames."""
     names = capped_names(footage, size)
     return replaced(
         footage, at, 2,
@@ -302,7 +303,7 @@ def stuck(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def still_noisy(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the previous frame twice, with noise whose standard deviation is given in levels of 255."""
+    """Repeats the previous frame twice, with noise whose standard deviation is given in 8-bit levels."""
     rng = np.random.default_rng(0)
 
     def change(name: str, picture: Picture) -> Picture:
@@ -353,7 +354,7 @@ def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
 
 
 def two_cameras(footage: Footage) -> tuple[str, str]:
-    """Returns a camera, and one that sees the object from a different direction."""
+    """Returns the names of two cameras that see the object from different directions."""
     names = sorted(footage.frame(0).images)
     return names[1], names[len(names) // 2 + 1]
 

@@ -1,6 +1,6 @@
 """``scripts/bench timing``: cameras that are not synchronized, and how well their time offsets are estimated.
 
-A capture is played back and forth, as a stream of every second, third or fourth of its frames. Two cameras get images
+A capture is played back and forth, as a stream of every second, third or fourth frame. Two cameras get images
 from the frames in between, one later and one earlier than the others, so their offsets are exact. The stream moves at
 least twice as fast as the capture. The synthetic footage can be rendered at any moment and for any duration.
 """
@@ -83,7 +83,7 @@ def run(
         masks: whether the masks are used.
         changes: changes to the settings.
         again: whether to repeat finished runs.
-        report: prints the progress.
+        report: callback that prints progress messages.
     """
     settings, rows = settings_of("scas4d", None, 0, changes), []
     for folder in captures:
@@ -121,8 +121,8 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
     Args:
         capture: the capture.
         index: frame index in the stream.
-        step: frames of the capture per frame of the stream.
-        shifts: delay of each camera against the others, in frames of the capture, keyed by camera name.
+        step: number of capture frames per stream frame.
+        shifts: delay of each camera relative to the others, in capture frames, keyed by camera name.
     """
     frame = capture.frame(ping_pong(abs(step * index), capture.frame_count))
     images, masks = dict(frame.images), dict(frame.masks)
@@ -136,7 +136,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
 
 @contextmanager
 def clocked() -> Iterator[list[float]]:
-    """Records the seconds that the timing checks of each frame take, within the context."""
+    """Records how many seconds each frame's timing checks take within the context."""
     spent, looked = list[float](), timing.record_timing
 
     def record_timing(*given: Any) -> Any:

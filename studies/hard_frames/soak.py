@@ -73,7 +73,7 @@ class Row:
         frame: frame index.
         seconds: mean seconds per update since the previous row.
         psnr: PSNR of the training views of the update, in dB.
-        still: whether static Gaussians have the same bits as in frame 0, except for their colours.
+        still: whether static Gaussians are bit-identical to those in frame 0, except for their colours.
         finite: whether all values are finite.
         resting: RMS distance of the resting ball from the truth, in metres.
         moving: RMS distance of the moving ball from the truth, in metres.
@@ -106,7 +106,7 @@ def true_state(state: Gaussians, index: int) -> Gaussians:
 
 
 class Soak:
-    """A run in a folder; creating it again for the same folder continues the run."""
+    """A soak test run stored in a folder; creating it again for the same folder resumes the run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

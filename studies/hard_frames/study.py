@@ -32,8 +32,8 @@ class FrameCaseResult:
 
     Attributes:
         case: the case.
-        size: its size.
-        said: statements of the reports about the faulty frames.
+        size: size at which the case was run.
+        said: summaries of the reports on the faulty frames.
         against: PSNR of each frame minus that of the undisturbed run, in dB; the good frames come last.
         violations: violated checks.
     """
@@ -51,10 +51,10 @@ def cases_of(footage: AnyFootage) -> tuple[FrameCase, ...]:
 
 
 class FrameStudy:
-    """Runs cases on a footage.
+    """Runs cases on footage.
 
     Args:
-        footage: the footage.
+        footage: footage on which the cases are run.
         folder: folder for committed states; its contents are deleted.
     """
 
@@ -107,7 +107,7 @@ class FrameStudy:
         return steps
 
     def _branch(self, name: str) -> Reconstruction:
-        """Returns a copy of the scene as it was before the case; it continues with the same bits."""
+        """Returns a copy of the scene as it was before the case; it continues bit-identically."""
         folder = self.folder / name
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(self.folder / "before", folder)

@@ -86,7 +86,7 @@ def measure(architectures: Sequence[int], ptxas: Path | None) -> list[KernelUse]
 
 
 def find_ptxas() -> Path | None:
-    """Returns ptxas if it is on the path."""
+    """Returns the path of ptxas, or None if it was not found."""
     found = shutil.which("ptxas")
     return None if found is None else Path(found)
 

@@ -58,10 +58,10 @@ def study(
         store: study folder.
         frames: number of frames, at least 3. The first update compiles or loads kernels and is not counted.
         repeats: repetitions of the rasterizer and the micro-kernel.
-        report: prints the progress.
+        report: callback that prints progress messages.
 
     Raises:
-        ValueError: fewer than 3 frames.
+        ValueError: fewer than 3 frames were requested.
         BrokenProcessPool: the process of the run ended early.
     """
     if frames < 3:
@@ -108,7 +108,7 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
         gaussians: Gaussians to render.
         cameras: cameras in internal world coordinates.
         repeats: number of measurements.
-        limits: rasterizer limits in the scene.
+        limits: rasterizer limits of the scene.
     """
     rasterizer = CpuRasterizer(limits)
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
@@ -180,7 +180,7 @@ def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
 
 
 def update_figures(updates: Sequence[Row]) -> Row:
-    """Returns the seconds of the updates and of their rasterizer passes, and their ratio, without the first update.
+    """Returns the seconds of the updates and of their rasterizer passes, and their ratio, excluding the first update.
 
     Args:
         updates: updates in order, each with the ``seconds`` of the whole step and of its ``stages``.
@@ -205,7 +205,7 @@ def spread(values: Any) -> dict[str, float]:
 
 
 def table(row: Row) -> str:
-    """Formats the figures as one Markdown table."""
+    """Formats the measurements as one Markdown table."""
     targets = {target.metric: target for target in TARGETS if target.run == KERNELS}
 
     def line(what: str, of: dict[str, float], unit: str, metric: str | None = None, digits: int = 2) -> str:

@@ -1,7 +1,7 @@
 """Time of an update against the share of moving pixels, on synthetic footage.
 
 Cameras in a row see a textured wall. A square in its middle slides; its size depends on the share. All variants have
-the same Gaussians, cameras and settings, and are updated in alternation.
+the same Gaussians, cameras and settings, and are updated alternately.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class MovingTime:
     """Measurements of one variant.
 
     Attributes:
-        share: requested share of the pixels that show something moving.
+        share: requested share of pixels that show moving content.
         moving: number of moving Gaussians.
         seconds: median seconds per update.
         psnr: PSNR of the last update, averaged over the cameras, in dB.
@@ -38,7 +38,7 @@ class MovingTime:
 
 
 def measure(shares: Sequence[float], frames: int, settings: Settings | None = None) -> list[MovingTime]:
-    """Updates all variants in alternation, frame by frame.
+    """Updates all variants alternately, frame by frame.
 
     Args:
         shares: shares of moving pixels, from 0 to 1.

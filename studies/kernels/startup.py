@@ -1,7 +1,7 @@
 """Startup of a service, from an empty kernel cache to the first committed update.
 
 A service starts without compiled kernels. As soon as it is ready, the study sends it the first two frames of a capture,
-as a rig would. Two checkouts are measured in alternation, because the speed of a shared machine drifts.
+as a rig would. Two checkouts are measured alternately, because the speed of a shared machine drifts.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Start:
         ready: seconds from the start of the process until the service was ready.
         first: seconds from the start of the process until frame 0 was committed.
         update: seconds from the start of the process until the first update was committed.
-        processor: CPU seconds of all its processes.
+        processor: CPU time of all processes of the service, in seconds.
     """
 
     checkout: Path
@@ -56,7 +56,7 @@ class Start:
 
 
 def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> list[Start]:
-    """Starts a service of each checkout several times, in alternation.
+    """Starts a service from each checkout several times, alternating between checkouts.
 
     Raises:
         RuntimeError: a service or one of its processes did not end, or no update was committed.
@@ -70,7 +70,7 @@ def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> l
 
 
 def start(capture: Path, checkout: Path) -> Start:
-    """Starts a service of a checkout with an empty cache, and sends it two frames.
+    """Starts a service from a checkout with an empty cache, and sends it two frames.
 
     It runs in a separate process, which waits for all its children and counts only their time.
     """

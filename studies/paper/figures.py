@@ -1,7 +1,7 @@
 """Figures of the paper (SCas4D, TMLR 06/2025) per scene, as printed in its tables.
 
 Only scenes with a counterpart among the captures are included: five of FastParticle, and Basketball of Panoptic. The
-captures have the same names, but show other images of other motions.
+captures have the same names, but contain different images and motions.
 """
 
 from __future__ import annotations

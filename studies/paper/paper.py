@@ -1,8 +1,8 @@
 """``scripts/bench paper``: each experiment of the paper on the available captures, next to the paper's figures.
 
 Every experiment compares one setting with another, by one score. The outcome agrees in sign if the difference of the
-means has the sign of the paper's, and in size if both are also within a factor of two. Differences that are small on
-both sides agree as well. If the paper shows only a picture, its claim is the sign.
+means has the same sign as in the paper. It agrees in size if the two differences are also within a factor of two.
+Differences that are small on both sides agree as well. If the paper shows only an image, only the sign is compared.
 """
 
 from __future__ import annotations
@@ -199,11 +199,11 @@ AgreementWord = Literal["sign and size", "sign", "no", "not measured"]
 
 @dataclass(frozen=True)
 class ClaimResult:
-    """A claim of the paper next to our figures.
+    """Comparison of a claim in the paper with our figures.
 
     Attributes:
         claim: the claim.
-        paper: the paper's mean gain over the captures that both have; None if the paper prints no figures.
+        paper: the paper's mean gain over the captures used by both; None if the paper prints no figures.
         own: our mean gain over the same captures; None if not measured.
         captures: captures over which the gains are averaged.
         same_sign: number of these captures whose own gain agrees with the paper.
@@ -219,7 +219,7 @@ class ClaimResult:
 
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
-    """Returns our figures from the frontier study, or from the quality study over the updates that both have."""
+    """Returns our figures from the frontier study, or from the quality study over updates shared by both methods."""
     by_variant: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:

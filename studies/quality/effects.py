@@ -1,6 +1,6 @@
-"""``scripts/bench effects``: benefit and cost of each effect compared with `auto`, measured in alternation.
+"""``scripts/bench effects``: benefit and cost of each effect compared with `auto`, measured alternately.
 
-Two reconstructions start from the same frame 0 and are updated in alternation, frame by frame, in one process. One
+Two reconstructions start from the same frame 0 and are updated alternately, frame by frame, in one process. One
 follows `auto`; in the other, effects are pinned. An effect that waits for evidence is tested "on", "off" and "removed",
 that is, without its line in the registry, which shows what it costs while it is off.
 """
@@ -76,8 +76,8 @@ def run(
         frames: number of frames; all if None.
         changes: changes to the settings that both reconstructions share.
         again: whether to repeat the runs that ``out`` already contains.
-        options: how the captures are read.
-        report: prints the progress.
+        options: options for reading the captures.
+        report: callback that prints progress messages.
 
     Raises:
         ValueError: an effect or setting is unknown, the settings contradict a pin, or there are fewer than two frames.
@@ -177,7 +177,7 @@ def _row(
 
 
 def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
-    """Returns the figures of a variant relative to auto."""
+    """Returns the measurements of a variant relative to auto."""
     given = (settings, pinned(settings, pins))
     scenes, psnr = [], np.zeros((2, count - 1))
     wall, cpu = np.zeros((2, count - 1)), np.zeros((2, count - 1))
@@ -219,7 +219,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
 
 
 def _words(scene: Reconstruction, pins: Pins) -> str:
-    """Returns the final switches of these effects in auto, and since when they have been on."""
+    """Describes whether each of these effects is on in auto at the end and, if so, since which frame."""
     record: Any = scene.history.report(scene.history.indices[-1]).get("effects", {})
     switches = {name: record[name] for name in pins if name in record}
     return ", ".join(f"on since {one['since']}" if one["on"] else "off" for one in switches.values())

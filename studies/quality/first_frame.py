@@ -36,8 +36,8 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
     """Returns a name for a capture's frame 0, which depends on cameras, images, masks, points and settings.
 
     Args:
-        capture: capture as the method gets it, without withheld inputs.
-        settings: settings; only those of the scene and of frame 0 matter.
+        capture: capture as passed to the method, without withheld inputs.
+        settings: complete settings, of which only those of the scene and of frame 0 matter.
     """
     hasher = hashlib.sha256()
     described = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
@@ -58,7 +58,7 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
 
 
 def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
-    """Returns a stored frame 0 and the seconds that it took, or None if it is not stored."""
+    """Returns a stored frame 0 and its fitting time in seconds, or None if it is not stored."""
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as file:
@@ -92,7 +92,7 @@ def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
 
 
 def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
-    """Returns frame 0 from the folder of a study, fitting it on first use; each pin of gloss has its own."""
+    """Returns frame 0 from a study folder, fitting it on first use; each pin of gloss has its own frame 0."""
     key = first_frame_key(capture, settings)
     gloss = settings.effects.get("direction", "auto")
     path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"

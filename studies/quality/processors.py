@@ -1,9 +1,9 @@
 """``scripts/bench processors``: variation of a capture's result between processors and seeds.
 
-The first frames of a capture run on this processor, as on one with only AVX2, and as on one of 2008. This applies to
-kernels (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``). For comparison,
-other seeds of the updates run as well. Each row runs in a separate process, including frame 0; rows on disk are not
-run again.
+The first frames of a capture are processed on this processor, as on one with only AVX2, and as on one from 2008. This
+applies to kernels (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``). For
+comparison, the updates are also run with other seeds. Each row runs in a separate process, including frame 0; rows
+already on disk are not run again.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ def run(
         frames: updates per run.
         seeds: number of seeds of the updates, starting at 0.
         changes: changes to the settings, such as ``update.iterations=20``.
-        report: prints the progress.
+        report: callback that prints progress messages.
 
     Returns:
-        Whether every capture has the same bits on all targets.
+        Whether the states of every capture are bit-identical on all targets.
 
     Raises:
         RuntimeError: a run failed; the message contains its last line of output.
@@ -89,7 +89,7 @@ def same_bits(rows: Sequence[Row], capture: str) -> bool:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Returns a table with a row per capture: PSNR in dB by target, whether bits agree, and the spread over seeds."""
+    """Returns a table with a row per capture: PSNR in dB per target, bit identity, and the spread over seeds."""
     lines = [
         f"| capture | {' | '.join(PROCESSORS)} | states | seeds: spread (standard deviation) |",
         "|---" * (len(PROCESSORS) + 3) + "|",

@@ -1,9 +1,9 @@
 """``scripts/bench quality``: scores of images, tracks and parts of captures, and seconds per update.
 
 There is one row for every capture, preset, number of iterations and seed. Each row runs in a separate process, so that
-it has its own peak memory; rows on disk are not run again. Rows of a capture with the same settings of scene and frame
-0 share one frame 0 (``first/`` in the folder of the study), which only the first of them fits. An interrupted row
-starts again at frame 0.
+it has its own peak memory; rows already on disk are not run again. Rows of a capture with the same scene and frame 0
+settings share one frame 0 (``first/`` in the study folder), which is fitted only for the first of them. An interrupted
+row is restarted from frame 0.
 """
 
 from __future__ import annotations
@@ -49,20 +49,21 @@ def run(
     """Measures every capture with every preset; prints the table and writes it to ``out/table.md``.
 
     Args:
-        captures: folders. Captures without test cameras are measured on their training cameras, and their rows say so.
+        captures: capture folders. Captures without test cameras are measured on their training cameras, and their rows
+            are marked.
         out: folder for rows, per-frame lines and images; a second call with the same folder continues.
         presets: preset names.
         iterations: numbers of iterations per update, each of which is measured; the preset's own if empty.
         seeds: seeds of frame 0 and of the updates, each of which is measured.
-        changes: further settings, such as ``"update.clusters=[64]"``, with JSON after the sign.
+        changes: further settings, such as ``"update.clusters=[64]"``, with a JSON value after the equals sign.
         frames: number of frames per capture; all if None.
-        masks: False withholds the masks from the method.
-        points: False withholds the initial point cloud.
+        masks: whether the method is given the masks.
+        points: whether the method is given the initial point cloud.
         pictures: frames to save as truth | render | difference; negative numbers count from the end.
         lpips: whether to measure LPIPS, if its weights are installed.
         again: whether to measure rows again that are already on disk.
-        options: how the captures are read.
-        report: prints the progress.
+        options: options for reading the captures.
+        report: callback that prints progress messages.
 
     Returns:
         The requested rows, in order; a failed row has an ``error`` and is retried next time.

@@ -1,8 +1,8 @@
 """``scripts/bench refit``: upper bound for the updates, from fitting a later frame alone with the method of frame 0.
 
 A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. The
-gap to the updates at that frame shows what they still miss: what no effect explains, and what was lost on the way. The
-figures of the updates are read from the rows of ``scripts/bench quality`` in the same folder.
+gap to the updates at that frame shows what they still miss: changes that no effect explains, and quality lost over the
+frames. The figures of the updates are read from the rows of ``scripts/bench quality`` in the same folder.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def run(
         points: whether to start from the point cloud of the capture's first frame, instead of the images alone.
         changes: changes to the settings, such as ``"effects.direction=off"``.
         again: whether to repeat fits that ``out`` already contains.
-        options: how the captures are read.
-        report: prints the progress.
+        options: options for reading the captures.
+        report: callback that prints progress messages.
 
     Raises:
         ValueError: a capture does not have the frame, or a setting is unknown.
@@ -121,7 +121,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
 
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
-    """Returns the PSNR of the updates at the same frame and its deficit, or nothing if it was not measured."""
+    """Returns the PSNR of the updates at the same frame and its deficit, or an empty row if not measured."""
     wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])

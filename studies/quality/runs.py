@@ -1,4 +1,4 @@
-"""Runs that the targets need, with the captures, preset and changes of each; see ``scripts/bench targets``."""
+"""Runs required by the targets, with the captures, preset and changes of each; see ``scripts/bench targets``."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else
 
 @dataclass(frozen=True)
 class Run:
-    """One way to reconstruct some captures.
+    """Configuration for reconstructing some captures.
 
     Attributes:
-        captures: names of the folders.
+        captures: names of the capture folders.
         preset: preset name.
         iterations: iterations per update.
         changes: further settings, such as ``"update.clusters=[64]"``.
-        masks: whether the method gets the masks.
-        points: whether the method gets the initial points.
+        masks: whether the method is given the masks.
+        points: whether the method is given the initial points.
         frames: number of frames; all if None.
     """
 
@@ -50,7 +50,7 @@ class Run:
         return settings_of(self.preset, self.iterations, changes=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
 
     def job(self, folder: Path, frames: int | None = None) -> Job:
-        """Returns the job that measures one capture, with at most a number of frames."""
+        """Returns the job that measures one capture, optionally limited to ``frames`` frames."""
         limits = [limit for limit in (frames, self.frames) if limit is not None]
         return Job(
             capture=folder,
@@ -95,7 +95,7 @@ def measure_runs(
         only: names of captures; all captures of each run if empty.
         frames: number of frames per capture; all if None.
         again: whether to measure rows again that are already on disk.
-        report: prints the progress.
+        report: callback that prints progress messages.
 
     Raises:
         ValueError: a run or capture is unknown, or the folder contains no capture of any run.
@@ -130,8 +130,8 @@ FIRST_FRAME = "scas4d_core.first_frame."
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
     """Returns the stored row of each run and capture that has the run's settings; of several rows, the longest.
 
-    A row belongs to a run if its settings equal the run's current settings exactly. If only frame 0 is needed, the
-    settings of updates do not matter.
+    A row belongs to a run if its settings equal the run's current settings exactly. If only frame 0 is needed, update
+    settings are ignored.
     """
     rows = [row for row in store.rows() if "error" not in row]
     by_run: dict[tuple[str, str], Row] = {}

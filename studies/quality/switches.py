@@ -1,6 +1,6 @@
-"""``scripts/bench switches``: the effects that a stream activates, and how often each is switched.
+"""``scripts/bench switches``: the effects that a stream activates, and how often each is switched on or off.
 
-A capture is played back and forth, so that a stream may be longer than the capture.
+A capture is played back and forth, so that a stream can be longer than the capture.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def run(
         seeds: seeds of frame 0 and the updates, each of which is measured.
         changes: changes to the settings.
         again: whether to repeat finished runs.
-        report: prints the progress.
+        report: callback that prints progress messages.
     """
     rows = []
     for folder in captures:

@@ -27,7 +27,7 @@ Rows = Mapping[tuple[str, str], Row]
 
 @dataclass(frozen=True)
 class Target:
-    """A figure to reach.
+    """A target for one figure.
 
     Attributes:
         what: description of the figure.
@@ -38,7 +38,7 @@ class Target:
         sense: how the figure must compare with the threshold.
         threshold: threshold in ``unit``; if None, the figure is only reported.
         unit: unit of the figure.
-        over: if given, the figure is the difference to the best of these runs (higher is better).
+        over: if given, the figure is the difference from the best of these runs (higher is better).
         mean: whether the mean over the captures is compared.
     """
 
@@ -123,7 +123,7 @@ class Verdict:
     """One line of the table.
 
     Attributes:
-        target: the target.
+        target: target that was evaluated.
         capture: capture name, or "mean of …".
         value: the figure; None if a part of it is not measured.
         parts: figures of the run and of the run it is compared with, if the target is a difference.
@@ -211,7 +211,7 @@ def target_table(verdicts: Sequence[Verdict]) -> str:
 
 
 def count_words(verdicts: Sequence[Verdict]) -> str:
-    """Counts the targets that are reached, missed, and not measured."""
+    """Describes how many targets are reached, missed, and not measured."""
     compared = [verdict for verdict in verdicts if verdict.target.threshold is not None]
     reached, missed = (sum(verdict.reached is answer for verdict in compared) for answer in (True, False))
     unknown = len(compared) - reached - missed
@@ -318,7 +318,7 @@ def _verdict(target: Target, capture: str, figure: Figure | None) -> Verdict:
 
 
 def _reached(target: Target, value: float) -> bool | None:
-    """Compares the figure as measured, without the rounding of the table."""
+    """Returns whether the unrounded figure reaches the target, or None if the target has no threshold."""
     if target.threshold is None:
         return None
     return {

@@ -55,7 +55,7 @@ def faulty(camera: Camera, kind: str, size: float) -> Camera:
     """Returns a camera with a fault in its calibration.
 
     Args:
-        camera: the camera.
+        camera: camera whose calibration is changed.
         kind: "across" and "down" rotate the camera by ``size`` pixels; "centre" shifts its principal point by ``size``
             pixels; "focal" increases its focal length by the fraction ``size``.
         size: size of the fault.
@@ -99,7 +99,7 @@ def run(
         fit: whether to also fit frame 0 to faulty rigs.
         changes: changes to the settings.
         again: whether to repeat finished runs.
-        report: prints the progress.
+        report: callback that prints progress messages.
     """
     measured_rows, fitted = [], []
     for folder in captures:

@@ -39,7 +39,7 @@ def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row
 
     Args:
         scene: scene with ``count`` committed frames.
-        capture: capture in the rendered resolution, whose training cameras are used.
+        capture: capture at the rendered resolution, whose training cameras are used.
         count: number of frames.
 
     Returns:
@@ -98,7 +98,7 @@ def followed(film: Grey, start: Float) -> Float:
 def _flow(
     picture: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Returns the positions [Q, 2] of points in the next image, and [Q] whether they were found."""
+    """Returns the positions [Q, 2] of points in the next image, and a mask [Q] of the points that were found."""
     where, status, _ = cv2.calcOpticalFlowPyrLK(picture, after, points, points.copy())
     return np.asarray(where, np.float32), np.asarray(status).ravel() > 0
 

@@ -1,7 +1,7 @@
 """``scripts/bench drift``: captures with two drifting cameras, with and without pose tracking.
 
-The images of a drifting camera are those that it would take if it rotated, because a rotation needs no depth. One
-camera rotates across and one down, by a number of pixels per frame, up to a maximum. Test cameras do not move.
+A drifting camera's images are resampled as if it rotated, because a rotation requires no depth. One camera rotates
+across and one down, by a number of pixels per frame, up to a maximum. Test cameras do not move.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def run(
         most: largest drift, in pixels of the capture's files.
         changes: changes to the settings.
         again: whether to repeat finished runs.
-        report: prints the progress.
+        report: callback that prints progress messages.
     """
     rows = []
     for folder in captures:
@@ -130,7 +130,7 @@ def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
 
 
 def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float64]]) -> Frame:
-    """Returns a frame with some cameras rotated by pixels across, down and around its axis (``pixel_offset``)."""
+    """Returns a frame with some cameras rotated by pixels across, down and around the axis (``pixel_offset``)."""
     frame = capture.frame(index)
     images, masks = dict(frame.images), dict(frame.masks)
     for name, offset in offsets.items():

@@ -77,11 +77,12 @@ def run(
         captures: capture folders.
         out: study folder; a second call continues.
         frames: maximum number of frames.
-        longer: largest length of the longer side of the largest image, in pixels.
+        longer: maximum length of the longer side of the largest image, in pixels.
         changes: changes to the settings, such as ``"static.seconds=60"``.
         again: whether to repeat rows that ``out`` already contains.
-        options: how the captures are read; ``options.test`` names the cameras to hold out instead of the middle one.
-        report: prints the progress.
+        options: options for reading the captures; ``options.test`` names the cameras to hold out instead of the middle
+            one.
+        report: callback that prints progress messages.
     """
     store, rows = Store(out), list[Row]()
     compile_in_processes()
@@ -101,7 +102,7 @@ def run(
 def measured(
     folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str], pictures: Path
 ) -> Row:
-    """Returns the row of one capture; arguments as in ``run``, ``pictures`` receives truth, render and difference."""
+    """Returns one capture's row; arguments as in ``run``, except ``pictures``: folder for comparison images."""
     names = options.open(folder).full_rig.names
     if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
         options = replace(options, test=(names[len(names) // 2],))

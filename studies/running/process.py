@@ -26,7 +26,7 @@ EVERY_S = 0.05
 
 
 class StudyError(RuntimeError):
-    """Raised if the service does not do what the study needs."""
+    """Raised if the service does not behave as the study requires."""
 
 
 def wait_until(done: Callable[[], bool], fault: str, seconds: float = PATIENCE_S) -> None:
@@ -139,7 +139,7 @@ class Service:
         return FrameReportModel.model_validate_json(self.http.get(f"/v1/scenes/{scene}/frames/{index}").content)
 
     def deaths(self, scene: str) -> int:
-        """Returns the number of worker deaths in the journal of a scene."""
+        """Returns the number of worker deaths recorded in a scene's journal."""
         return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"type":"worker_died"')
 
     def finish(self, scene: str, frames: int, every: float = EVERY_S) -> SceneStatus:

@@ -32,7 +32,7 @@ class Study:
 
     Attributes:
         folder: folder for data folders and logs.
-        capture: capture of the frames.
+        capture: capture that provides the frames.
         frames: encoded images and masks of each frame.
         settings: scene settings.
         environment: environment variables for the service.
@@ -174,7 +174,7 @@ def running(
 
     Args:
         study: the study.
-        name: name of the folder.
+        name: name of the service's folder.
         environment: additional environment variables of the service.
         rules: rules of the scene, as in `Study.create`.
     """
@@ -188,7 +188,7 @@ def running(
 
 
 def undisturbed(study: Study) -> tuple[dict[int, str], float]:
-    """Returns the states of an undisturbed run, and the seconds per update."""
+    """Returns the digests of the states of an undisturbed run, and the seconds per update."""
     with running(study, "undisturbed") as (service, scene, sender):
         sender.send(0)
         service.finish(scene, 1)

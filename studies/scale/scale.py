@@ -55,7 +55,7 @@ class Cost:
     Attributes:
         update: median seconds per update.
         view: median seconds per view.
-        frame_0: seconds of frame 0, from its images and one point per Gaussian, with few iterations.
+        frame_0: seconds to fit frame 0 from its images and one point per Gaussian, with few iterations.
         memory: peak memory of the process in MB during updates and views, before frame 0 is fitted.
     """
 
@@ -113,7 +113,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
 
     Args:
         frames: numbers of frames after which the memory is measured.
-        folder: whether states are kept in a folder, as in the service, or only in the process.
+        folder: whether states are stored in a folder, as in the service, or only in memory.
     """
     from tempfile import TemporaryDirectory
 
@@ -191,7 +191,7 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
 
 
 def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
-    """Returns the figures of a size or frame count from the folder, or measures them in a new process."""
+    """Returns the stored figures of a size or frame count, or measures them in a new process."""
     name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
     ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # distinguishes other settings
     file = work / f"{name}-{ways:08x}.json"

@@ -1,7 +1,7 @@
-"""Connections of a stranger without a token, held open by one lightweight process: `python -m studies.service.attack`.
+"""Connections of a client without a token, held open by one lightweight process: `python -m studies.service.attack`.
 
-These are one endless header, half-sent headers and stalled uploads, all at once. The process writes one line of JSON
-when the service has closed the last connection, or when its patience has run out.
+They comprise one endless header, half-sent headers and stalled uploads, all at once. The process writes one line of
+JSON when the service has closed the last connection, or when its patience has run out.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def attack(port: int, path: str, header: int, halves: int, uploads: int, patienc
         header: bytes of the endless header; 0 for none.
         halves: number of half-sent headers.
         uploads: number of stalled uploads.
-        patience: seconds to wait.
+        patience: maximum time to wait, in seconds.
 
     Returns:
         seconds: time from the first connection until the last one was closed.

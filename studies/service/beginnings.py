@@ -24,7 +24,7 @@ SPREADS_S = (0.1, 1.0)
 
 
 def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int, echo: Echo) -> ScenarioResult:
-    """Kills the whole service with `kill -9` at a random moment of each of `count` restarts.
+    """Kills the whole service with `kill -9` at a random moment during each of `count` restarts.
 
     Half of the frames arrive before the first restart, and one more with each restart.
     """

@@ -1,9 +1,9 @@
-"""Source files that a frame runs through from PUT to commit, and a render from request to response.
+"""Source files that a frame passes through from PUT to commit, and a render from request to response.
 
-Both limit how many files a reader must open to follow a frame. A file counts if one of its functions runs, in any
-process, for each of two frames or of two renders, so that unrelated work is ignored. Also ignored are `__init__` files,
-the kernels, the groups of effects (of which a scene has only a few) and `server/repair` (which checks the disk every
-few seconds in any case). The service runs as usual, with a profiler in each process.
+Their number is how many files a reader must open to follow a frame or a render. A file counts if one of its functions
+runs, in any process, for each of two frames or of two renders, so that unrelated work is ignored. Also ignored are
+`__init__` files, the kernels, the groups of effects (of which a scene has only a few) and `server/repair` (which checks
+the disk every few seconds in any case). The service runs as usual, with a profiler in each process.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ sys.setprofile(profile)
 
 
 def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
-    """Returns the sorted files that a later "frame" and a "render" run through, relative to the checkout.
+    """Returns the sorted files that a later "frame" and a "render" pass through, relative to the checkout.
 
     Args:
         folder: folder for the service's data, created if missing.

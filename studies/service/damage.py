@@ -46,7 +46,7 @@ class Flips:
     """Outcome of the bit flips.
 
     Attributes:
-        counts: number of noticed and of harmless flips, by kind of file.
+        counts: number of noticed and of harmless flips, keyed by kind of file.
         recomputed: frames whose state was recomputed.
         lost: frames whose state is lost.
         unreported: frames whose state is unchanged but whose report is lost.
@@ -106,7 +106,7 @@ def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> F
 
 
 class _Flip:
-    """One bit of one file, and what its flip must not break."""
+    """A flip of one bit in one file, and the checks that it must pass."""
 
     def __init__(
         self, study: Study, service: Service, scene: str, kind: str, frames: int, random_: random.Random
@@ -121,7 +121,7 @@ class _Flip:
         self.faults: list[str] = []
 
     def _choose(self, random_: random.Random) -> tuple[int, Path]:
-        """Returns a file of the kind, and the frame to which it belongs."""
+        """Returns a random file of the given kind, and the index of the frame to which it belongs."""
         newest, states = self.frames - 1, self.folder.states
         match self.kind:
             case "state":
@@ -182,7 +182,7 @@ class _Flip:
             return False
 
     def _look(self, index: int, found: Flips, views: Pictures) -> None:
-        """Checks that a view and a report are unchanged, marked, or refused with a reason."""
+        """Checks that a view and its report are unchanged, or that any loss or recomputation is reported."""
         until = time.monotonic() + NOTICED_S
         while (answer := _view(self.service, self.study, self.scene, index)).status_code == 503:
             self._no_path(answer)

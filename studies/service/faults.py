@@ -82,7 +82,7 @@ def kills(
 
 
 def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
-    """Kills the scene's worker as soon as it processes a frame with fewer than the maximum number of kills."""
+    """Kills the scene's worker once it processes a frame that has not reached the maximum number of kills."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         status = service.status(scene)
@@ -265,19 +265,19 @@ def run(
     parts: Sequence[str] = PARTS,
     echo: Echo = print,
 ) -> list[ScenarioResult]:
-    """Runs the scenarios of `parts`.
+    """Runs the scenarios named in `parts`.
 
     Args:
         study: study that defines the frames and the service.
-        moments: number of kills, and of beginnings.
+        moments: number of kills, and of reconstruction restarts.
         cuts: number of truncated log files.
         flips: number of log files with a flipped bit.
         bits: number of bits flipped in all files on disk.
-        seed: seed of the random moments.
-        attack: attack of the strangers; the full attack if None.
+        seed: random seed for the moments and places of the faults.
+        attack: attack by clients without a token; the full attack if None.
         turns: number of turns without and with the attack.
         parts: names of the scenarios to run.
-        echo: prints the progress.
+        echo: callback that prints progress messages.
     """
     outcomes = []
     if set(parts) & {"kills", "beginnings", "log", "disk"}:

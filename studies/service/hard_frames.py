@@ -1,4 +1,4 @@
-"""The frame cases on a running service: no status above 499, no dead worker, every failure explained and recovered.
+"""Frame cases on a running service: no HTTP status above 499, no dead worker, failures explained and recovered.
 
 All cases go into one scene, one after the other, with good frames between them. Another scene gets only the good
 frames. The committed states are read from the folders of the scenes and compared.

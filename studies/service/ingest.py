@@ -1,8 +1,8 @@
 """Ingest rate over the loopback interface, compared with plain fsynced writes of the same records.
 
-Everything is measured in one run and in alternation, because a disk's speed drifts and heavy writing slows what follows
-it. A record contains the encoded images of one frame. The scene is paused, so that only ingest is measured: receive,
-check the structure of each image, hash, write, sync, acknowledge.
+Everything is measured alternately in one run, because a disk's speed drifts and heavy writing slows later writes. A
+record contains the encoded images of one frame. The scene is paused, so that only ingest is measured: receive, check
+the structure of each image, hash, write, sync, acknowledge.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class IngestTimes:
     socket: list[float]
 
     def share(self, ingest: Sequence[float]) -> float:
-        """Returns the median ratio to plain writes over all rounds."""
+        """Returns the median over all rounds of the ratio to plain writes."""
         return statistics.median(took / plain for took, plain in zip(ingest, self.plain, strict=True))
 
 
 def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
-    """Creates a noise JPEG with the highest quality that fits into a given size."""
+    """Creates a JPEG of noise, with the highest quality that fits into a given size."""
     rng = np.random.default_rng(seed)
     picture = Image.fromarray(rng.integers(0, 256, (side, side, 3), dtype=np.uint8))
     best = b""
@@ -74,7 +74,7 @@ def noise_rig(cameras: int, side: int = 1024) -> Rig:
 
 
 def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> IngestTimes:
-    """Sends `frames` frames per round and writes the same bytes to plain files, in alternation."""
+    """Sends `frames` frames per round and alternately writes the same bytes to plain files."""
     rig = noise_rig(cameras)
     pictures = [jpeg(size_bytes, seed) for seed in range(cameras)]
     records = [{name: pictures[(k + turn) % cameras] for k, name in enumerate(rig.names)} for turn in range(2)]

@@ -1,8 +1,8 @@
 """Peak memory of a reconstruction compared with the service's estimate (server/health/estimate.py).
 
 Frame 0 and two updates of a ball in the middle of a ring of cameras are reconstructed with few iterations, on which
-memory does not depend. Another study measures a service whose scenes all sleep: its memory, and the time of
-listing and of a first view.
+memory does not depend. Another study measures a service whose scenes all sleep: its memory, and the times to list the
+scenes and to render a first view.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float
         work: data folder; its contents are deleted.
 
     Returns:
-        MB per scene; seconds from the start to the list, if the folders are new to the service and if they are not; and
-        median and longest seconds to the first view of a scene.
+        Memory per scene in MB; seconds from startup to the list of scenes, both for folders that are new to the service
+        and for known ones; and the median and longest time to the first view of a scene, in seconds.
     """
     shutil.rmtree(work, ignore_errors=True)
     empty, full = work / "empty", DataFolder(work / "full")

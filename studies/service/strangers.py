@@ -1,7 +1,7 @@
-"""Cost of clients without a token: `/health/live`, memory and updates, with and without an attack, in alternation.
+"""Cost of clients without a token: `/health/live`, memory and updates, alternately with and without an attack.
 
 The attack is `studies.service.attack`, in a separate process. One service runs with a token and one without. The scene
-is updated all the time; in turns with the attack, until its last connection is closed.
+is updated continuously. A turn with the attack lasts until its last connection is closed.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class AttackTimes:
 
 
 class Watch:
-    """Polls `/health/live` and the service's memory in a thread while the block runs."""
+    """Polls `/health/live` and the service's memory in a thread while the context is active."""
 
     def __init__(self, service: Service, side: AttackTimes) -> None:
         self._service, self._side = service, side
@@ -97,7 +97,7 @@ class Watch:
 
 
 def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, echo: Echo) -> ScenarioResult:
-    """Runs the attack on one service.
+    """Measures one service with and without the attack.
 
     Args:
         study: frames and settings of the scene.
@@ -105,7 +105,7 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
         turns: number of turns without and with the attack.
         seconds: shortest duration of a turn without the attack.
         token: whether the service has a token, which the attack does not know.
-        echo: prints the progress.
+        echo: callback that prints progress messages.
     """
     environment = {**study.environment, **({"SCAS4D_TOKEN": TOKEN} if token else {})}
     name = "strangers-token" if token else "strangers"
@@ -148,7 +148,7 @@ def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
 def compare(
     attack: Attack, without: AttackTimes, attacked: AttackTimes, closed: float, left: int, *, token: bool
 ) -> ScenarioResult:
-    """Returns the row of the table.
+    """Compares the measurements and returns the attack's row of the table.
 
     Args:
         attack: size of the attack.

@@ -1,8 +1,8 @@
 """Live views during updates: how much updates and an open-loop load of renders slow each other.
 
-A service runs in a separate process. For each rate, the study measures views while nothing is updated, updates while
-nobody views, and both together, in alternation, because a machine's speed drifts. Requests start at fixed times,
-whatever became of the earlier ones. Latency counts from the time at which a request was due, so that a service that
+A service runs in a separate process. For each rate, the study measures views while nothing is updated, updates without
+views, and both together. It alternates between them, because a machine's speed drifts. Requests start at fixed times,
+regardless of earlier requests. Latency is measured from the time at which a request was due, so that a service that
 falls behind is noticed.
 """
 
@@ -128,13 +128,13 @@ def measure(
     Args:
         capture: capture whose frames are sent.
         folder: folder for the service's data; its contents are deleted.
-        rates: views per second.
-        updates: updates per turn, without and with views.
-        turns: turns per rate.
+        rates: view rates to measure, in views per second.
+        updates: number of updates per turn, both with and without views.
+        turns: number of turns per rate.
         width: width of a view in pixels.
         settings: scene settings.
         environment: environment variables for the service.
-        echo: prints the progress.
+        echo: callback that prints progress messages.
     """
     shutil.rmtree(folder, ignore_errors=True)
     data = folder / "data"

@@ -52,7 +52,7 @@ def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[fl
 
 
 class Failures:
-    """Triggers the failures.
+    """Triggers failures at scheduled times.
 
     Args:
         cluster: the cluster.
@@ -60,7 +60,7 @@ class Failures:
         silent: shortest and longest time for which the head does not respond, in seconds.
 
     Attributes:
-        happened: number of failures that have happened, by kind.
+        happened: number of failures that have happened, keyed by kind.
     """
 
     def __init__(self, cluster: SimulatedCluster, service: SimulatedService, silent: Range) -> None:

@@ -11,7 +11,7 @@ from server.cluster.resource_needs import ResourceNeeds
 
 
 class NodeState(Enum):
-    """Actual state of a node, which Ray learns with a delay."""
+    """Actual state of a node, of which Ray learns with a delay."""
 
     RUNNING = auto()
     STOPPED = auto()
@@ -58,7 +58,7 @@ class Node:
         listed: whether Ray considers the node alive.
         failed_at: time at which it last fell silent, in seconds.
         processes: processes on the node.
-        held: calls that wait until the node can be reached again; dropped if Ray declares it lost before.
+        held: calls deferred until the node can be reached again; dropped if Ray declares the node lost before that.
     """
 
     number: int
@@ -102,7 +102,7 @@ class Capacity:
 
     Args:
         kinds: kinds of resource needs.
-        now: returns the current time.
+        now: function that returns the current time.
 
     Attributes:
         listed: number of nodes with room per kind, as known to Ray, including silent nodes that are not yet lost.

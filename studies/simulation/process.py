@@ -22,7 +22,7 @@ class SimulatedProcess:
     """A worker process that behaves like `RayProcess`: after its end was reported, nothing from it reaches the service.
 
     Attributes:
-        over: whether the service has given the process up or has ended.
+        over: whether the service has given up this process, or the service itself has ended.
         work: work of the process; None before it has a place and after it has ended.
     """
 
@@ -105,12 +105,12 @@ class SimulatedProcess:
             self.work.resume()
 
     def kill(self) -> None:
-        """Ends with its node, before Ray notices."""
+        """Ends together with its node, before Ray notices."""
         if self.work is not None:
             self.work.end()
 
     def lost(self) -> None:
-        """Handles that Ray has declared the node lost."""
+        """Handles the loss of the node, as declared by Ray."""
         assert self.node is not None
         if self.work is not None:
             self.work.drift()
@@ -138,7 +138,7 @@ class SimulatedProcess:
         self.work = Work(self._cluster, frames, scene, folder, self._number, longest, self._say, self._gone)
 
     def _gone(self) -> None:
-        """Handles that the worker has ended on its own."""
+        """Handles the end of a worker that exited on its own."""
         assert self.node is not None
         if self.over:
             self._cluster.give(self.node, self)
@@ -197,7 +197,7 @@ class SimulatedPlacement(Placement):
         cluster: the modelled cluster.
         frames: record of the frames.
         times: record of placement and recovery times.
-        needs: returns the resource needs of a scene's worker.
+        needs: function that returns the resource needs of a scene's worker.
         between_s: seconds between the frames of a scene.
     """
 

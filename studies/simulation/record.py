@@ -49,7 +49,7 @@ class FrameCounts:
         foreign: frames that were read but written by a worker that was given up.
         different: frames that were read but differ from those of an undisturbed chain.
         twice: frames that were run twice.
-        beside: processes that started while another one of their scene was running.
+        beside: processes that started while another process of the same scene was running.
         again: frames that were updated again after a commit that was not reported.
     """
 
@@ -66,8 +66,8 @@ class FrameRecord:
     """Frames of each scene.
 
     Attributes:
-        acknowledged: number of acknowledged frames on the service's disk, by scene.
-        works: work of running workers, given up or not, by scene.
+        acknowledged: number of acknowledged frames on the service's disk, keyed by scene.
+        works: work of running workers, given up or not, keyed by scene.
         workers: number of workers started, each with its own epoch.
     """
 
@@ -124,7 +124,7 @@ class FrameRecord:
 
         Args:
             scene: scene id.
-            found: the frames that were read, by index.
+            found: the frames that were read, keyed by index.
             chain: contents of the frames in an undisturbed run.
         """
         reported = self._reported.get(scene, {})
@@ -155,10 +155,10 @@ class TimeRecord:
 
     Attributes:
         capacity: measures the time with room.
-        now: returns the current time.
-        placed: seconds with room until a worker got a place, and the part of them in which the head responded, by the
-            reason for the request.
-        resumed: seconds from a failure until the scene continued, and the part of them without room, by failure.
+        now: function that returns the current time.
+        placed: seconds with room until a worker got a place, and the part of them in which the head responded, keyed by
+            the reason for the request.
+        resumed: seconds from a failure until the scene continued, and the part of them without room, keyed by failure.
         waited: seconds that processes waited for a place, if longer than `WAIT_S`.
         unexplained: number of these processes whose scene was given no reason.
     """
@@ -215,7 +215,7 @@ class TimeRecord:
         self._hit.pop(scene, None)
 
     def hit(self, scene: str, failure: str, at: float, kind: int) -> None:
-        """Records a failure of the scene at a time that may be past; an earlier unresolved failure has priority."""
+        """Records a scene's failure at a time that may be in the past; an earlier unresolved failure has priority."""
         without = self.now() - self.capacity.seconds(kind)[0]
         self._hit.setdefault(scene, (failure, at, without))
 

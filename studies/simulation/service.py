@@ -27,13 +27,13 @@ class SimulatedService:
         frames: record of the frames.
         times: record of placement and recovery times.
         takeovers: actions at the start of an epoch.
-        needs: returns the resource needs of a scene's worker.
+        needs: function that returns the resource needs of a scene's worker.
         between_s: seconds between the frames of a scene.
 
     Attributes:
         up: whether the service is running.
         plans: plans of all scenes that were requested and not ended by their users.
-        scenes: scenes of the running instance, by id.
+        scenes: scenes of the running instance, keyed by id.
     """
 
     def __init__(

@@ -101,7 +101,7 @@ class Outcome:
         waited: see `TimeRecord`.
         unexplained: see `TimeRecord`.
         unplaced: number of workers without a place at the end.
-        happened: number of failures by kind.
+        happened: number of failures, keyed by kind.
         workers: number of workers started.
         adrift: number of files written by workers that were given up.
         folders: number of folders of earlier epochs that are left in scenes that no user has ended.

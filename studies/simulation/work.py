@@ -93,7 +93,7 @@ class Work:
     """Work of a worker process.
 
     A worker that was given up but still runs is harder to deal with than a real one: without any orders, it commits all
-    acknowledged frames and rewrites its own newest frame again and again.
+    acknowledged frames and repeatedly rewrites its own newest frame.
 
     Args:
         cluster: the modelled cluster.
@@ -102,8 +102,8 @@ class Work:
         folder: folder of the worker's epoch.
         worker: worker number.
         longest: longest duration of an update, in seconds.
-        say: sends a message to the service.
-        gone: called when the worker ends on its own.
+        say: callback that sends a message to the service.
+        gone: callback for when the worker exits on its own.
     """
 
     def __init__(

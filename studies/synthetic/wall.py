@@ -66,7 +66,7 @@ def rig(size: Size) -> Rig:
 
 
 def shown(state: Gaussians, index: int, cameras: Rig) -> Frame:
-    """Returns frame ``index``, after as many slides."""
+    """Renders frame ``index``, in which the middle part has slid ``index`` times."""
     way = np.array([SLIDE_M * index, 0.5 * SLIDE_M * index, 0], np.float32)
     means = state.means + np.where(state.moving[:, None], way, np.float32(0))
     return replace(photograph(state.replace(means=means.astype(np.float32)), cameras), index=index, time=index / RATE)

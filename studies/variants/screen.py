@@ -1,4 +1,4 @@
-"""``scripts/bench variants``: contenders for the default, on variants of captures.
+"""``scripts/bench variants``: compares contenders for the default settings on variants of captures.
 
 Every row (capture, variant, contender, seed) runs in a separate process and stays on disk, like the rows of
 ``scripts/bench quality``. The contenders alternate row by row, so that they are timed within the same minutes. They
@@ -39,7 +39,7 @@ class Contender:
         name: name in tables.
         preset: preset that the settings start from.
         changes: changes such as ``"update.iterations=80"``.
-        constants: changed constants of the method, as pairs of dotted name and value.
+        constants: overridden constants of the method, as pairs of dotted name and value.
 
     >>> Contender.read("seeded: update.seed=2 scas4d_core.update.warm_start.WARM_START=0.5")
     Contender(name='seeded', preset='scas4d', changes=('update.seed=2',), constants=(('scas4d_core...', 0.5),))
@@ -74,7 +74,7 @@ class Contender:
 
 @dataclass(frozen=True)
 class VariantJob(Job):
-    """Measures one variant of a capture.
+    """Job that measures one variant of a capture.
 
     Attributes:
         of: name of the variant.
@@ -83,11 +83,11 @@ class VariantJob(Job):
     of: str = "as it is"
 
     def open_given(self) -> Capture:
-        """Returns the variant as input of the method."""
+        """Returns the variant as it is passed to the method."""
         return VARIANTS[self.of].made(super().open_given())
 
     def open_truth(self) -> Capture:
-        """Returns the variant as it is measured."""
+        """Returns the variant as it is used for evaluation."""
         return VARIANTS[self.of].made(super().open_truth())
 
     @property
@@ -118,10 +118,10 @@ def run(
         variants: names from ``VARIANTS``; if empty, all of them or those of the quick screening.
         seeds: seeds of the updates; frame 0 always uses the first one.
         frames: maximum number of frames per variant.
-        quick: whether to run only the quick screening, see ``QUICK``.
+        quick: whether to run only the quick screening; see ``QUICK``.
         again: whether to measure rows again that are already on disk.
-        options: how the captures are read.
-        report: prints the progress.
+        options: options for reading the captures.
+        report: callback that prints progress messages.
 
     Raises:
         ValueError: a preset or setting is unknown, or a value is out of range.

@@ -26,9 +26,9 @@ CANDIDATES_PER_ROW = 0.5
 
 
 def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
-    """Returns up to `count` rows of Gaussians with large motion whose trajectories are far apart.
+    """Returns the rows of up to `count` Gaussians with large motion and trajectories that are far apart.
 
-    The result is empty if nothing moves.
+    The result is empty if no Gaussian moves.
 
     Args:
         states: states of a few frames, in order; motion is measured relative to the first one. Only Gaussians that are

@@ -30,7 +30,7 @@ def make_video(
     """Renders a video and returns its path, holding two states and one image in memory at a time.
 
     Args:
-        source: source of the states, see `opened`.
+        source: source of the states; see `opened`.
         out: path that ends in `.mp4` or `.webp`; None for an MP4 next to the source, named after it.
         options: video options.
         frames: inclusive range `A:B`; None for all frames.

@@ -1,7 +1,7 @@
 """Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files. Requires OpenCV.
 
 `names` lists the cameras. Per camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in some
-versions, `H_<name>` and `W_<name>`; without them, the size is that of the images. `extri.yml` has `Rot_<name>`
+versions, `H_<name>` and `W_<name>`; if they are missing, the size is read from the images. `extri.yml` has `Rot_<name>`
 [3, 3], or only `R_<name>` [3] (Rodrigues vector), and `T_<name>` [3], world to camera. A camera without a pose is left
 out, with a remark.
 (github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)

@@ -86,7 +86,7 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
     Args:
         folder: capture folder.
         camera: camera name.
-        where: position in the calibration at which the size is missing, for messages.
+        where: position in the calibration at which the size is missing, for error messages.
 
     Raises:
         CaptureError: there is neither an image nor a video, or it cannot be read.
