@@ -39,20 +39,24 @@ def gpu_fault() -> str | None:
     """Returns the reason why device "gpu" cannot be used, or None if it can."""
     if importlib.util.find_spec("warp") is None:
         return "NVIDIA Warp is not installed (extra gpu)"
-    return None if WARP_DEVICE in os.environ else _hardware_fault()
+    return None if warp_device() == "cpu" else _hardware_fault(warp_device())
 
 
 @cache
-def _hardware_fault() -> str | None:
+def _hardware_fault(device: str) -> str | None:
     """Returns the reason why no GPU can be used, or None. NVIDIA Warp is only imported if a driver is installed."""
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return "no NVIDIA driver is installed"
-    import warp
+    try:
+        import warp
 
-    if warp.get_cuda_device_count() == 0:
-        return "no usable NVIDIA GPU was found, or the driver is too old for the CUDA version of NVIDIA Warp"
+        if warp.get_cuda_device_count() == 0:
+            return "no NVIDIA GPU can be used, or the driver is older than the CUDA version of NVIDIA Warp requires"
+        warp.get_device(device)
+    except Exception as error:  # a broken installation must not end the service
+        return f"NVIDIA Warp cannot use {device!r}: {error}"
     return None
 
 
@@ -70,7 +74,7 @@ def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
     >>> resolve_device("cpu")
     'cpu'
     """
-    if device == "cpu" or (device == "auto" and (WARP_DEVICE in os.environ or gpu_fault() is not None)):
+    if device == "cpu" or (device == "auto" and (warp_device() == "cpu" or gpu_fault() is not None)):
         return "cpu"
     if fault := gpu_fault():
         raise DeviceError(fault)

@@ -56,14 +56,14 @@ class TrainingView:
         camera: camera in kernel format.
         target: [C, H, W] float32 image, RGB in 0…1, followed by the mask if the frame has one. C is 3 or 4.
         exposure: [C, 2] gain and offset of each channel; 1 and 0 for the mask.
-        levels: [C, H, W] uint8 image in 0…255 and mask in 0…1 from which ``target`` was converted, or None.
+        source: [H, W, 3] uint8 image and [H, W] uint8 mask (or None) that ``target`` was converted from, if any.
     """
 
     name: str
     camera: CameraArrays
     target: Array
     exposure: Array
-    levels: NDArray[np.uint8] | None = None
+    source: tuple[NDArray[np.uint8], NDArray[np.uint8] | None] | None = None
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:

@@ -106,8 +106,7 @@ class FrameUpdate:
         rendered: set[int] = set()
         iteration = planned_before = 0
         while iteration < (planned := stopping.planned(iteration)):
-            if stopping.end is not None:
-                engine.wait(iteration)
+            engine.wait(iteration)
             chosen = order.take()
             step = self._step(rates, iteration, planned, planned_before or planned, len(samples))
             engine.iterate(chosen, step)  # deformation, rendering, loss, backward pass, Adam

@@ -65,15 +65,13 @@ class ViewFactory:
             camera = CameraArrays.of(self.posed[name])
             image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
             channels = 3 if mask is None else 4
-            levels = np.empty((channels, camera.height, camera.width), np.uint8)
-            levels[:3] = np.moveaxis(image, -1, 0)
-            target = np.empty(levels.shape, np.float32)
-            np.multiply(levels[:3], np.float32(1 / 255), out=target[:3])
+            target = np.empty((channels, camera.height, camera.width), np.float32)
+            np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
             if mask is not None:
-                target[3] = levels[3] = mask
+                target[3] = mask
             exposure = np.tile(np.array([1, 0], np.float32), (channels, 1))
             exposure[:3] = exposures.get(name, exposure[:3])
-            views.append(TrainingView(name, camera, target, exposure, levels))
+            views.append(TrainingView(name, camera, target, exposure, (image, mask)))
         if not views:
             raise ValueError(
                 f"frame {frame.index} has no image of any of the rig's cameras ({', '.join(self.rig.names)})"

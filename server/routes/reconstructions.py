@@ -35,7 +35,7 @@ async def put(
     asked = request or ReconstructionRequest()
     with setting_problems():
         settings = changed(scene.spec.settings, asked.settings)
-    check_settings(scene.request, settings, server, scenes.placement)
+    await check_settings(scene.request, settings, server, scenes.placement)
     begun = scene.ledger.reconstruction < n
     status = await scenes.begin_again(scene, NewReconstruction(n, asked, settings, scene.rig))
     if begun:

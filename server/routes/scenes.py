@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -70,19 +71,21 @@ def check_nodes(request: SceneCreate, placement: Placement) -> None:
         )
 
 
-def check_device(settings: Settings, placement: Placement) -> None:
+async def check_device(settings: Settings, placement: Placement) -> None:
     """Raises `Problem` if the scene requires a GPU that this machine lacks; other machines are not checked."""
     if settings.device != "gpu" or placement.has_labels:
         return
-    if fault := gpu_fault():
+    if fault := await asyncio.to_thread(gpu_fault):  # may initialize CUDA
         remedy = "use 'auto' or 'cpu', or see docs/gpu.md"
         raise Problem(422, f"no usable GPU: {fault}", field="settings.device", value="gpu", remedy=remedy)
 
 
-def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings, placement: Placement) -> None:
+async def check_settings(
+    request: SceneCreate, settings: Settings, server: ServerSettings, placement: Placement
+) -> None:
     """Raises `Problem` if the settings do not fit the rig or the machine, or the scene exceeds the memory limit."""
     check_rig(request, settings)
-    check_device(settings, placement)
+    await check_device(settings, placement)
     estimate.refuse_if_too_large(request.rig, settings, server)
 
 
@@ -101,7 +104,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 remedy="send smaller images with matching intrinsics, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
     check_nodes(request, scenes.placement)
-    check_settings(request, settings, server, scenes.placement)
+    await check_settings(request, settings, server, scenes.placement)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()

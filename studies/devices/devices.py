@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures import Capture
-from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault
+from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault, warp_device
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics.evaluation import measure_pictures, measure_tracks
 from scas4d_core.presets import preset
@@ -60,7 +60,7 @@ def use_cpu_without_gpu() -> str:
     Raises:
         SystemExit: NVIDIA Warp is not installed.
     """
-    if WARP_DEVICE not in os.environ and gpu_fault() is None:
+    if warp_device() != "cpu" and gpu_fault() is None:
         return "a GPU"
     os.environ[WARP_DEVICE] = "cpu"
     if (fault := gpu_fault()) is not None:

@@ -110,7 +110,7 @@ def step_parameters(
     row = fixed + i
     second = load(splats, 2 * row + 1)
     r0 = load(records, RECORD * row)
-    if second[2] > 0.0:
+    if second[2] > 0.0 and adam.scalars[0] > 0.0:  # 0: the image is incomplete and is rendered again
         first = load(splats, 2 * row)
         camera = cameras[view[0]]
         x = 0.5 * wp.float32(camera.width) * (first[2] * r0[1] + first[3] * r0[2])

@@ -17,6 +17,7 @@ wp.set_module_options({"enable_backward": False})
 def step_colours(
     adam: Adam,
     weight: wp.float32,
+    reported: wp.int32,
     learned: wp.array[wp.int32],
     before: wp.array2d[wp.float32],
     g_features: wp.array2d[wp.float32],
@@ -29,6 +30,7 @@ def step_colours(
 
     Args:
         weight: weight of each element's absolute change.
+        reported: 1 to add the term to the losses, which only the report needs.
         learned: [N] flags, 1 for Gaussians whose colours are learned, otherwise 0.
         before: [N, 4] features of Θ_{t−1}.
         g_features: [N, 4] gradients of the rendering losses.
@@ -44,7 +46,8 @@ def step_colours(
         g = g_features[i, k]
         if change != 0.0:
             g += weight * wp.sign(change)
-            wp.atomic_add(losses, iteration[0], weight * wp.abs(change))
+            if reported == 1:
+                wp.atomic_add(losses, iteration[0], weight * wp.abs(change))
     gradients[i, k] = g
     step_element(adam, features, i, k, g)
 
@@ -75,6 +78,7 @@ class WarpColours:
 
     def begin(self, start: AttemptStart) -> None:
         """Starts an attempt, with zero moments."""
+        self._reported = int(start.curve)
         rates = np.full(self._count, start.static_colour if self._static else 0.0, np.float32)
         rates[self._rows] = start.colour
         self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2), rates)
@@ -83,5 +87,5 @@ class WarpColours:
         self, before: wp.array, g_features: wp.array, features: wp.array, iteration: wp.array, losses: wp.array
     ) -> None:
         """Performs one optimization step; see ``step_colours``."""
-        given = [self.optimizer.adam, self._weight, self._learned, before, g_features, features]
+        given = [self.optimizer.adam, self._weight, self._reported, self._learned, before, g_features, features]
         wp.launch(step_colours, (self._count, 3), [*given, self.gradients, iteration, losses], device=self._device)

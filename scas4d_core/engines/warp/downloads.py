@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Downloads:
-    """Copies arrays to the host through page-locked buffers that are allocated once.
+    """Copies arrays to the host through page-locked buffers, which calls with equal shapes reuse.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -27,11 +27,10 @@ class Downloads:
         self.waits += 1
         if not self._device.is_cuda:
             return [array.numpy().copy() for array in arrays]
-        for array in arrays:
-            staged = self._staged.get(array.ptr)
+        for place, array in enumerate(arrays):
+            staged = self._staged.get(place)
             if staged is None or staged.shape != array.shape or staged.dtype != array.dtype:
-                staged = wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=True)
-                self._staged[array.ptr] = staged
+                self._staged[place] = staged = wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=True)
             wp.copy(staged, array)
         wp.synchronize_stream(self._device)
-        return [self._staged[array.ptr].numpy().copy() for array in arrays]
+        return [self._staged[place].numpy().copy() for place in range(len(arrays))]

@@ -45,8 +45,8 @@ from scas4d_core.guards import GuardCounts, summed
 
 Array = NDArray[np.float32]
 
-MOST_VIEWS = 64
-"""Maximum number of views per iteration."""
+MOST_VIEWS = 8
+"""Maximum number of views per iteration, the limit of the setting ``update.views``."""
 LOG_ROWS = 1024
 """Maximum number of renderings that the device logs before the host must read the log."""
 ITERATIONS = "iterations"
@@ -111,14 +111,13 @@ class WarpEngine:
         self._losses = wp.zeros(LOG_ROWS, dtype=wp.float32, device=device)
         self._probe_view, self._probe_row = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
-        self._graphs, self._captured_for = Graphs(device), object()
+        self._graphs, self._captured_for, self._generation = Graphs(device), object(), -1
         self._events: deque[wp.Event] = deque()
         self._views: list[TrainingView] = []
-        self._probes: list[TrainingView] = []
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
         """See ``UpdateEngine.load_views``."""
-        self._views, self._probes = list(views), list(probes)
+        self._views = list(views)
         self._pictures.load_views([*views, *probes])
         self._pictures.reserve(LOG_ROWS + len(probes))
         if self._gains is not None:
@@ -164,8 +163,7 @@ class WarpEngine:
         """See ``UpdateEngine.begin``."""
         self._start = start
         replaced = self._deformation.begin(start)
-        # Graphs contain buffer addresses and Adam's decay rates.
-        captured_for = start.beta1, start.beta2, start.gains is None, self._pictures.generation
+        captured_for = start.beta1, start.beta2, start.gains is None, start.curve
         if replaced or captured_for != self._captured_for:
             self._graphs.forget()
         self._captured_for = captured_for
@@ -191,15 +189,7 @@ class WarpEngine:
             self._gains.begin(self._start.gains, self._pictures.exposures)
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
-        """See ``UpdateEngine.iterate``.
-
-        Raises:
-            ValueError: if there are more than ``MOST_VIEWS`` views.
-        """
-        if len(views) > MOST_VIEWS:
-            raise ValueError(
-                f"update.views: {len(views)} views per iteration, but this engine supports at most {MOST_VIEWS}"
-            )
+        """See ``UpdateEngine.iterate``."""
         if self._used_rows + len(views) > LOG_ROWS:
             self._settle()
         self._history.append((views, step))
@@ -208,10 +198,12 @@ class WarpEngine:
         self._records.write(
             step.sample, len(self._pending), list(zip(views, rows, keeps, strict=True)), self._scalars(step)
         )
-        variant = Variant(
-            len(views), self._unchanged, step.frozen, step.keep_pictures, step.smooth_gloss,
-            step.smooth_gloss and not self._smoothed,
-        )  # fmt: skip
+        smooths = step.smooth_gloss and self._learnt_gloss is not None
+        first = smooths and not self._smoothed
+        variant = Variant(len(views), self._unchanged, step.frozen, step.keep_pictures, smooths, first)
+        if self._pictures.generation != self._generation:  # captured graphs contain the addresses of old buffers
+            self._graphs.forget()
+            self._generation = self._pictures.generation
         self._graphs.run(variant, partial(self._launch, variant))
         self._pending.append(views)
         self._used_rows += len(views)
@@ -319,7 +311,6 @@ class WarpEngine:
 
     def _repeat(self) -> None:
         """Enqueues all iterations of the attempt again, after buffers were reallocated."""
-        self._graphs.forget()
         history = self._history
         self._pictures.forget_guards()
         self._reset()
@@ -415,7 +406,7 @@ class WarpEngine:
         if self._gains is None or self._start is None or self._start.gains is None:
             raise ValueError(GAINS_MISSING)
         self._settle()
-        return self._gains.finish(self._pictures.exposures)
+        return self._gains.finish(self._pictures.exposures, self.downloads)
 
     def gradients(self) -> dict[str, Array]:
         """See ``UpdateEngine.gradients``. The gradients of frozen layers are stale."""

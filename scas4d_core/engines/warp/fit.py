@@ -87,6 +87,7 @@ class WarpFitEngine:
         self._detached = mask_weight != 0
         self._background = wp.array([[*renderer.background, 0.0]], dtype=wp.vec4, device=self._device)
         self._downloads = Downloads(self._device)
+        self._rasterizer = Rasterizer(self._device, 0, renderer.limits)
         self._scalars = wp.zeros(3 * SCALARS, dtype=wp.float32, device=self._device)
         self._view, self._row = (wp.zeros(1, dtype=wp.int32, device=self._device) for _ in range(2))
         self._log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=self._device)
@@ -104,7 +105,7 @@ class WarpFitEngine:
         if not isinstance(table.gloss, GlossShading | None):
             raise EngineError("warp", ["gloss from another engine"])
         device, count = self._device, len(table.parameters)
-        self._table, self._count = table, count
+        self._table, self._count, self._stepped = table, count, False
         self._parameters = wp.array(table.parameters, dtype=wp.float32, ndim=2, device=device)
         self._optimizer = Optimizer((count, PARAMETERS), self._scalars[:SCALARS])
         self._optimizer.begin([0.0] * PARAMETERS, (float(table.beta1), float(table.beta2)))
@@ -115,7 +116,9 @@ class WarpFitEngine:
         else:
             self._shapes = [_Shapes.empty(count, device)] * len(self._views)
         most = max(shapes.fixed for shapes in self._shapes) + count
+        capacity = self._rasterizer.capacity
         self._rasterizer = Rasterizer(device, most, self.renderer.limits, self._detached)
+        self._rasterizer.capacity = max(capacity, self._rasterizer.capacity)
         self._rasterizer.resize(self._loss.columns, self._loss.rows)
         self._gradients = [wp.zeros(most, dtype=kind, device=device) for kind in (wp.vec3, wp.mat33, wp.vec4)]
         statistics = table.statistics or RenderingStatistics.empty(count)
@@ -148,6 +151,7 @@ class WarpFitEngine:
         steps = [*self._optimizer.next_scalars(1.0)]
         for place in range(2):
             steps += (0.0, 1.0, 1.0) if gloss is None else gloss.optimizers[place].next_scalars(scalars.gloss)
+        self._stepped = True
         row = self._launch(shapes, steps)
         while self._rasterizer.grow(row[PAIRS]):
             row = self._launch(shapes, steps)
@@ -195,7 +199,10 @@ class WarpFitEngine:
         return row
 
     def table(self) -> FitTable:
-        """See ``FitEngine.table``."""
+        """See ``FitEngine.table``; downloads only if iterations have run since the last download."""
+        if not self._stepped:  # the host may have edited the table
+            return self._table
+        self._stepped = False
         table, adam = self._table, self._optimizer.adam
         arrays = [self._parameters, adam.first, adam.second, self._screen, self._rendered]
         parameters, first, second, screen, rendered = self._downloads.read(*arrays)

@@ -20,6 +20,7 @@ from scas4d_core.engines.exposure import (
     SHARE,
     gain_to_exposure,
 )
+from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.layout import Camera
 
 wp.set_module_options({"enable_backward": False})
@@ -286,8 +287,8 @@ class WarpGains:
         state = [self._measured, self._pending, self._gains, exposures]
         wp.launch(record_gain, 1, given + state, device=self._device)
 
-    def finish(self, exposures: wp.array) -> Array:
+    def finish(self, exposures: wp.array, downloads: Downloads) -> Array:
         """Ends the round, waits for the device, and returns the gains [cameras, 3]."""
         self._record(self._end, exposures)
-        gains: Array = self._gains.numpy().copy()
+        (gains,) = downloads.read(self._gains)
         return gains

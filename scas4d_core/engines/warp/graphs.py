@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from typing import ClassVar
 
 import warp as wp
 
@@ -12,11 +13,17 @@ class Graphs:
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
+
+    Attributes:
+        captures: whether to capture graphs; None captures them on GPUs only. Set it on the class before an engine is
+            bound: tests capture on the CPU device, and measurements of single kernels do not capture.
     """
+
+    captures: ClassVar[bool | None] = None
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self._captures = wp.get_device(device).is_cuda
+        self._captures = wp.get_device(device).is_cuda if self.captures is None else self.captures
         self._graphs: dict[Hashable, wp.Graph | None] = {}
 
     def forget(self) -> None:

@@ -466,11 +466,16 @@ class PictureLoss:
             self._host_exposures[index, :channels] = view.exposure
             if self._taken[index] is not view.target:
                 self._taken[index] = view.target
-                if view.levels is None:
-                    self._host_targets[index, :channels, :height, :width] = view.target
+                if view.source is None:
+                    if index not in self._staged_floats:
+                        self._staged_floats[index] = self._pinned(wp.float32)
+                    self._staged_floats[index].numpy()[:channels, :height, :width] = view.target
                     floats.append(index)
                 else:
-                    self._host_levels[index, :channels, :height, :width] = view.levels
+                    image, mask = view.source
+                    self._host_levels[index, :3, :height, :width] = np.moveaxis(image, -1, 0)
+                    if mask is not None:
+                        self._host_levels[index, 3, :height, :width] = mask
                     levels.append(index)
         cameras = [camera_of(view.camera) for view in views]
         wp.copy(self.cameras, wp.array(cameras, dtype=Camera, device="cpu"), count=len(views))
@@ -478,7 +483,7 @@ class PictureLoss:
             wp.copy(there, here)
         size = self.targets.size // len(self._taken)
         for index in floats:
-            wp.copy(self.targets, self._targets, size * index, size * index, size)
+            wp.copy(self.targets, self._staged_floats[index], size * index, 0, size)
         for index in levels:  # a quarter of the bytes
             wp.copy(self._levels, self._staged_levels, size * index, size * index, size)
             inputs = [index, int(self._host_channels[index]), self._levels, self.targets]
@@ -490,6 +495,11 @@ class PictureLoss:
         if wp.get_device(self._device).is_cuda:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
+
+    def _pinned(self, dtype: object) -> wp.array:
+        """Returns a page-locked buffer for one image of the maximum size."""
+        shape = self.targets.shape[1:]
+        return wp.zeros(shape, dtype=dtype, device="cpu", pinned=wp.get_device(self._device).is_cuda)
 
     def measure(
         self, view: wp.array, record: wp.array, drawn: Rasterizer, background: wp.array, log: wp.array
@@ -545,10 +555,10 @@ class PictureLoss:
         self._by_window = wp.zeros(shape[1:], dtype=wp.vec3, device=device)
         self._channels = wp.zeros(views, dtype=wp.int32, device="cpu", pinned=pinned)
         self._exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device="cpu", pinned=pinned)
-        self._targets = wp.zeros(shape, dtype=wp.float32, device="cpu", pinned=pinned)
+        self._staged_floats: dict[int, wp.array] = {}
         self._levels = wp.zeros(shape, dtype=wp.uint8, device=device)
         self._staged_levels = wp.zeros(shape, dtype=wp.uint8, device="cpu", pinned=pinned)
         # NumPy views of the same memory.
         self._host_channels, self._host_exposures = self._channels.numpy(), self._exposures.numpy()
-        self._host_targets, self._host_levels = self._targets.numpy(), self._staged_levels.numpy()
+        self._host_levels = self._staged_levels.numpy()
         self._host_exposures[:] = [1, 0]

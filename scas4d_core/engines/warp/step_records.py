@@ -34,7 +34,7 @@ class StepRecords:
     def __init__(self, device: str, optimizers: int, views: int, rows: int) -> None:
         pinned = wp.get_device(device).is_cuda
         integers, scalars = 2 + VIEW_COLUMNS * views, WEIGHTS + SCALARS * optimizers
-        self.views, self.rows, self._next = views, rows, 0
+        self.rows, self._next = rows, 0
         self._integers = wp.zeros(integers, dtype=wp.int32, device=device)
         self._scalars = wp.zeros(scalars, dtype=wp.float32, device=device)
         self._integer_ring = wp.zeros((rows, integers), dtype=wp.int32, device="cpu", pinned=pinned)

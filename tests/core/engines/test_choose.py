@@ -57,9 +57,10 @@ def test_with_a_driver_the_number_of_gpus_decides(devices: int, monkeypatch) -> 
 
     monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
     monkeypatch.setattr(warp, "get_cuda_device_count", lambda: devices)
+    monkeypatch.setattr(warp, "get_device", lambda name: name)
     assert resolve_device("auto") == ("gpu" if devices else "cpu")
     if not devices:
-        with pytest.raises(DeviceError, match="the driver is too old"):
+        with pytest.raises(DeviceError, match="no NVIDIA GPU can be used"):
             resolve_device("gpu")
 
 
@@ -73,3 +74,15 @@ def test_the_kernels_run_without_a_gpu_only_on_request(monkeypatch) -> None:
     monkeypatch.delenv(choose.WARP_DEVICE)
     no_driver(monkeypatch)
     assert resolve_device("auto") == "cpu"  # what was found for one is not kept for the other
+
+
+@pytest.mark.skipif(not WARP, reason="NVIDIA Warp is not installed: pip install warp-lang")
+def test_a_device_that_does_not_exist_is_named(monkeypatch) -> None:
+    import warp
+
+    monkeypatch.setenv(choose.WARP_DEVICE, "cuda:7")
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: None)
+    monkeypatch.setattr(warp, "get_cuda_device_count", lambda: 1)
+    with pytest.raises(DeviceError, match="NVIDIA Warp cannot use 'cuda:7'"):
+        resolve_device("gpu")
+    assert resolve_device("auto") == "cpu"

@@ -194,6 +194,20 @@ def test_gloss_is_learnt_where_it_is_given_and_new_rows_inherit_it() -> None:
     np.testing.assert_array_equal(fit.table.gloss.gloss[4], state.gloss[3])
 
 
+def test_a_gloss_that_the_host_edits_is_the_one_that_is_learnt_on() -> None:
+    normals = (BOX.means[:COUNT] / np.linalg.norm(BOX.means[:COUNT], axis=1, keepdims=True)).astype(np.float32)
+    fit = make_fit(gloss=GlossShading.fresh(0.5 * normals, table()[:, MEAN]))
+    fit.run([0, 1], lambda now: only(COLOUR))
+    gloss = fit.table.gloss
+    assert isinstance(gloss, GlossShading)
+    gloss.gloss[:] = -0.3 * normals
+    fit.set_gloss(gloss)
+    assert fit.table.gloss is not None
+    np.testing.assert_array_equal(fit.table.gloss.gloss, -0.3 * normals)
+    fit.run([0], lambda now: only(COLOUR))
+    assert np.abs(fit.table.gloss.gloss + 0.3 * normals).max() < 0.01
+
+
 def test_exposures_are_learnt_where_they_are_given() -> None:
     fit = make_fit()
     fit.run([0, 1], lambda now: FitScalars(ALL))

@@ -17,6 +17,7 @@ from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.engine import StepScalars
 from scas4d_core.engines.warp import engine as module
 from scas4d_core.engines.warp.engine import WarpEngine
+from scas4d_core.engines.warp.graphs import Graphs
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import PlanBuilder
@@ -163,7 +164,30 @@ def test_a_long_attempt_is_logged_whole(monkeypatch) -> None:
     assert logs[0].rendered == logs[1].rendered
 
 
-def test_more_views_than_it_has_room_for_are_refused() -> None:
-    engine = loaded(WarpEngine(DEVICE), case())
-    with pytest.raises(ValueError, match=r"update.views: 65 views per iteration, but this engine supports at most 64"):
-        engine.iterate([0] * 65, step())
+@pytest.mark.parametrize("rooms", ["enough", "too little for an iteration", "too little for a probe"])
+def test_captured_graphs_give_the_bits_of_plain_launches(rooms: str, monkeypatch) -> None:
+    results = []
+    for captures in (False, True):
+        monkeypatch.setattr(Graphs, "captures", captures)
+        scene, engine = three_layers(**TOGETHER), WarpEngine(DEVICE)
+        loaded(engine, scene, layers=RATES)
+        if rooms == "too little for an iteration":
+            engine._pictures._rasterizer.capacity = 100
+            engine._pictures._rasterizer.resize(48, 40)
+        for attempt in range(2):
+            for round in range(3):
+                for views, scalars in STEPS[3 * round : 3 * round + 3] * 3:
+                    engine.iterate(views, scalars)
+                if rooms == "too little for a probe" and round == 1:
+                    engine._pictures._rasterizer.capacity = 100
+                    engine._pictures._rasterizer.resize(48, 40)
+                    engine._pictures.generation += 1
+                engine.probe(range(5), moved=True, learnt=True)
+            results.append([engine.log().losses, engine.tables().deltas, engine.gains(), engine.state(True).colours])
+            if attempt == 0:
+                engine.load_state(scene.previous)
+                engine.set_tables(engine.tables())
+                engine.begin(scene.start(layers=RATES))
+    half = len(results) // 2
+    for plain, captured in zip(results[:half], results[half:], strict=True):
+        assert all(np.array_equal(one, other) for one, other in zip(plain, captured, strict=True))

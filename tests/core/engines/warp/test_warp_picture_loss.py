@@ -137,7 +137,8 @@ def test_images_of_8_bits_become_the_same_targets() -> None:
     target = np.concatenate([levels[:3] * np.float32(1 / 255), levels[3:].astype(np.float32)])
     made = PictureLoss(DEVICE, 1.0, 1.0)
     plain = view_of(target, camera(33, 21))
-    made.load([replace(plain, target=target, levels=levels), replace(plain, target=target.copy())])
+    image, mask = np.ascontiguousarray(np.moveaxis(levels[:3], 0, -1)), levels[3]
+    made.load([replace(plain, target=target, source=(image, mask)), replace(plain, target=target.copy())])
     targets, moments = made.targets.numpy(), made.target_means.numpy()
     assert np.array_equal(targets[0, :, :21, :33], target)
     assert np.array_equal(targets[0], targets[1])
