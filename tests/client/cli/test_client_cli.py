@@ -240,7 +240,7 @@ def test_a_scene_begins_again(service, tmp_path):
             client.wait(scene, 1)
             assert "discard" in said(code=1)
             assert "missing colours" in said("--points", str(tmp_path / "bare.npz"), code=1)
-            assert "contradict" in said("--points", "x.npz", "--no-points", code=1)
+            assert "mutually exclusive" in said("--points", "x.npz", "--no-points", code=1)
             given = (
                 "--discard",
                 "--frame",

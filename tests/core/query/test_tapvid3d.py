@@ -43,5 +43,5 @@ def test_a_query_frame_that_is_not_among_the_frames_is_told():
 
 
 def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"visibility \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"got \(2, 1, 3\) and \(2, 2\)"):
         tapvid3d(np.zeros((2, 1, 3)), np.ones((2, 2), bool), CAMERA, 0)
