@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import scas4d_core
+from scas4d_core.machine import usable_cores
 
 CPU_INFO = Path("/proc/cpuinfo")
 """File in which Linux names the processor; other systems report the name through Python."""
@@ -19,7 +20,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 def machine() -> dict[str, Any]:
     """Returns a description of the machine (hardware, operating system, Python version) for a row of results."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     facts: dict[str, Any] = {"processor": processor(), "cores": cores}
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         facts["memory_gb"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)

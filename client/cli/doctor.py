@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 import shutil
@@ -39,7 +38,9 @@ class Check:
 
 def checks(data: Path) -> Iterator[Check]:
     """Checks the machine; ``data`` is the service's data folder, which need not exist yet."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    from scas4d_core.machine import usable_cores
+
+    cores = usable_cores()
     python = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}, {cores} cores"
     yield Check("scas4d", f"{__version__}, {python}")
     yield from installed()

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable
 from scas4d_core.compilation.compiled_markers import CompiledMarkers, open_markers
 from scas4d_core.compilation.compiling import compile_kernel
 from scas4d_core.compilation.manifest import KernelGroup, kernels_of
+from scas4d_core.machine import usable_cores
 
 log = logging.getLogger("scas4d.kernels")
 
@@ -46,7 +47,7 @@ _pool: list[subprocess.Popen[bytes]] = []
 
 def processes() -> int:
     """Returns the number of processes that may compile concurrently: one per core, at most `MAX_PROCESSES`."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     return min(cores, MAX_PROCESSES)
 
 

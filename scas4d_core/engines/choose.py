@@ -63,7 +63,7 @@ def _hardware_fault(device: str) -> str | None:
 def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
     """Resolves the setting ``device`` to a device.
 
-    "auto" selects the GPU if one can be used and ``WARP_DEVICE`` is not set, otherwise the CPU.
+    "auto" selects the GPU if one can be used, otherwise the CPU. It never selects Warp's CPU device.
 
     Args:
         device: value of the setting ``device``.

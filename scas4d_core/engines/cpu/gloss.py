@@ -111,8 +111,7 @@ class GlossShading:
         self.gradients = np.zeros_like(gloss), np.zeros_like(environment)
         self.moments = [np.zeros((2, *table.shape), np.float32) for table in (gloss, environment)]
         self._columns = np.array([rates[0]] * 3, np.float32)
-        self._by_row = np.full(len(environment), rates[1], np.float32)
-        self._by_row[direction.MIDDLE], self._by_row[direction.NEARNESS] = 0, rates[2]
+        self._by_row = environment_rates(rates)
         self._cells = cell_areas(direction.SIDE)
         self._seen = self.steps = 0
         self._near: tuple[Any, Any] | None = None
@@ -191,6 +190,19 @@ class GlossShading:
         index, weights = self._near
         change = (self.gloss - self.changed_from)[index]
         self.gloss[:] = self.changed_from + np.einsum("nkc,nk->nc", change, weights)
+
+
+def environment_rates(rates: tuple[float, float, float]) -> Array:
+    """Returns the learning rate of each row of an environment, [ROWS]; its middle is not learnt.
+
+    Args:
+        rates: learning rates of the gloss, the environment and its nearness.
+    """
+    from scas4d_core.kernels.appearance import direction
+
+    by_row = np.full(direction.ROWS, rates[1], np.float32)
+    by_row[direction.MIDDLE], by_row[direction.NEARNESS] = 0, rates[2]
+    return by_row
 
 
 def cell_areas(side: int) -> Array:

@@ -23,6 +23,8 @@ COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
 """Names of the guards that ``step_element`` counts."""
 SCALARS = 3
 """Number of scalars per step: learning rate factor, 1 − β₁^steps and 1 − β₂^steps."""
+IDLE = 0.0, 1.0, 1.0
+"""Scalars with which an optimizer takes no step."""
 
 
 @wp.struct
@@ -123,7 +125,7 @@ class Optimizer:
     def next_scalars(self, factor: float) -> tuple[float, float, float]:
         """Returns the next step's scalars. A factor of 0 skips the step and leaves the moments unchanged."""
         if factor == 0:
-            return 0.0, 1.0, 1.0
+            return IDLE
         self.steps += 1
         return factor, 1 - self.adam.beta1**self.steps, 1 - self.adam.beta2**self.steps
 

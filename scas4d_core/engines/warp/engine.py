@@ -29,6 +29,7 @@ from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import psnr_of
 from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.engines.warp.adam import COUNTED_GUARDS as ADAM_GUARDS
+from scas4d_core.engines.warp.adam import IDLE
 from scas4d_core.engines.warp.colours import WarpColours
 from scas4d_core.engines.warp.deformation import WarpDeformation
 from scas4d_core.engines.warp.downloads import Downloads
@@ -52,7 +53,7 @@ LOG_ROWS = 1024
 ITERATIONS = "iterations"
 """Name of the update stage in which the host enqueues iterations."""
 AHEAD = 2
-"""Maximum number of pending iterations while an update is monitoring its time limit."""
+"""Maximum number of pending iterations; bounds how far the host's clock runs ahead of the device."""
 
 
 class Variant(NamedTuple):
@@ -223,11 +224,10 @@ class WarpEngine:
     def _scalars(self, step: StepScalars) -> list[float]:
         """Returns an iteration's scalars for ``StepRecords.write``, and advances the step counts of all optimizers."""
         scalars = self._deformation.scalars(step)
-        idle = [0.0, 1.0, 1.0]
-        scalars += idle if self._colours is None else self._colours.optimizer.next_scalars(step.colour)
+        scalars += IDLE if self._colours is None else self._colours.optimizer.next_scalars(step.colour)
+        gloss = self._learnt_gloss
         for place in range(2):
-            gloss = self._learnt_gloss
-            scalars += idle if gloss is None else gloss.optimizers[place].next_scalars(step.gloss)
+            scalars += IDLE if gloss is None else gloss.optimizers[place].next_scalars(step.gloss)
         return scalars
 
     def _launch(self, variant: Variant) -> None:

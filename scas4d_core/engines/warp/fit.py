@@ -17,7 +17,7 @@ from scas4d_core.engines.fit import FitGloss, FitLoss, FitScalars, FitTable, Ren
 from scas4d_core.engines.renderer import CHANNELS, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.engines.warp.activation import activate, step_parameters
-from scas4d_core.engines.warp.adam import SCALARS, Optimizer
+from scas4d_core.engines.warp.adam import IDLE, SCALARS, Optimizer
 from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.gloss import GlossTables
 from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, MASK_LOSS, PAIRS, SHIFT, SQUARES
@@ -150,7 +150,7 @@ class WarpFitEngine:
         self._optimizer.set_columns(scalars.rates)
         steps = [*self._optimizer.next_scalars(1.0)]
         for place in range(2):
-            steps += (0.0, 1.0, 1.0) if gloss is None else gloss.optimizers[place].next_scalars(scalars.gloss)
+            steps += IDLE if gloss is None else gloss.optimizers[place].next_scalars(scalars.gloss)
         self._stepped = True
         row = self._launch(shapes, steps)
         while self._rasterizer.grow(row[PAIRS]):

@@ -17,6 +17,7 @@ from scas4d_core.engines.cpu.gloss import (
     UPDATE_RATE_GLOSS,
     UPDATE_RATE_NEARNESS,
     cell_areas,
+    environment_rates,
     gloss_rate,
 )
 from scas4d_core.engines.warp.adam import Optimizer, step_table
@@ -356,10 +357,8 @@ class GlossTables:
 
     def begin(self, rates: tuple[float, float, float]) -> None:
         """Resets the moments to zero and sets the learning rates of the gloss, the environment and its nearness."""
-        by_row = np.full(direction.ROWS, rates[1], np.float32)
-        by_row[direction.MIDDLE], by_row[direction.NEARNESS] = 0, rates[2]
         self.optimizers[0].begin([rates[0]] * 3, BETAS)
-        self.optimizers[1].begin([1.0] * 3, BETAS, by_row)
+        self.optimizers[1].begin([1.0] * 3, BETAS, environment_rates(rates))
 
     def shade(
         self, cameras: wp.array, view: wp.array, means: wp.array, turns: wp.array | None, features: wp.array,
@@ -375,8 +374,12 @@ class GlossTables:
             features: [N] vec4 features without gloss.
             tables: gloss and environment, usually the ``tables`` attribute.
         """
-        given = [cameras, view, means, self._entries, self.seen if turns is None else turns, int(turns is not None)]
-        wp.launch(shade, self._count, [*given, *tables, features, self.seen], device=self._device)
+        inputs = [cameras, view, means, *self._rotations(turns), *tables, features, self.seen]
+        wp.launch(shade, self._count, inputs, device=self._device)
+
+    def _rotations(self, turns: wp.array | None) -> list[object]:
+        """Returns the kernel arguments for rotations; without any, the array is a placeholder that is not read."""
+        return [self._entries, self.seen if turns is None else turns, int(turns is not None)]
 
     def shade_backward(
         self, cameras: wp.array, view: wp.array, means: wp.array, turns: wp.array | None, features: wp.array,
@@ -391,9 +394,8 @@ class GlossTables:
         """
         if not add:
             self.gradients[1].zero_()
-        given = [cameras, view, means, self._entries, self.seen if turns is None else turns, int(turns is not None)]
-        given += [*self.tables, features, int(add), self.g_seen, g_features, *self.gradients]
-        wp.launch(shade_backward, self._count, given, device=self._device)
+        inputs = [cameras, view, means, *self._rotations(turns), *self.tables, features, int(add), self.g_seen]
+        wp.launch(shade_backward, self._count, [*inputs, g_features, *self.gradients], device=self._device)
 
     def step(self) -> None:
         """Takes an Adam step for both tables."""

@@ -468,7 +468,7 @@ class PictureLoss:
                 self._taken[index] = view.target
                 if view.source is None:
                     if index not in self._staged_floats:
-                        self._staged_floats[index] = self._pinned(wp.float32)
+                        self._staged_floats[index] = self._pinned()
                     self._staged_floats[index].numpy()[:channels, :height, :width] = view.target
                     floats.append(index)
                 else:
@@ -496,10 +496,10 @@ class PictureLoss:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
 
-    def _pinned(self, dtype: object) -> wp.array:
-        """Returns a page-locked buffer for one image of the maximum size."""
-        shape = self.targets.shape[1:]
-        return wp.zeros(shape, dtype=dtype, device="cpu", pinned=wp.get_device(self._device).is_cuda)
+    def _pinned(self) -> wp.array:
+        """Returns a page-locked float32 buffer for one image of the maximum size."""
+        pinned = wp.get_device(self._device).is_cuda
+        return wp.zeros(self.targets.shape[1:], dtype=wp.float32, device="cpu", pinned=pinned)
 
     def measure(
         self, view: wp.array, record: wp.array, drawn: Rasterizer, background: wp.array, log: wp.array
