@@ -1,4 +1,8 @@
-"""Writes the table of effects in docs/effects.md: `PYTHONPATH=. python scripts/effects_table.py`."""
+"""Writes the table of effects in docs/effects.md from the registry.
+
+PYTHONPATH=. python scripts/effects_table.py            # writes
+PYTHONPATH=. python scripts/effects_table.py --check    # exits with 1 if the page is out of date
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ CONDITIONS = {
     "shadows": "with static Gaussians; later by evidence",
     "static_colour": "no, only if pinned",
 }
-"""When an effect is on by default, if neither always nor only by evidence."""
+"""Maps an effect to the condition under which it is on by default, if that is not "yes" or "by evidence"."""
 
 
 def table() -> str:
@@ -29,7 +33,7 @@ def table() -> str:
 
 
 def written(page: str) -> str:
-    """Returns the page with its table replaced."""
+    """Returns the text of the page with an up-to-date table."""
     head, rest = page.split(BEGIN)
     return head + BEGIN + table() + END + rest.split(END, 1)[1]
 

@@ -37,13 +37,13 @@ def folders() -> Iterator[Path]:
 
 
 def table() -> str:
-    """Returns one row per folder."""
+    """Returns a Markdown table with one row per folder."""
     rows = [f"| `{folder.relative_to(ROOT)}/` | {first_line(folder)} |" for folder in folders()]
     return "\n".join(["| folder | contents |", "|---|---|", *rows]) + "\n"
 
 
 def with_table(page: str) -> str:
-    """Returns the page with its table replaced."""
+    """Returns the text of the page with an up-to-date table."""
     before, rest = page.split(BEGIN)
     return before + BEGIN + table() + END + rest.split(END, 1)[1]
 

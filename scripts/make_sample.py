@@ -30,7 +30,13 @@ def spread(centres: NDArray[np.float64], count: int) -> list[int]:
 
 
 def cut_meta(meta: dict[str, Any], frames: int, cameras: list[int]) -> dict[str, Any]:
-    """Returns a train_meta or test_meta reduced to the first ``frames`` frames and the given cameras."""
+    """Returns the contents of a train_meta or test_meta file for the first ``frames`` frames and the given cameras.
+
+    Args:
+        meta: parsed contents of the file.
+        frames: number of frames to keep.
+        cameras: indices of the cameras to keep.
+    """
     return {
         key: [[row[camera] for camera in cameras] for row in value[:frames]] if isinstance(value, list) else value
         for key, value in meta.items()
@@ -38,7 +44,7 @@ def cut_meta(meta: dict[str, Any], frames: int, cameras: list[int]) -> dict[str,
 
 
 def main() -> None:
-    """Writes the reduced capture and checks its size."""
+    """Writes the reduced capture. Exits with an error if it is larger than ``LIMIT_MB``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("source", type=Path)
     parser.add_argument("target", type=Path)

@@ -26,7 +26,7 @@ BEGIN, END = "<!-- settings: written by scripts/settings_pages.py -->", "<!-- en
 
 
 def cell(value: object) -> str:
-    """Escapes a value so that it stays within one table cell."""
+    """Returns a value as text, escaped to stay within one table cell."""
     return str(value).replace("|", "\\|").replace("\n", " ")
 
 
@@ -52,7 +52,7 @@ def server_table() -> str:
 
 
 def method_rows(model: type[BaseModel], path: str = "") -> Iterator[str]:
-    """Yields one row per method setting; nested names are joined with dots."""
+    """Yields one table row per method setting, with the parts of nested names joined by dots."""
     for name, field in model.model_fields.items():
         inner = field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
@@ -62,7 +62,7 @@ def method_rows(model: type[BaseModel], path: str = "") -> Iterator[str]:
 
 
 def preset_rows() -> Iterator[str]:
-    """Yields one row per preset, with the settings that it changes."""
+    """Yields one table row per preset, with the settings that the preset changes."""
     usual = Settings().model_dump(mode="json")
     for name, settings in PRESETS.items():
         changes = format_changes(settings.model_dump(mode="json"), usual)
@@ -77,14 +77,14 @@ def method_table() -> str:
 
 
 def written(page: Path, table: str) -> str:
-    """Returns the page with its table replaced."""
+    """Returns the text of a page with the given table between the markers."""
     before, _, rest = page.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
     return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
 
 
 def main() -> None:
-    """Writes the pages, or with `--check` only compares them."""
+    """Writes the pages. With `--check`, only compares them and exits with an error if one is out of date."""
     stale = []
     for name, table in (("service-settings.md", server_table()), ("settings.md", method_table())):
         page = DOCS / name

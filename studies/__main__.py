@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def remedy(missing: ModuleNotFoundError) -> str:
-    """Returns installation instructions for a missing package; studies need all test dependencies."""
+    """Returns instructions for installing a missing package. Studies need all test dependencies."""
     return f"this command requires {missing.name}, which is not installed; run in the checkout: scripts/setup dev"
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def in_a_process(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Calls a function of a module in a new process; returns its result or raises its exception.
+    """Calls a module-level function in a new process and returns its result, or raises its exception.
 
     Raises:
         BrokenProcessPool: the process ended before it returned a result, for example because it ran out of memory.

@@ -1,4 +1,4 @@
-"""Temporary changes to the method's internal constants, each in the module that uses it."""
+"""Context managers that temporarily change the method's internal constants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Description of the machine and sources that a figure was measured on."""
+"""Description of the machine and the source version that produced a figure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import scas4d_core
 from scas4d_core.machine import usable_cores
 
 CPU_INFO = Path("/proc/cpuinfo")
-"""File in which Linux names the processor; other systems report the name through Python."""
+"""File from which the processor name is read on Linux. Elsewhere, the name comes from ``platform``."""
 
 
 def machine() -> dict[str, Any]:
@@ -28,7 +28,7 @@ def machine() -> dict[str, Any]:
 
 
 def in_words(of: Mapping[str, Any]) -> str:
-    """Formats the result of ``machine`` as one line; unknown values are omitted."""
+    """Formats the result of ``machine`` as one line, omitting unknown values."""
     words = [str(of.get("processor", "unknown processor"))]
     if "cores" in of:
         words.append(f"{of['cores']} core{'s' if of['cores'] != 1 else ''}")
@@ -42,7 +42,7 @@ def in_words(of: Mapping[str, Any]) -> str:
 
 
 def processor() -> str:
-    """Returns the name of the processor."""
+    """Returns the name of the processor, or its architecture if the name is unknown."""
     if CPU_INFO.exists():
         for line in CPU_INFO.read_text().splitlines():
             if line.startswith("model name"):
@@ -62,7 +62,7 @@ def resident_mb(pid: int | None = None) -> float:
 def core_version() -> str:
     """Returns eight hexadecimal digits that identify the sources of the method (all of ``scas4d_core``).
 
-    A row is identified by its settings; this version shows which rows were produced by the same code.
+    Rows are identified by their settings. This version shows which of them were produced by the same code.
     """
     root = Path(scas4d_core.__file__).parent
     hasher = hashlib.sha256()

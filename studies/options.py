@@ -1,4 +1,4 @@
-"""Options, output and folders shared by several studies."""
+"""Command-line options, output functions and folders shared by several studies."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Annotated
 import typer
 
 Echo = Callable[[str], None]
-"""Prints one line of a study's output."""
+"""Function that prints one line of a study's output."""
 QUALITY = Path("out/quality")
-"""Folder of the quality study, which other studies read."""
+"""Default folder of the quality study. Other studies read its results."""
 FRONTIER = Path("out/frontier")
-"""Folder of the study of accuracy against time, which the paper and effort studies share."""
+"""Default folder of the study of accuracy against time, shared with the paper and effort studies."""
 
 Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")]
 Repeated = Annotated[
@@ -46,7 +46,7 @@ def write_part(path: Path, text: str) -> None:
 
 
 def write_page(out: Path | None, text: str) -> None:
-    """Writes the text to `out`, creating its folder if necessary; does nothing for None."""
+    """Writes the text to `out`, creating its folder if necessary. Does nothing if `out` is None."""
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text if text.endswith("\n") else text + "\n")

@@ -20,21 +20,22 @@ def export(
     url: str,
     token: str | None,
 ) -> None:
-    """Exports frames to a file or folder, holding one state in memory at a time.
+    """Exports frames to a file or folder, with only one state in memory at a time.
 
     Args:
         source: source of the states; see `opened`.
         format: format name from docs/exports.md.
-        out: output folder or `.zip` for numbered files, otherwise output file. If None, the name is derived from source
-            and format, and the output is written next to the source, or to the current folder for a scene.
-        frames: inclusive range `A:B`; either end may be omitted. None for all frames.
+        out: output folder or `.zip` for a format with one file per frame, otherwise the output file. If None, the name
+            is derived from the source and the format. The output is then written next to the source, or to the current
+            folder for a scene.
+        frames: inclusive range `A:B`, where A or B may be omitted; None for all frames.
         ids: ids of the Gaussians to export in the `tracks` format.
-        rate: frame rate of a source that consists of numbered files; None for the default of 30.
+        rate: frame rate of a source that consists of numbered files; None for the default of 30 frames per second.
         url: service URL.
         token: access token for the service.
 
     Raises:
-        InputError: the source, format, range or output is invalid.
+        InputError: if the source, format, range or output is invalid.
     """
     from scas4d_core.exports.formats import WITH_PARTS, check_suffix, format_of
     from scas4d_core.exports.sequence import export_sequence, other_frames

@@ -1,7 +1,7 @@
 """Bundles JavaScript modules into one classic script, for pages opened from ``file://``.
 
-Browsers do not load modules from ``file://``. Each module becomes a function that returns its exports. Only the forms
-of import and export matched below are supported; all others are rejected.
+Browsers do not load modules from ``file://``. Each module therefore becomes a function that returns its exports. Only
+the forms of import and export matched below are supported.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ def script(entry: Path, root: Path) -> str:
 
     Args:
         entry: path to the entry module.
-        root: folder to which module names are relative.
+        root: folder that contains all modules. Modules are named by their path relative to this folder.
 
     Returns:
         Self-contained script that does not contain ``</script``.
 
     Raises:
-        ValueError: a module uses an unsupported form of import or export, or there is an import cycle.
+        ValueError: if a module uses an unsupported form of import or export, or there is an import cycle.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -24,13 +24,16 @@ from scas4d_core.errors import InputError
 VIEWER = Path(__file__).parents[2] / "server" / "viewer"
 """Folder of the viewer's modules, which the player reuses."""
 PIECE = 3 << 18
-"""Chunk size in bytes; a multiple of 3, so that each base64 chunk can be decoded separately."""
+"""Chunk size in bytes. It is a multiple of 3, so each base64 chunk can be decoded separately."""
 LARGE, LARGEST = 100 << 20, 1 << 30
-"""Total sizes of the compact files, in bytes, above which a player opens slowly and above which browsers refuse it."""
+"""Total sizes of the compact files in bytes. Pages above the first open slowly, and pages above the second fail."""
 
 
 def export_player(source: str, out: Path, frames: str | None = None, *, url: str, token: str | None) -> None:
-    """Writes a player with the compact files of the source, or with a new file if only some frames are requested.
+    """Writes an HTML player for the frames of a source.
+
+    The player contains the compact files of the source, or a new compact file if only some of their frames are
+    requested.
 
     Args:
         source: compact file, output folder of `scas4d reconstruct`, or id of a scene on the service.
@@ -40,7 +43,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
         token: access token for the service.
 
     Raises:
-        InputError: the range or output is invalid, or the data is larger than browsers can open.
+        InputError: if the range or output is invalid, or the data is larger than browsers can open.
     """
     if out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"player={str(out)!r} is not an HTML file name", "use a name that ends in .html")
@@ -64,7 +67,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
 
 
 def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
-    """Writes an HTML page with embedded compact files, holding one chunk in memory at a time.
+    """Writes an HTML page with embedded compact files, with only one chunk in memory at a time.
 
     Args:
         out: HTML file to write.
@@ -103,7 +106,7 @@ def _pieces(file: Path) -> Iterator[str]:
 
 @contextmanager
 def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[Path]]:
-    """Yields the source's compact files, or a new one if there are none or they contain other frames."""
+    """Yields the source's compact files, or a new one if there are none, or if they also contain other frames."""
     if isinstance(given.of, CompactStates) and count == _held(given.of.files):
         yield given.of.files
         return
@@ -140,7 +143,7 @@ def _facing(points: NDArray[np.float64]) -> Camera:
 
 
 def _held(files: Sequence[Path]) -> int:
-    """Returns the number of frames in compact files, including those that only serve as dependencies."""
+    """Returns the number of frames in compact files, including frames that are only needed to decode others."""
     indices: set[int] = set()
     for file in files:
         with CompactReader(file) as reader:

@@ -22,7 +22,7 @@ from scas4d_core.gaussians import Gaussians
 
 SUFFIX = ".rrd"
 FAINT = 0.1
-"""Opacity below which Gaussians are omitted; points are drawn opaque, so haze would hide the surfaces behind it."""
+"""Opacity below which Gaussians are omitted. Points are drawn opaque, so haze would hide the surfaces behind it."""
 THIN = -0.7
 """Radius of the track lines; the viewer interprets negative values as screen-space points."""
 PLANE = 0.15
@@ -40,7 +40,7 @@ def make_recording(
     url: str,
     token: str | None,
 ) -> Path:
-    """Writes a Rerun recording, holding one state in memory at a time, and returns its path.
+    """Writes a Rerun recording with only one state in memory at a time, and returns its path.
 
     Args:
         source: source of the states; see `opened`.
@@ -48,13 +48,14 @@ def make_recording(
         frames: inclusive range `A:B`; None for all frames.
         tracks: number of moving Gaussians whose trajectories are drawn.
         trail: trajectory length in seconds of scene time.
-        parts: whether to colour points by part instead of using their own colours. Part labels are always recorded.
+        parts: whether to colour points by part instead of using their own colours. Part labels are recorded in either
+            case.
         url: service URL.
         token: access token for the service.
 
     Raises:
-        InputError: the range or output is invalid.
-        ModuleNotFoundError: rerun-sdk is not installed.
+        InputError: if the range or output is invalid, or `parts` is set for a source without parts.
+        ModuleNotFoundError: if rerun-sdk is not installed.
     """
     low, high = frame_range(frames)
     if out is not None and out.suffix.lower() != SUFFIX:
@@ -88,7 +89,7 @@ def make_recording(
 
 @contextmanager
 def _stream(target: Path) -> Iterator[Any]:
-    """Yields a Rerun stream that records to a temporary file, which is renamed once it is complete."""
+    """Yields a Rerun stream that records to a temporary file, and renames the file once it is complete."""
     import rerun
     from rerun import blueprint
 
@@ -109,7 +110,7 @@ def _stream(target: Path) -> Iterator[Any]:
 def _log_what_stays(stream: Any, given: Source, labels: NDArray[np.int64] | None) -> None:
     """Logs the static data: axes, part names and colours, and the rig.
 
-    The class id of a part is its label + 1; 0 means no part.
+    The class id of a part is its label + 1. Class 0 means no part.
     """
     import rerun
 
@@ -135,7 +136,7 @@ def _log_what_stays(stream: Any, given: Source, labels: NDArray[np.int64] | None
 
 
 def _axes(rig: Rig | None) -> Any:
-    """Returns the view coordinates whose axis is closest to the rig's up direction; y down if there is no rig."""
+    """Returns Rerun's view coordinates for the axis closest to the rig's up direction, or for y down without a rig."""
     import rerun
 
     up = np.array([0.0, -1.0, 0.0]) if rig is None else RigView.of(rig).up
@@ -176,7 +177,7 @@ def _longer(
     """Appends the positions of a state to the trails and returns the positions within the last `trail` seconds.
 
     Returns:
-        Positions [S, K, 3]; NaN where a Gaussian is not present.
+        Positions [S, K, 3] of K Gaussians in S states, with NaN where a Gaussian is not present.
     """
     places = given.head.world.to_user(state.means[rows])
     places[~state.present[rows]] = np.nan

@@ -57,10 +57,10 @@ class States(Protocol):
         """Sentences that describe data missing from the source."""
 
     def parts(self) -> NDArray[np.int64] | None:
-        """Returns the part label of each Gaussian [N], or None."""
+        """Returns the part label of each Gaussian [N], or None if there are no labels."""
 
     def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Yields index, time in seconds and state of the frames from ``low`` to ``high``."""
+        """Yields the index, time in seconds and state of each frame from ``low`` to ``high``."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Source:
 
     Attributes:
         name: default base name of exported files.
-        beside: default folder for exported files, next to the source.
+        beside: default folder for exported files: the source's folder, or the current folder for a scene.
         of: states of the source.
     """
 
@@ -83,18 +83,18 @@ class Source:
         return self.of.head
 
     def parts(self) -> NDArray[np.int64] | None:
-        """Returns the part label of each Gaussian [N], or None."""
+        """Returns the part label of each Gaussian [N], or None if there are no labels."""
         return self.of.parts()
 
     def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Yields index, time in seconds and state of the frames from ``low`` to ``high``."""
+        """Yields the index, time in seconds and state of each frame from ``low`` to ``high``."""
         return self.of.states(low, high)
 
     def within(self, low: int, high: int) -> dict[int, float]:
         """Returns the time in seconds of each frame from ``low`` to ``high``, keyed by frame index, in order.
 
         Raises:
-            InputError: there are no such frames.
+            InputError: if there are no such frames.
         """
         times = {index: time for index, time in zip(self.of.frames, self.of.times, strict=True) if low <= index <= high}
         if not times:
@@ -104,7 +104,7 @@ class Source:
         return times
 
     def some(self, indices: Sequence[int]) -> list[Gaussians]:
-        """Returns the states of the first, middle and last of the given frames, without duplicates."""
+        """Returns the states of the first, middle and last given frame, without duplicates."""
         chosen = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
         return [state for index in chosen for _, _, state in self.states(index, index)]
 
@@ -121,7 +121,7 @@ class Source:
 def opened(
     source: str, low: int, high: int, parts: bool, url: str, token: str | None, rate: float | None = None
 ) -> Iterator[Source]:
-    """Opens and yields a source of states; the states of a scene are downloaded from the service.
+    """Opens and yields a source of states. The states of a scene are downloaded from the service.
 
     Args:
         source: compact file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
@@ -131,10 +131,10 @@ def opened(
         parts: whether to also download the part labels of a scene.
         url: service URL.
         token: access token for the service.
-        rate: frame rate of numbered files; None for the default of 30.
+        rate: frame rate of numbered files; None for the default of 30 frames per second.
 
     Raises:
-        InputError: the source does not exist, or is an export without ids.
+        InputError: if the source does not exist, or is an export without ids.
     """
     path = Path(source)
     if path.exists():
@@ -149,7 +149,7 @@ def opened(
 
 
 def is_scene_id(source: str) -> bool:
-    """Returns True if a source is a scene id, i.e. it is not an existing path and has neither a suffix nor a folder.
+    """Returns whether a source is a scene id: a name without a suffix or folder that is not an existing path.
 
     >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
     (True, False, False, False)
@@ -160,7 +160,7 @@ def is_scene_id(source: str) -> bool:
 
 @dataclass(frozen=True)
 class CompactStates:
-    """States of one or several consecutive compact files; one file is open at a time.
+    """States of one or several consecutive compact files, which are opened one at a time.
 
     Attributes:
         files: compact files in frame order.
@@ -179,7 +179,7 @@ class CompactStates:
 
     @classmethod
     def of(cls, files: Sequence[Path], first: int = 0) -> CompactStates:
-        """Returns the states of the files from frame ``first`` on; earlier frames serve only as dependencies."""
+        """Returns the states of the files from frame ``first`` on. Earlier frames are only used for decoding."""
         heads: list[FileHeader] = []
         times: dict[int, float] = {}
         damages: list[str] = []
@@ -192,12 +192,12 @@ class CompactStates:
         return cls(files, heads[0], list(times), list(times.values()), damages[0] if damages else None)
 
     def parts(self) -> NDArray[np.int64] | None:
-        """Returns the part label of each Gaussian [N] from the last file, or None."""
+        """Returns the part label of each Gaussian [N] from the last file, or None if it contains no labels."""
         with CompactReader(self.files[-1]) as reader:
             return reader.parts()
 
     def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Yields index, time in seconds and state of the frames from ``low`` to ``high``, without duplicates."""
+        """Yields the index, time in seconds and state of each frame from ``low`` to ``high``, without duplicates."""
         last = low - 1
         for file in self.files:
             with CompactReader(file) as reader:
@@ -212,10 +212,10 @@ def of_path(path: Path, rate: float | None = None) -> Source:
 
     Args:
         path: existing file or folder.
-        rate: frame rate of numbered files; None for the default of 30.
+        rate: frame rate of numbered files; None for the default of 30 frames per second.
 
     Raises:
-        InputError: the path is not a supported source.
+        InputError: if the path is not a supported source.
     """
     if path.is_dir() and (path / STATES).exists():
         path = path / STATES
@@ -250,7 +250,10 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
 
 
 def frame_range(text: str | None) -> tuple[int, int]:
-    """Parses a frame range and returns its first and last frame.
+    """Parses a frame range such as `2:4` and returns its first and last frame. None means all frames.
+
+    Raises:
+        InputError: if the range is invalid or empty.
 
     >>> frame_range("2:4"), frame_range(":1"), frame_range("7")
     ((2, 4), (0, 1), (7, 7))

@@ -1,4 +1,4 @@
-"""`Calibration`: the cameras of a rig, independent of the calibration tool that wrote them. Requires only numpy."""
+"""Calibrations of rigs, independent of the tool that produced them. Requires only numpy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
 STATIC_TOLERANCE = 1e-6
-"""Maximum relative change, between images, of any entry in a static camera's pose, intrinsics or distortion."""
+"""Maximum relative difference between the images of a static camera in its pose, intrinsics or distortion."""
 
 
 NAMES = (
@@ -29,7 +29,7 @@ class CalibratedImage:
 
     Attributes:
         path: path as written in the calibration file.
-        lens: camera that took the image; `calibration` assigns its name.
+        lens: camera that took the image. The function `calibration` assigns its name.
         time: timestamp in seconds; None if the file contains none.
     """
 
@@ -49,7 +49,7 @@ class Calibration:
         points: point cloud included in the calibration, or None.
         fps: frame rate; None if the file contains none.
         remarks: messages for the user about how the calibration was read.
-        left_out: names of cameras that are in the file but not in the rig; a remark lists them.
+        left_out: names of cameras that are in the file but not in the rig. A remark lists them.
     """
 
     source: Path
@@ -62,7 +62,7 @@ class Calibration:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Camera names."""
+        """Names of the cameras, in the order of `cameras`."""
         return tuple(camera.name for camera in self.cameras)
 
 
@@ -77,10 +77,10 @@ def calibration(
 ) -> Calibration:
     """Builds a calibration by grouping images by camera.
 
-    A camera is named after the folder of its images or, if all images are in one folder, after its image.
+    A camera is named after the folder of its images or, if all images are in one folder, after its image file.
 
     Raises:
-        CaptureError: there are no views, a camera moves, or a camera name is invalid.
+        CaptureError: if there are no views, a camera moves, or a camera name is invalid.
     """
     if not views:
         raise CaptureError(f"{source} contains no cameras")
@@ -113,10 +113,10 @@ def calibration_of_cameras(
         source: file or folder from which the calibration was read.
         cameras: cameras of the rig.
         left_out: names of cameras that are in the file but not in the rig.
-        why: beginning of the remark that lists these cameras.
+        why: beginning of the remark that lists the cameras in `left_out`.
 
     Raises:
-        CaptureError: there are no cameras, a name occurs twice, or a name is invalid.
+        CaptureError: if there are no cameras, a name occurs twice, or a name is invalid.
     """
     if not cameras:
         raise CaptureError(f"{source} contains no camera with a pose; calibrate the rig's extrinsics too")

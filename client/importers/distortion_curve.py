@@ -1,4 +1,4 @@
-"""`DistortionCurve`: applies and inverts lens distortion where its polynomial is monotonic. Requires only numpy."""
+"""Applies and inverts lens distortion where its polynomial is monotonic. Requires only numpy."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from client.importers.lens import LensCamera
 Float = NDArray[np.float64]
 
 FLAT = np.radians(89.0)
-"""Angle from the optical axis in radians, beyond which a ray is treated as never meeting the plane at distance 1."""
+"""Angle from the optical axis, in radians, beyond which a ray is considered parallel to the plane at distance 1."""
 SAMPLES = 8192
 STEEP = 0.1
 """Smallest trusted slope of the radial profile, relative to the slope on the axis.
 
-Near the maximum of a non-monotonic polynomial, no calibration points constrain it. Where it is flatter than this, a
-tenth of a pixel in the lens's image would be stretched over more than a pixel.
+No calibration points constrain a non-monotonic polynomial near its maximum. Where the slope is smaller than this value,
+a tenth of a pixel in the lens's image would be stretched over more than a pixel.
 """
 NEWTON = 8
 ROUNDS = 60
-"""Number of fixed-point iterations for the tangential part; since it is small, they converge quickly."""
+"""Number of fixed-point iterations for the tangential part. They converge quickly because this part is small."""
 CLOSE = 1e-7
 """Maximum residual, on the plane at distance 1, for a ray to count as a solution."""
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionCurve:
-    """Radial distortion profile of a lens: a function of the ray's radius at distance 1 or, for a fisheye, its angle.
+    """Radial distortion profile of a lens, as a function of a ray's radius at distance 1 or, for a fisheye, its angle.
 
     Attributes:
         lens: camera with lens distortion.
@@ -47,7 +47,7 @@ class DistortionCurve:
 
     @classmethod
     def of(cls, lens: LensCamera) -> DistortionCurve:
-        """Samples the profile of a lens with distortion."""
+        """Returns the sampled profile of a lens with distortion."""
         samples = np.linspace(0, np.pi, SAMPLES) if lens.fisheye else np.tan(np.linspace(0, FLAT, SAMPLES))
         bends, slopes = _profile(lens, samples)
         corners = np.array([[0, 0], [lens.width, 0], [0, lens.height], [lens.width, lens.height]])
@@ -80,9 +80,9 @@ class DistortionCurve:
         return rays * np.where(radius > 0, bends / np.maximum(radius, 1e-12), 1.0) + _tangential_offset(self.lens, rays)
 
     def undistort(self, bent: Float) -> Float:
-        """Maps distorted points [P, 2] back to rays [P, 2]; the inverse of `distort`.
+        """Maps distorted points [P, 2] back to rays [P, 2], as the inverse of `distort`.
 
-        Returns ±infinity beyond 89° for a fisheye, and NaN for points that no trusted ray reaches.
+        The result is ±infinity beyond 89° for a fisheye, and NaN for points that no trusted ray reaches.
         """
         if self.lens.fisheye or not _tangential(self.lens).any():
             return self._undistort_radial(bent)

@@ -13,10 +13,14 @@ class MissingExtraError(RuntimeError):
 
 
 def load(module: str, *, needed: str) -> Any:
-    """Imports a module; `needed` states its purpose in the error message.
+    """Imports and returns a module.
+
+    Args:
+        module: name of the module.
+        needed: purpose of the module, for the error message.
 
     Raises:
-        MissingExtraError: the module is not installed; the message names the extra.
+        MissingExtraError: if the module cannot be imported. The message contains the command that installs it.
     """
     try:
         return importlib.import_module(module)
@@ -28,10 +32,10 @@ def load(module: str, *, needed: str) -> Any:
 
 
 def opencv() -> Any:
-    """Imports OpenCV, which undistorts images."""
+    """Imports and returns OpenCV, which undistorts images."""
     return load("cv2", needed="undistorting images")
 
 
 def pyav() -> Any:
-    """Imports PyAV, which decodes videos."""
+    """Imports and returns PyAV, which decodes and encodes videos."""
     return load("av", needed="video")

@@ -65,10 +65,10 @@ class LensCamera:
         return not self.fisheye and not self.distortion.any()
 
     def pinhole(self, intrinsics: Float | None = None) -> Camera:
-        """Returns a pinhole camera at the same pose, with the given intrinsics or the lens's own.
+        """Returns a pinhole camera with the same pose, and with the given intrinsics or those of the lens.
 
         Raises:
-            CameraError: the camera is not valid.
+            CameraError: if the camera is not valid.
         """
         k = self.intrinsics if intrinsics is None else intrinsics
         return Camera(self.name, k, self.world_to_camera, self.width, self.height)
@@ -95,7 +95,7 @@ def lens_camera(
         source: file name, for messages.
 
     Raises:
-        CaptureError: the model is not supported, or the camera is not valid.
+        CaptureError: if the model is not supported, or the camera is not valid.
     """
     if model not in MODELS:
         raise CaptureError(

@@ -1,4 +1,4 @@
-"""`open_source`: opens a capture in any supported layout, recognized by the files in its folder."""
+"""Opens captures in any supported layout, which is recognized by the files in the folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PicturesFrom = Literal["images", "videos", "named"]
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Options for reading a capture, shared by all commands and studies; each is an argument of `open_source`."""
+    """Options for reading a capture, shared by all commands and studies. Each is an argument of `open_source`."""
 
     calibration: Path | None = None
     pictures: PicturesFrom | None = None
@@ -40,7 +40,7 @@ class CaptureOptions:
     encoding: Encoding = "jpeg"
 
     def open(self, folder: Path | str, **more: Any) -> Capture:
-        """Opens a capture with these options; `more` is also passed to `open_source` and takes precedence."""
+        """Opens a capture with these options. Arguments in `more` are passed to `open_source` and take precedence."""
         return open_source(folder, **(asdict(self) | more))
 
     @property
@@ -79,7 +79,7 @@ def open_source(
         calibration: transforms.json, COLMAP model folder, or calibration file of another tool
             (`client/importers/formats/`); None to search the folder.
         pictures: source of the images: `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
-            names. None to use the named files if there are several per camera, otherwise whichever exist.
+            names. None to use the named files if there are several per camera, otherwise the source that exists.
         fps: frame rate that overrides the files; None for the files' frame rate, or 30 if they specify none.
         encoding: format in which undistorted images and video frames are encoded for sending or writing.
         use_masks: whether to use the masks in `masks/` (`seg/`).
@@ -90,8 +90,8 @@ def open_source(
             None to reject such images.
 
     Raises:
-        CaptureError: the layout is unknown, or a file is invalid; the message names the problem.
-        MissingExtraError: undistortion or video decoding needs a package from the extra `importers`.
+        CaptureError: if the layout is unknown, or a file is invalid. The message names the problem.
+        MissingExtraError: if undistortion or video decoding needs a package from the extra `importers`.
 
     >>> capture = open_source(folder)
     >>> capture.rig.names, capture.frame_count
@@ -161,8 +161,8 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
     The search order is transforms.json, a COLMAP model in one of the usual places, then a single file of another tool.
 
     Raises:
-        CaptureError: there is no calibration, there are several, or it cannot be read.
-        MissingExtraError: the format needs a package from the extra `importers`.
+        CaptureError: if there is no calibration, there are several, or the calibration cannot be read.
+        MissingExtraError: if the format needs a package from the extra `importers`.
     """
     if given is not None:
         if given.is_file() and given.suffix == ".json":
@@ -188,7 +188,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
 
 
 def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) -> Calibration:
-    """Returns the calibration with a remark that lists other calibrations in the folder, which are not read."""
+    """Returns the calibration with a remark that lists the other calibrations in the folder, which are not read."""
     if not others:
         return found
     listed = ", ".join(str(path.relative_to(folder)) for path in others)

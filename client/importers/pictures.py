@@ -1,7 +1,7 @@
 """Frames from image files: one folder per camera, or files listed in the calibration. Requires only numpy and Pillow.
 
-In ``images/<camera>/<frame>.jpg``, frames are in natural order of their names. All images of a frame have the same
-name, with any extension.
+The frames in ``images/<camera>/<frame>.jpg`` are in natural order of their names. All images of a frame have the same
+name, but may have different extensions.
 """
 
 from __future__ import annotations
@@ -22,10 +22,15 @@ SHOWN = 3
 
 
 class PictureFiles:
-    """Image files of T frames for each camera; all images of a camera have the size of the first one.
+    """Reader for image files, with one file per camera and frame. All images of a camera must have the same size.
+
+    Args:
+        calibration: calibration of the cameras.
+        files: image files of each frame [T], keyed by camera name.
+        times: time of each frame in seconds; empty if unknown.
 
     Raises:
-        CaptureError: the first image of a camera cannot be read.
+        CaptureError: if the first image of a camera cannot be read.
     """
 
     fps: float | None = None
@@ -50,19 +55,19 @@ class PictureFiles:
         return self._files[0][camera]
 
     def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image file, or None if the service does not accept its format."""
+        """Returns the image file of a camera and frame, or None if the service does not accept its format."""
         path = self._files[index][camera]
         return path if path.suffix.lower() in SENT else None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Decodes an image, [H, W, 3]."""
+        """Returns the decoded image [H, W, 3] of a camera and frame."""
         return decode_image(self._files[index][camera], size=self.sizes[camera])
 
     def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
         """Checks that masks and images have the same frame names.
 
         Raises:
-            CaptureError: an image has no mask, or a mask has no image.
+            CaptureError: if an image has no mask, or a mask has no image.
         """
         for index in range(max(len(masks), len(self._files))):
             picture = next(iter(self._files[index].values())) if index < len(self._files) else None
@@ -78,7 +83,7 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "images") ->
     """Returns the files in ``root/<camera>/`` for each frame [T], keyed by camera name.
 
     Raises:
-        CaptureError: a camera has no folder, or a folder lacks a frame that another folder has.
+        CaptureError: if a camera has no folder, or a folder lacks a frame that another folder has.
     """
     by_camera: dict[str, dict[str, Path]] = {}
     for camera in calibration.names:
@@ -119,12 +124,14 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
 
 
 def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
-    """Returns the files listed in the calibration for each frame [T], keyed by camera name, and the times if given.
+    """Returns the files listed in the calibration for each frame [T], keyed by camera name, and the frame times.
 
-    Frame t consists of the t-th image of each camera.
+    Frame t consists of the t-th image of each camera. Times are in seconds, and empty if any of them is unknown or if
+    there is only one frame.
 
     Raises:
-        CaptureError: a file is missing, cameras have different numbers of images, or the times within a frame differ.
+        CaptureError: if a file is missing, cameras have different numbers of images, or the times within a frame
+            differ.
     """
     counts = {camera: len(views) for camera, views in calibration.views.items()}
     most = max(counts, key=lambda camera: counts[camera])

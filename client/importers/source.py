@@ -28,7 +28,7 @@ JPEG_QUALITY = 95
 
 
 class RawReader(Protocol):
-    """Reads the original, distorted images from files or videos."""
+    """Reader for the original, distorted images in files or videos."""
 
     @property
     def frame_count(self) -> int:
@@ -53,26 +53,26 @@ class RawReader(Protocol):
         """Returns the first file of a camera, for messages."""
 
     def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image file, or None if there is none in a format that the service accepts."""
+        """Returns the image file of a camera and frame, or None if there is none that the service accepts."""
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Decodes an image, [H, W, 3]."""
+        """Returns the decoded image [H, W, 3] of a camera and frame."""
 
 
 class ImportedPictures:
-    """Undistorted images of a calibrated rig; implements `PictureReader`.
+    """Reader for the undistorted images of a calibrated rig, which implements `PictureReader`.
 
-    Image files of cameras without distortion are passed through unchanged; all other images are re-encoded.
+    Image files of cameras without distortion are passed through unchanged. All other images are re-encoded.
 
     Args:
         calibration: calibration that matches the image sizes of `raw` (see `fit_to_pictures`).
         raw: reader of the original images of all cameras.
         masks: mask files for each frame [T], keyed by camera name; empty if there are no masks.
-        encoding: format of re-encoded images; JPEG uses quality 95 without chroma subsampling.
+        encoding: format of re-encoded images. JPEG uses quality 95 without chroma subsampling.
 
     Raises:
-        CaptureError: a lens cannot be undistorted.
-        MissingExtraError: a lens has distortion and OpenCV is not installed.
+        CaptureError: if a lens cannot be undistorted.
+        MissingExtraError: if a lens has distortion and OpenCV is not installed.
     """
 
     def __init__(
@@ -119,7 +119,11 @@ class ImportedPictures:
         return undistorter.mask(decode_mask(self._masks[index][camera], size=size))
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the original file, or the undistorted image re-encoded; 16-bit images are rounded to 8 bits."""
+        """Returns the original image file, or the undistorted image re-encoded, as bytes.
+
+        The original is used if the service accepts its format and the camera has no distortion. 16-bit images are
+        rounded to 8 bits.
+        """
         if self._undistorters[camera].lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
@@ -134,12 +138,13 @@ class ImportedPictures:
 def fit_to_pictures(
     calibration: Calibration, raw: RawReader, size_mismatch: SizeMismatch | None
 ) -> tuple[Calibration, list[str]]:
-    """Adapts the calibration to the actual size of the images.
+    """Adapts a calibration to the actual size of the images.
 
-    Returns the adapted calibration, and a remark for each camera whose image size differs from the calibrated one.
+    Returns:
+        The adapted calibration, and a remark for each camera whose image size differs from the calibrated size.
 
     Raises:
-        CaptureError: the aspect ratio of images differs from the calibrated one, and `size_mismatch` is not given.
+        CaptureError: if the aspect ratio of images differs from the calibrated one, and `size_mismatch` is not given.
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:
@@ -161,7 +166,7 @@ def check_times(name: str, times: Sequence[float]) -> None:
     """Checks that the frame times [T] are strictly increasing.
 
     Raises:
-        CaptureError: a frame is not later than the previous one; the message names it.
+        CaptureError: if a frame is not later than the previous one. The message names the frame.
     """
     for index, (before, now) in enumerate(pairwise(times), 1):
         if now <= before:
@@ -171,7 +176,7 @@ def check_times(name: str, times: Sequence[float]) -> None:
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:
-    """Encodes an image or mask as the bytes of an image file."""
+    """Encodes an image or mask, and returns the bytes of the image file."""
     if encoding == "png":
         return imageio.imwrite("<bytes>", picture, extension=".png", compress_level=1)
     return imageio.imwrite("<bytes>", picture, extension=".jpg", quality=JPEG_QUALITY, subsampling=0)

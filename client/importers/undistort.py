@@ -1,11 +1,11 @@
-"""Undistorts images of perspective and fisheye lenses with OpenCV, to pinhole images with the same pose and size.
+"""Undistorts images of perspective and fisheye lenses to pinhole images with the same pose and size, using OpenCV.
 
-The pinhole camera covers the largest region with the image's aspect ratio in which every pixel was seen, so there are
-no black corners. It keeps the lens's pixel aspect ratio; the principal point follows from the region. If the distortion
-polynomial decreases before a corner, the field of view is narrowed to the rays on which the polynomial increases.
+The pinhole camera keeps the pixel aspect ratio of the lens and covers only rays that the lens saw, so there are no
+black corners. Its principal point follows from this region. If the distortion polynomial decreases before a corner, the
+field of view is narrowed to the rays for which the polynomial increases.
 
 OpenCV puts the centre of the first pixel at (0, 0), whereas this project and COLMAP put it at (0.5, 0.5). Principal
-points passed to OpenCV are therefore reduced by half a pixel; otherwise images would be shifted by half a pixel.
+points passed to OpenCV are therefore reduced by half a pixel. Otherwise, images would be shifted by half a pixel.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDEST_DEGREES = 120.0
-"""Maximum field of view of a pinhole camera in degrees; a wider one would stretch a fisheye image too much."""
+"""Maximum field of view of a pinhole camera in degrees. A wider one would stretch a fisheye image too much."""
 BORDER_POINTS = 64
 TOLERANCE_PIXELS = 0.01
-"""Maximum distance of the pinhole's border outside the image, in pixels; interpolation hides such distances."""
+"""Maximum distance of the pinhole's border outside the image, in pixels. Interpolation hides such distances."""
 NARROWING = 1.005
 """Factor by which the focal length grows per step while a lens with non-monotonic distortion is cropped."""
 MOST_NARROWED = 50.0
-"""Multiple of the lens's focal length at which the search for a pinhole camera is abandoned."""
+"""Maximum focal length in the search for a pinhole camera, as a multiple of the lens's focal length."""
 LEAST_KEPT = 0.25
-"""Minimum fraction of the image that must remain after cropping; below it, the calibration must be wrong."""
+"""Minimum fraction of the image that must remain after cropping. A smaller one indicates a wrong calibration."""
 HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Undistorter:
-    """Undistorts the images of one camera. A lens without distortion needs neither processing nor OpenCV.
+    """Undistorter for the images of one camera. Images without distortion are returned unchanged, without OpenCV.
 
     Args:
         lens: calibrated camera with lens distortion.
 
     Raises:
-        CaptureError: less than a quarter of the image can be undistorted.
-        MissingExtraError: OpenCV is needed but not installed.
+        CaptureError: if less than a quarter of the image can be undistorted.
+        MissingExtraError: if OpenCV is needed but not installed.
     """
 
     lens: LensCamera
@@ -60,7 +60,7 @@ class Undistorter:
 
     @cached_property
     def remark(self) -> str | None:
-        """Message about a lens that is cropped because its distortion is not monotonic; None for other lenses."""
+        """Message about a lens that is cropped because its distortion is not monotonic, or None for other lenses."""
         if self.lens.is_pinhole or self._view.kept is None:
             return None
         return (
@@ -93,7 +93,7 @@ class Undistorter:
         return np.asarray(inside)
 
     def picture(self, picture: Picture) -> Picture:
-        """Undistorts an image [H, W, 3] of the lens to an image [H, W, 3] of the pinhole camera.
+        """Undistorts an image [H, W, 3] of the lens, and returns an image [H, W, 3] of the pinhole camera.
 
         Uses Lanczos interpolation, which keeps painted dots within 0.03 pixels of their true position. Cubic
         interpolation shifts them by up to 0.08 pixels, and linear interpolation blurs the image.
@@ -118,7 +118,7 @@ class Undistorter:
 
 
 def _shifted(intrinsics: Float) -> Float:
-    """Returns the intrinsics for OpenCV's pixel coordinates, whose pixel centres are at integers."""
+    """Returns the intrinsics for OpenCV's pixel coordinates, in which pixel centres are at integers."""
     shifted = intrinsics.copy()
     shifted[:2, 2] -= HALF
     return shifted
@@ -138,7 +138,7 @@ class _View:
 
 
 def _inscribed(lens: LensCamera) -> _View:
-    """Returns a pinhole camera whose entire image the lens saw; it keeps the lens's pixel aspect ratio."""
+    """Returns a pinhole camera that keeps the pixel aspect ratio of the lens and covers only rays that the lens saw."""
     curve = DistortionCurve.of(lens)
     left, top, right, bottom = _inner_rectangle(lens, curve)
     fx, fy = lens.intrinsics[0, 0], lens.intrinsics[1, 1]
@@ -154,7 +154,7 @@ def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
     """Narrows a pinhole camera about the lens's axis until the distortion polynomial increases on its entire image.
 
     Raises:
-        CaptureError: too little of the image remains.
+        CaptureError: if too little of the image remains.
     """
     border, size = np.concatenate(list(_edges(lens).values())), np.array([lens.width, lens.height])
     kept = 0.0
@@ -176,7 +176,7 @@ def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
 
 
 def _edges(lens: LensCamera) -> dict[str, Float]:
-    """Returns the pixels [P, 2] along each edge of the lens's image, in order around the image."""
+    """Returns pixels [P, 2] along each edge of the lens's image, keyed by edge, in order around the image."""
     x, y = (np.linspace(0, length, BORDER_POINTS) for length in (lens.width, lens.height))
     return {
         "top": np.stack([x, np.zeros_like(x)], axis=-1),
@@ -189,8 +189,11 @@ def _edges(lens: LensCamera) -> dict[str, Float]:
 def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, float, float, float]:
     """Returns (left, top, right, bottom), at distance 1, of a rectangle inside the region that the lens saw.
 
-    Each side lies at the innermost point of the corresponding undistorted image edge. If the distortion is
-    not monotonic, `_within` crops the corners afterwards.
+    Each side lies at the innermost point of the corresponding undistorted image edge. If the distortion is not
+    monotonic, `_within` crops the corners afterwards.
+
+    Raises:
+        CaptureError: if the rectangle is empty.
     """
     limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.max_radius)
     rays = {side: undistort_pixels(lens, pixels, curve) for side, pixels in _edges(lens).items()}

@@ -22,15 +22,15 @@ from scas4d_core.captures.images import mixed_colours
 
 ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
 RATE_TOLERANCE = 1e-3
-"""Maximum relative difference between the frame rates of two cameras, about that between 29.97 and 30."""
+"""Maximum relative difference between the frame rates of two cameras, about the difference between 29.97 and 30."""
 NEAR = 8
-"""Maximum number of frames to decode forwards; for larger steps, seeking to a keyframe is usually faster."""
+"""Maximum number of frames to skip by decoding them. For larger steps, seeking to a keyframe is usually faster."""
 ALIKE = 0.05
 """Relative difference below which two frame intervals count as equal, because timestamps are rounded."""
 
 
 class Video:
-    """One video file.
+    """Reader for the frames of one video file.
 
     Attributes:
         times: [T] time of each frame in seconds, relative to the first.
@@ -39,8 +39,8 @@ class Video:
         grey: whether the pixel format is grayscale.
 
     Raises:
-        CaptureError: the file has no video stream, is damaged, or has no frame with a timestamp.
-        MissingExtraError: PyAV is not installed.
+        CaptureError: if the file has no video stream, is damaged, or has no frame with a timestamp.
+        MissingExtraError: if PyAV is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,18 +75,18 @@ class Video:
 
     @property
     def interval(self) -> float:
-        """Median interval between consecutive frames in seconds; dropped frames do not affect it."""
+        """Median interval between consecutive frames in seconds, which dropped frames do not affect."""
         return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
 
     def frame(self, index: int) -> Picture:
-        """Decodes frame `index`: [H, W, 3] sRGB values, read-only.
+        """Returns frame `index` as a read-only array [H, W, 3] of sRGB values.
 
-        Caches the most recent frame, and the most recent frame that was requested by stepping back. Scoring compares
-        every frame with frame 0; without this cache, each comparison would decode everything since the preceding
-        keyframe again.
+        The most recent frame and the most recent frame reached by stepping back are cached. Scoring compares every
+        frame with frame 0. Without this cache, each comparison would decode everything since the preceding keyframe
+        again.
 
         Raises:
-            CaptureError: the frame cannot be decoded, or the video's metadata rotates it.
+            CaptureError: if the frame cannot be decoded, or the video's metadata rotates it.
         """
         with self._lock:
             for cached in (self._last, self._kept):
@@ -133,10 +133,12 @@ class Video:
 
 
 class Videos:
-    """One video per camera, with a common frame rate and start time. The shortest one determines the number of frames.
+    """Reader for one video per camera, with a common frame rate and start time.
+
+    The shortest video determines the number of frames.
 
     Raises:
-        CaptureError: the frame rates differ, or the frame times of two videos are more than half a frame apart.
+        CaptureError: if the frame rates differ, or the frame times of two videos are more than half a frame apart.
     """
 
     def __init__(self, calibration: Calibration, files: Mapping[str, Path]) -> None:
@@ -186,15 +188,15 @@ class Videos:
         return None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Decodes an image, [H, W, 3]."""
+        """Returns the decoded image [H, W, 3] of a camera and frame."""
         return self._videos[camera].frame(index)
 
 
 def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
-    """Returns the path of ``folder/<camera>.mp4`` (or another extension in `ENDS`) for each camera.
+    """Returns the video of each camera, ``folder/<camera>.mp4`` or with another extension in `ENDS`, keyed by camera.
 
     Raises:
-        CaptureError: a camera has no video, or more than one.
+        CaptureError: if a camera has no video, or more than one.
     """
     there = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS)
     videos = {}

@@ -17,7 +17,7 @@ from scas4d_core.captures import Capture, CaptureError
 OnProgress = Callable[[str, int, int], None]
 
 UNEVEN = 0.1
-"""Maximum deviation from a constant frame rate, in frames; timestamps of videos are rounded."""
+"""Maximum deviation from a constant frame rate, in frames. It allows for rounded video timestamps."""
 
 
 def write_dynamic3dgs(
@@ -27,9 +27,10 @@ def write_dynamic3dgs(
     frames: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> None:
-    """Writes a capture: images to `ims/`, masks to `seg/`, cameras to `train_meta.json` and `test_meta.json`.
+    """Writes a capture in the Dynamic3DGaussians layout.
 
-    The camera files are written last, so an incomplete folder is not recognized as a capture.
+    Images are written to `ims/`, masks to `seg/`, points to `init_pt_cld.npz`, and cameras to `train_meta.json` and
+    `test_meta.json`. The camera files are written last, so an incomplete folder is not recognized as a capture.
 
     Args:
         source: capture to write; its test cameras are written to `test_meta.json`.
@@ -38,7 +39,7 @@ def write_dynamic3dgs(
         on_progress: callback that receives ("frames", done, total).
 
     Raises:
-        CaptureError: the folder is not empty, or the frames are not evenly spaced in time.
+        CaptureError: if the folder is not empty, or the frames are not evenly spaced in time.
 
     >>> from client.importers.open_source import open_source
     >>> write_dynamic3dgs(open_source(folder, test=("1",)), out, frames=2)
@@ -75,10 +76,10 @@ def write_dynamic3dgs(
 
 
 def _rate(source: Capture, count: int) -> float:
-    """Returns the frame rate, because the layout stores no individual times.
+    """Returns the frame rate, which the layout stores instead of individual times.
 
     Raises:
-        CaptureError: the frames are not evenly spaced in time.
+        CaptureError: if the frames are not evenly spaced in time.
     """
     times = np.array([source.time(index) for index in range(count)])
     if count < 2:
@@ -110,7 +111,7 @@ def _write_meta(
 
 
 def _one_or_all(sizes: list[int]) -> int | list[int]:
-    """Returns one size if all cameras share it, otherwise a list of sizes per camera, which extends the layout."""
+    """Returns the size shared by all cameras, or else a list of one size per camera. Such a list extends the layout."""
     return sizes[0] if len(set(sizes)) == 1 else sizes
 
 

@@ -17,8 +17,8 @@ from scas4d_core.engines.renderer import Renderer
 Device = Literal["cpu", "gpu"]
 
 WARP_DEVICE = "SCAS4D_WARP_DEVICE"
-"""Environment variable that selects the Warp device used for device "gpu". In tests, the value "cpu" runs the same
-kernels, slowly, without a GPU."""
+"""Environment variable with the name of the Warp device that device "gpu" uses. Tests set it to "cpu", which runs the
+same kernels, slowly, without a GPU."""
 
 
 class DeviceError(ValueError):
@@ -44,7 +44,7 @@ def gpu_fault() -> str | None:
 
 @cache
 def _hardware_fault(device: str) -> str | None:
-    """Returns the reason why no GPU can be used, or None. NVIDIA Warp is only imported if a driver is installed."""
+    """Returns the reason why no GPU can be used, or None. Imports NVIDIA Warp only if a driver is installed."""
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
@@ -124,6 +124,9 @@ def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
     Args:
         renderer: renderer that determines the device, background and limits.
         mask_weight: weight of the mask loss, which is added to the image loss and only affects the labels.
+
+    Raises:
+        TypeError: if there is no fit engine for this type of renderer.
     """
     from scas4d_core.engines.cpu.fit import CpuFitEngine
     from scas4d_core.engines.cpu.renderer import CpuRenderer

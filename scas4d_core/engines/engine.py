@@ -1,7 +1,7 @@
 """Interface between the update loop and the engine that runs it, with the data they exchange.
 
-The loop (``update.frame_update``) makes the decisions; the engine does the computation. One attempt to update a frame
-makes these calls, in order::
+The loop (``update.frame_update``) makes the decisions, and the engine does the computation. One attempt to update a
+frame makes these calls, in order::
 
     engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
     engine.load_views(views, probes)        # images of the frame
@@ -41,9 +41,9 @@ REPORT = "report"
 """Name of the stage in which an update compiles its report. The stage includes timings, colour shifts, I/O and
 publishing."""
 KEPT_PICTURES = 8
-"""Number of most recent views whose renderings are kept in the log for evaluation by effects."""
+"""Maximum number of views with a rendering in the log. Effects evaluate these renderings."""
 KEPT_ROWS = 128
-"""Approximate height of the renderings in the log; larger renderings are subsampled."""
+"""Approximate length in pixels of the shorter side of a rendering in the log. Larger renderings are subsampled."""
 
 
 class EngineError(ValueError):
@@ -98,12 +98,11 @@ class AttemptStart:
         position, rotation, scale: learning rates of Δp (metres), ΔR and Δs.
         colour, static_colour: learning rates of the RGB colours of moving and static Gaussians, respectively.
         beta1, beta2: Adam's decay rates.
-        samples: samples of the moving Gaussians, each [S] int64 indices in hierarchy order;
-            ``StepScalars.sample`` selects one.
+        samples: samples of the moving Gaussians, each with [S] int64 indices in hierarchy order.
+            ``StepScalars.sample`` selects one of them.
         gains: [cameras, 3] initial camera gains, in the plan's camera order, or None if gains are not estimated.
         curve: whether to compute terms that only affect the reported loss, not the state.
-        lap: callback that receives the name of each stage when the stage ends. Only engines that synchronize after
-            every stage call it.
+        lap: callback that receives the name of each stage when the stage ends. The stages depend on the engine.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -136,12 +135,12 @@ class StepScalars:
 
     Attributes:
         frozen: number of frozen layers, counted from the coarsest.
-        layers: learning rate factor of each layer; a layer with factor 0 is not updated.
+        layers: learning rate factor of each layer. A layer with factor 0 is not updated.
         own: learning rate factor of Δp, ΔR and Δs.
         colour, gloss: learning rate factors of the colours and the gloss.
         smooth_gloss: whether to average the gloss updates over neighbours after this step.
         rigidity: weight of the rigidity loss in this iteration.
-        sample: index into ``AttemptStart.samples``; the neighbour terms are evaluated for these Gaussians.
+        sample: index of the sample in ``AttemptStart.samples`` for which the neighbour terms are evaluated.
         keep_pictures: whether to keep the renderings of this iteration in the log.
     """
 
@@ -223,7 +222,7 @@ class IterationLog:
 
 
 class UpdateEngine(Protocol):
-    """Runs the updates of one scene on one device and owns the required memory.
+    """Interface of an engine that runs the updates of one scene on one device.
 
     Attributes:
         name: name of the engine, used in messages.
@@ -233,10 +232,10 @@ class UpdateEngine(Protocol):
 
     @property
     def renderer(self) -> Renderer:
-        """Returns a renderer for states, with the background and limits of the plan."""
+        """Renderer for states, with the background and limits of the plan."""
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """Allocates buffers and compiles kernels for a plan.
+        """Allocates buffers and compiles kernels for a plan and a structure.
 
         Raises:
             EngineError: if the engine does not support a feature that the plan requires.
@@ -246,12 +245,12 @@ class UpdateEngine(Protocol):
         """Loads the images of a frame. Views that are already loaded are reused.
 
         Args:
-            views: training views; ``iterate`` refers to them by index.
-            probes: views of the same cameras that are used to compare states; ``probe`` refers to them by index.
+            views: training views. ``iterate`` refers to them by index.
+            probes: views of the same cameras that are used to compare states. ``probe`` refers to them by index.
         """
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads Θ_{t−1} and discards any motion and learned colours."""
+        """Loads Θ_{t−1} and discards learned colours and gloss. The next call must be ``set_tables``."""
 
     def set_tables(self, tables: Tables) -> None:
         """Sets the parameters of the deformation."""
@@ -263,15 +262,15 @@ class UpdateEngine(Protocol):
         """Runs one iteration: deform, render, compare, backward, Adam step.
 
         Args:
-            views: indices of the views to render; image and mask losses are averaged over them.
+            views: indices of the views to render. Image and mask losses are averaged over them.
             step: scalars of this iteration.
         """
 
     def leave_out(self, views: Sequence[int]) -> None:
-        """Excludes the views with the given indices from the rest of the attempt, and freezes their cameras' gains."""
+        """Freezes the camera gains of the views with the given indices, which the attempt no longer renders."""
 
     def wait(self, iteration: int) -> None:
-        """Waits until the device has nearly reached an iteration, so that host timings reflect device work."""
+        """Waits until the device has almost caught up with an iteration. Host timings then reflect device work."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """Returns the image loss of a state on each of the selected probe views.
@@ -303,7 +302,11 @@ class UpdateEngine(Protocol):
         """
 
     def exposures(self) -> Mapping[str, Array]:
-        """Returns the current exposure of each camera with views, keyed by camera name: [C, 2] gain and offset."""
+        """Returns the current exposures ([C, 2] gain and offset) of all cameras with views, keyed by camera name."""
 
     def gains(self) -> Array:
-        """Returns the camera gains [cameras, 3], including measurements since the last complete round."""
+        """Returns the camera gains [cameras, 3], including measurements since the last complete round.
+
+        Raises:
+            ValueError: if gains are not estimated.
+        """

@@ -1,8 +1,9 @@
-"""Camera gains and the resulting exposures. A gain is one factor per channel on linear light, before the sRGB curve.
+"""Camera gains, and their conversion to exposures.
 
-On the power segment of the sRGB curve, s = 1.055 L^(1/2.4) − 0.055. Scaling the light by γ maps a value s to
-a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. The gain a of a camera is
-therefore estimated as the median over pixels of (image + 0.055) / (rendering + 0.055).
+Suppose that a camera scales the linear light of a channel by a factor γ, before the sRGB curve. On the power segment of
+the curve, s = 1.055 L^(1/2.4) − 0.055. There, a value s becomes a s + 0.055 (a − 1), with the gain a = γ^(1/2.4). In
+other words, s + 0.055 is multiplied by a. The gain is therefore estimated as the median over pixels of
+(image + 0.055) / (rendering + 0.055).
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ Array = NDArray[np.float32]
 FOOT = np.float32(0.055)
 """Offset of the power segment of the sRGB curve; see the module docstring."""
 MIDDLE = np.float32(0.5)
-"""Pixel value in 0…1 at which a gain and offset from frame 0 are converted to an equivalent gain."""
+"""Pixel value, in 0…1, for which ``exposure_to_gain`` returns an equivalent gain."""
 LOOKED_AT = 4096
-"""Approximate number of pixels sampled per image on a regular grid; more pixels do not change the median."""
+"""Approximate number of pixels sampled per image on a regular grid. More pixels would hardly change the median."""
 DARK, SATURATED = 0.05, 0.985
 """Range of pixel values in 0…1 used to measure a gain. Darker pixels are noisy and lie on the linear segment."""
 PIXELS = 100
-"""Minimum number of usable pixels per channel; with fewer, the camera's gain is not updated."""
+"""Minimum number of usable pixels per channel. With fewer, the camera's gain is not updated."""
 SHARE = 0.5
 """Fraction of the difference between measured and current gains that is applied per round. An update of 100 iterations
 has three to eight rounds, which is enough to follow a drift. A single outlier round has little effect."""
 LARGEST = 2.0
-"""Maximum gain a; the minimum is its inverse. A gain of 2 corresponds to about 5 times the light."""
+"""Maximum gain a. The minimum is its inverse. A gain of 2 corresponds to about 5 times the light."""
 CAMERAS = 4
 """Minimum number of measured cameras. With fewer, gains cannot be distinguished from colours that only a few cameras
 see."""
 ENOUGH = 0.5
-"""Minimum fraction of the rig's cameras needed to update the gains; with few cameras, local errors bias the gains."""
+"""Minimum fraction of the rig's cameras needed to update the gains. With fewer, local errors would bias the gains."""
 
 
 def gain_to_exposure(gain: Array) -> Array:
@@ -52,7 +53,10 @@ def exposure_to_gain(exposure: Array) -> Array:
 
 
 def measured_gain(picture: Array, shown: Array) -> Array:
-    """Returns the gain [3] of an image [3, H, W] relative to its rendering before exposure; NaN if not measurable."""
+    """Returns the gain [3] of an image [3, H, W] relative to its rendering before exposure.
+
+    A channel with fewer than ``PIXELS`` usable pixels is NaN.
+    """
     gain = np.full(3, np.nan, np.float32)
     every = max(1, int(sqrt(picture[0].size / LOOKED_AT)))
     for channel in range(3):
@@ -66,8 +70,8 @@ def measured_gain(picture: Array, shown: Array) -> Array:
 def update_gains(gains: Array, measured: dict[int, Array], cameras: int) -> Array | None:
     """Returns the updated gains after a round over the cameras, or None if there are too few measurements.
 
-    Each gain moves towards its measured value by the fraction ``SHARE`` of their difference. The mean logarithm of the
-    gains is preserved, because a change common to all cameras is a change in lighting.
+    The logarithm of each gain moves towards its measured value by the fraction ``SHARE`` of the difference. The mean
+    logarithm of the gains is preserved, because a change common to all cameras is a change in lighting.
 
     Args:
         gains: [cameras of the rig, 3] current gains.

@@ -1,7 +1,7 @@
 """Interface between the optimization loop of a fit and the engine that runs it, with the data they exchange.
 
-The loop (``fit.gaussian_fit``) makes the decisions; the engine does the computation. ``choose.fit_engine_of`` creates
-an engine::
+The loop (``fit.gaussian_fit``) makes the decisions, and the engine does the computation. ``choose.fit_engine_of``
+creates an engine::
 
     engine.load_views(views, fixed)      # training images, and the fixed Gaussians of each view
     engine.load_table(table)             # parameters and moments; call again after changing them on the host
@@ -36,7 +36,8 @@ class RenderingStatistics:
     """Per-Gaussian statistics for density control, accumulated since rows were last added or removed.
 
     Attributes:
-        screen_gradients: [N] sum of screen-space gradient norms, in units of half the image size.
+        screen_gradients: [N] sum of the norms of the gradients with respect to the projected mean, with the mean
+            measured in units of half the image size.
         rendered: [N] number of renderings in which the Gaussian was visible.
         factors: [N, 3, 3] covariance factors rendered in the last iteration, before its Adam step.
     """
@@ -56,7 +57,7 @@ class FitGloss(Protocol):
 
     Attributes:
         gloss: [N, 3] normal of each Gaussian, scaled by its gloss strength.
-        environment: environment light; see ``Gaussians``.
+        environment: [ROWS, 3] environment; see ``Gaussians``.
     """
 
     gloss: Array
@@ -93,9 +94,9 @@ class FitScalars(NamedTuple):
     """Learning rates and options of one iteration.
 
     Attributes:
-        rates: [15] float32 Adam learning rate of each column; a column with rate 0 is not updated.
+        rates: [15] float32 Adam learning rate of each column. A column with rate 0 is not updated.
         gloss: factor that scales the learning rates of the gloss.
-        colour_shift: whether to measure the colour shift.
+        colour_shift: whether to compute ``FitLoss.colour_shift``.
     """
 
     rates: Array
@@ -110,8 +111,8 @@ class FitLoss(NamedTuple):
         view: index of the rendered view.
         loss: weighted sum of image and mask loss.
         psnr: PSNR of the rendering, in dB.
-        exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset; valid until the
-            next iteration.
+        exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset. The array may be a
+            buffer that the next iteration overwrites.
         colour_shift: [3] mean of the training image minus mean of the rendering, or None if it was not requested.
     """
 
@@ -123,19 +124,19 @@ class FitLoss(NamedTuple):
 
 
 class FitEngine(Protocol):
-    """Runs the iterations of one fit on one device."""
+    """Interface of an engine that runs the iterations of one fit on one device."""
 
     @property
     def renderer(self) -> Renderer:
-        """Returns a renderer for states that shares its buffers with the iterations."""
+        """Renderer for states. An iteration may overwrite its results."""
 
     def load_views(self, views: Sequence[TrainingView], fixed: Sequence[Gaussians] = ()) -> None:
-        """Loads the training images of the fit. Each iteration reads the current exposure of its view.
+        """Loads the training images of the fit. The caller may change their exposures in place between iterations.
 
         Args:
-            views: training views; ``iterate`` refers to them by index.
-            fixed: Gaussians that are rendered together with the fitted ones but not updated, for each view; empty if
-                there are none.
+            views: training views. ``iterate`` refers to them by index.
+            fixed: for each view, the Gaussians that are rendered together with the fitted ones but not updated. The
+                sequence is empty if there are none.
         """
 
     def load_table(self, table: FitTable) -> None:
@@ -146,7 +147,12 @@ class FitEngine(Protocol):
         """
 
     def iterate(self, view: int, scalars: FitScalars) -> FitLoss:
-        """Runs one iteration: renders a view, computes and backpropagates its loss, and takes an Adam step."""
+        """Runs one iteration: renders a view, computes and backpropagates its loss, and takes an Adam step.
+
+        Args:
+            view: index of the training view to render.
+            scalars: learning rates and options of the iteration.
+        """
 
     def table(self) -> FitTable:
         """Returns the current parameter table."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Freedom:
-    """Selects which columns of the cluster tables and per-Gaussian deltas are optimized; all others stay exactly 0.
+    """Selection of the columns of the cluster tables and deltas that are optimized. All others stay exactly 0.
 
     Attributes:
         cluster_rotation: whether r is free for the clusters in all layers.
         cluster_translation: whether t is free for the clusters in all layers.
-        cluster_scaling: whether c and s are free for the clusters of all layers.
+        cluster_scaling: whether c and s are free for the clusters in all layers.
         own_position, own_rotation, own_scale: whether Δp, ΔR and Δs of each Gaussian are free.
         prediction: whether to initialize the free parameters with the previous motion instead of 0.
 

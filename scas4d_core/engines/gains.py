@@ -1,4 +1,4 @@
-"""Estimation of camera gains during an update. Each round measures the gain of every camera once."""
+"""Estimation of camera gains during an update, in rounds that measure each camera at most once."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ class GainEstimator:
         gains: [cameras, 3] initial gains.
         rows: maps each camera name to its row in ``gains``.
         views: training views, whose exposures are updated in place.
+
+    Attributes:
+        gains: [cameras, 3] current gains.
     """
 
     def __init__(self, gains: Array, rows: Mapping[str, int], views: Sequence[TrainingView]) -> None:
@@ -33,7 +36,7 @@ class GainEstimator:
         self._views = [view for view in self._views if view not in views]
 
     def record_rendering(self, view: TrainingView, shown: Array) -> None:
-        """Measures a camera's gain from a rendering. If the camera was already measured, a new round starts first.
+        """Measures a camera's gain from a rendering. A second measurement of the same camera starts a new round.
 
         Args:
             view: training view that was rendered.
@@ -45,7 +48,7 @@ class GainEstimator:
         self._measured[row] = measured_gain(view.target, shown)
 
     def finish_round(self) -> None:
-        """Ends the current round and updates the gains and exposures from its measurements."""
+        """Ends the current round, and updates the gains and exposures if it has enough measurements."""
         settled = update_gains(self.gains, self._measured, len(self._views))
         if settled is not None:
             self.gains = settled

@@ -10,16 +10,17 @@ from scas4d_core.cameras import Camera, WorldFrame, rig_inside
 
 
 class Limits(NamedTuple):
-    """Rasterizer constants; two rasterizers only agree if they use the same values.
+    """Rasterizer constants. Two rasterizers produce the same image only if their constants are equal.
 
     Attributes:
-        alpha_floor: minimum alpha. A Gaussian covers exactly the pixels where its alpha is at least this value; lower
-            values are invisible in 8-bit images. Culling to this support is therefore exact.
+        alpha_floor: minimum alpha. A Gaussian covers exactly the pixels where its alpha is at least this value, so
+            culling to this support is exact. Lower values are invisible in 8-bit images.
         alpha_cap: upper bound on a Gaussian's alpha, which bounds 1/(1 − alpha) in the backward pass.
-        transmittance_stop: blending of a pixel stops before its transmittance would fall below this value.
-        low_pass: value added to the diagonal of the projected covariance so that a Gaussian covers at least about one
-            pixel, in pixels².
-        near: depth of the near plane, in metres; closer Gaussians are culled.
+        transmittance_stop: minimum transmittance. Blending of a pixel stops at the Gaussian that would reduce the
+            transmittance below this value.
+        low_pass: value added to the diagonal of the projected covariance, in pixels². It makes each Gaussian cover at
+            least about one pixel.
+        near: depth of the near plane, in metres. Closer Gaussians are culled.
         tangent_margin: margin around the image within which the projection's Jacobian is exact, as a fraction of half
             the image width (for x/z) or height (for y/z). Beyond it, the Jacobian is evaluated at a clamped position.
     """
@@ -55,9 +56,12 @@ def scene_limits(near: float | str, rig_radius: float) -> Limits:
 
 
 def rig_limits(near: float | str, world: WorldFrame, cameras: Sequence[Camera]) -> Limits:
-    """Returns the rasterizer constants for a scene, given its cameras in user world coordinates.
+    """Returns the rasterizer constants for a scene, given its cameras.
 
-    See ``scene_limits``.
+    Args:
+        near: see ``scene_limits``.
+        world: transform from the user's world to the internal world.
+        cameras: cameras of the rig, in user world coordinates.
 
     >>> import numpy as np
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)

@@ -1,4 +1,4 @@
-"""Plan of a scene's updates: a plain record whose fields the effects set when they register."""
+"""Plan of a scene's updates, which effects modify when they register, and structure of the moving Gaussians."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Array = NDArray[np.float32]
 Plane = tuple[float, float, float, float]
 
 MAX_SCALE = 0.02
-"""Axis length in metres up to which the scale loss is always 0 (paper, scale loss); see ``Structure.length_bounds``."""
+"""Axis length in metres up to which the scale loss is always 0, as in the paper. See ``Structure.length_bounds``."""
 
 
 @dataclass(eq=False)
 class ColourPlan:
-    """Selects which colours an update learns.
+    """Selection of the colours that an update learns.
 
     Attributes:
         moving, static: whether the colours of moving and static Gaussians are learned.

@@ -1,4 +1,4 @@
-"""Interface for all rendering outside an iteration: checks, births, frame 0 and client views."""
+"""Interface for rendering outside iterations, for example for checks, births, frame 0 and client views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float32]
 CHANNELS = 4
 """Number of feature channels rendered per pass: red, green, blue, label."""
 BLOCK = 4
-"""Side length of a block in pixels; see ``Renderer.reached``."""
+"""Side length in pixels of the blocks in ``Renderer.reached``."""
 
 
 class Picture(NamedTuple):
@@ -34,7 +34,7 @@ class Picture(NamedTuple):
 
 
 def psnr_of(squares: float, pixels: int) -> float:
-    """Returns the PSNR in dB, given the squared error summed over pixels and RGB; finite even if the error is 0.
+    """Returns the PSNR in dB, given the squared error summed over pixels and RGB. It is finite even if the error is 0.
 
     >>> round(psnr_of(0.03 * 64, pixels=64), 6)  # an error of 0.1 in every value
     20.0
@@ -77,10 +77,10 @@ class Gradients(NamedTuple):
 
 
 class Renderer(Protocol):
-    """Renders states of one scene, with its background and limits.
+    """Interface of a renderer for the states of one scene, with the scene's background and limits.
 
     The rendered colours include view-dependent gloss. If ``features`` [N, C] are given, they are rendered instead of
-    RGB and label; C must be a multiple of ``CHANNELS``.
+    RGB and label. C must be a multiple of ``CHANNELS``.
     """
 
     def render(
@@ -109,7 +109,7 @@ class Renderer(Protocol):
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """Returns [N, P] sums of ``planes`` [P, H, W] over all pixels, weighted by each Gaussian's blending weights.
 
-        P is at most 4. A plane of ones gives the number of pixels that each Gaussian covers.
+        P is at most 4. For a plane of ones, the sum is the Gaussian's total blending weight, in pixels.
         """
 
     def residuals(
@@ -121,11 +121,14 @@ class Renderer(Protocol):
             state: Gaussians to render.
             view: training view.
             learnt: [N] uint8 mask of the Gaussians whose sums are needed.
-            most: magnitude to which residuals are clipped; RGB values are in 0…1.
+            most: maximum magnitude of a residual, for RGB in 0…1. Larger residuals are clipped.
 
         Returns:
             [N, 3] weighted sums of the RGB residuals before exposure, and [N] sums of the weights, in pixels.
         """
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """Returns a padded [h, w] mask of the ``BLOCK``-pixel blocks that the supports of ``rows`` intersect."""
+        """Returns a mask [h, w] of the ``BLOCK``-pixel blocks that the supports of the Gaussians ``rows`` intersect.
+
+        The mask covers the image padded to a multiple of 32 pixels.
+        """

@@ -55,8 +55,8 @@ class TrainingView:
         name: name of the camera.
         camera: camera in kernel format.
         target: [C, H, W] float32 image, RGB in 0…1, followed by the mask if the frame has one. C is 3 or 4.
-        exposure: [C, 2] gain and offset of each channel; 1 and 0 for the mask.
-        source: [H, W, 3] uint8 image and [H, W] uint8 mask (or None) that ``target`` was converted from, if any.
+        exposure: [C, 2] gain and offset of each channel, which are 1 and 0 for the mask.
+        source: [H, W, 3] uint8 image and [H, W] uint8 mask (or None) from which ``target`` was converted, if any.
     """
 
     name: str
@@ -67,12 +67,12 @@ class TrainingView:
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:
-        """Mean RGB of the image [3], in 0…1; computed on first access."""
+        """Mean RGB [3] of the image in 0…1, computed on first access."""
         return means(self.target[:3])
 
     @cached_property
     def squares(self) -> Array:
-        """Mean colours [h, w, 3] of all complete ``SIDE``-pixel squares of the image; computed on first access."""
+        """Mean colours [h, w, 3] of all complete ``SIDE``-pixel squares of the image, computed on first access."""
         height, width = self.target.shape[1] // SIDE, self.target.shape[2] // SIDE
         part = self.target[:3, : height * SIDE, : width * SIDE]
         columns = part.reshape(3, height, SIDE, width * SIDE).sum(axis=2)  # five times faster with rows first
@@ -81,7 +81,7 @@ class TrainingView:
 
 
 def means(planes: Array) -> NDArray[np.float64]:
-    """Returns the mean [C] of each plane [C, H, W]. Rows are summed in float32 for speed (twice as fast)."""
+    """Returns the mean [C] of each plane [C, H, W]. Sums rows in float32, which is twice as fast."""
     _, height, width = planes.shape
     result: NDArray[np.float64] = planes.sum(axis=2).sum(axis=1, dtype=np.float64) / (height * width)
     return result

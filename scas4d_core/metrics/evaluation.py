@@ -6,11 +6,11 @@ These definitions complement those in ``scas4d_core.metrics``:
 - *Foreground* pixels are inside the mask of the test camera. *Changed* pixels differ by more than 0.1 in at least one
   channel from the ground-truth image of frame 0.
 - 3D tracks start at the ground-truth points in frame 0. 2D tracks start at the pixels of the moving points that are
-  visible in a test camera in frame 0, and use rendered depth; only frames where the point is visible are evaluated.
-- Parts are rendered with as many labels as the scene has foreground parts, and compared at pixels that show a part in
-  the ground truth.
+  visible in a test camera in frame 0. Each is evaluated only in frames where its point is visible.
+- Parts are rendered with as many labels as the scene has foreground parts. They are compared at the pixels that show a
+  part in the ground truth.
 - *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
-  evaluated frames. *Flicker* is the temporal standard deviation of the rendered values at these pixels, in levels.
+  evaluated frames. *Flicker* is the mean temporal standard deviation of the rendered values at these pixels, in levels.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
 
     Committed = Reconstruction | CommittedScene
-    """A scene in which the evaluated frames are committed."""
+    """A reconstruction or committed scene that contains the evaluated frames."""
 
 MOVING_SHARE = 0.01
-"""Distance from frame 0, as a fraction of the extent, up to which a ground-truth point is considered static."""
+"""Maximum distance of a static ground-truth point from its position in frame 0, as a fraction of the extent."""
 CHANGED = 0.1
-"""Difference from frame 0 in any channel, with values in 0…1, above which a pixel is considered changed."""
+"""A pixel has changed if any channel, in 0…1, differs from frame 0 by more than this threshold."""
 STILL_LEVELS = 6
-"""Maximum range of a still pixel's values in each channel, in 8-bit levels. Allows for noise in the true images."""
+"""Maximum range of a still pixel's true values in each channel, in 8-bit levels. It allows for image noise."""
 MIN_STILL = 500
 """Minimum number of still pixels over all test cameras for which flicker is reported."""
 
@@ -53,7 +53,7 @@ def measure_pictures(
 
     Args:
         reconstruction: reconstruction in which the frame is already committed.
-        capture: capture with masks, opened at the image scale to evaluate.
+        capture: capture with test cameras, opened at the image scale to evaluate.
         index: frame index.
         with_lpips: whether to also compute LPIPS, which requires torch.
 
@@ -88,7 +88,7 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
         indices: frame indices, starting with frame 0.
 
     Returns:
-        The scores. They are empty if there are fewer than two frames, or if no point moves.
+        The scores, or an empty dict if there are fewer than two frames or no point moves.
     """
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
@@ -137,7 +137,10 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
 
 
 def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Computes the part scores: adjusted Rand index, pooled over frames and labelled test cameras, and part count."""
+    """Computes the part scores: the part count, and the adjusted Rand index over all frames and labelled test cameras.
+
+    The scores are empty if there are fewer than two foreground parts, or if no test camera has labels.
+    """
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
     assert rig is not None
@@ -157,7 +160,10 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
 
 
 def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Returns the flicker, in 8-bit levels, and the number of still pixels over which it is averaged."""
+    """Computes the flicker, in 8-bit levels, and the number of still pixels over which it is averaged.
+
+    The flicker is None if there are fewer than ``MIN_STILL`` still pixels.
+    """
     rig = capture.test_rig
     assert rig is not None
     deviations: list[NDArray[Any]] = []
@@ -183,7 +189,7 @@ def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequen
 
 
 def render_parts(reconstruction: Committed, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Returns the part labels [H, W] of one camera in one frame."""
+    """Renders the part image [H, W] of a camera in one frame: 1 + the part label, or 0 for no part."""
     parts: NDArray[np.uint8] | None = reconstruction.render(camera, index, labels=labels).parts
     assert parts is not None  # labels were given
     return parts
@@ -196,7 +202,7 @@ def moving_points(points: NDArray[np.float64], extent: float) -> NDArray[np.bool
 
 
 def mean_scores(of: Iterable[Scores]) -> Scores:
-    """Averages each score over all entries in which it is available."""
+    """Returns the mean of each score over the entries in which it is available, or None if there are none."""
     table = list(of)
     names = dict.fromkeys(name for scores in table for name in scores)
     return {name: _mean([scores.get(name) for scores in table]) for name in names}
@@ -208,7 +214,7 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """Replaces non-finite values with None.
+    """Returns the value, or None if it is not finite.
 
     JSON does not support NaN, and a single infinity (identical pixels, all points lost) would make a mean infinite.
     """

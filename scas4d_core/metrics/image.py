@@ -1,6 +1,6 @@
 """Metrics that compare images with ground truth: PSNR, SSIM, FLIP and LPIPS.
 
-Images are [H, W, 3] arrays, either floats in 0…1 or uint8 in 0…255. As on a display, floats are first clamped to 0…1.
+Images are [H, W, 3] arrays, either floats in 0…1 or uint8 in 0…255. Floats are first clamped to 0…1, as on a display.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Score:
 
     Attributes:
         value: value of the metric, or None if it could not be computed.
-        reason: why the value is missing and how to fix it; empty if there is a value.
+        reason: why the value is missing, and how to obtain one. Empty if there is a value.
     """
 
     value: float | None
@@ -50,7 +50,7 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
         PSNR in dB. It is infinite for equal images, and NaN for an empty mask.
 
     Raises:
-        ValueError: if the shapes differ, or if values are not finite.
+        ValueError: if the shapes differ, or if an image has an invalid dtype or value.
 
     >>> truth = np.zeros((8, 8, 3))
     >>> round(psnr(truth + 0.1, truth), 6), psnr(truth, truth)
@@ -79,10 +79,10 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
         truth: [H, W, 3] ground-truth image.
 
     Returns:
-        SSIM; the maximum is 1, for equal images.
+        SSIM, which is 1 for equal images and lower for all others.
 
     Raises:
-        ValueError: if the shapes differ, or if values are not finite.
+        ValueError: if the shapes differ, or if an image has an invalid dtype or value.
 
     >>> picture = np.random.default_rng(0).random((32, 32, 3))
     >>> ssim(picture, picture), round(ssim(1 - picture, picture), 2)
@@ -100,17 +100,17 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
 
 
 def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
-    """Returns the mean LDR-ꟻLIP error (Andersson et al. 2020) at the recommended 67 pixels per degree; 0 means equal.
+    """Returns the mean LDR-ꟻLIP error (Andersson et al. 2020) at the recommended 67 pixels per degree.
 
     Args:
         image: [H, W, 3] rendered image in sRGB.
         truth: [H, W, 3] ground-truth image in sRGB.
 
     Returns:
-        The score. Its value is None if the flip_evaluator package is not installed.
+        The score, 0 for equal images. Its value is None if the flip_evaluator package is not installed.
 
     Raises:
-        ValueError: if the shapes differ, or if values are not finite.
+        ValueError: if the shapes differ, or if an image has an invalid dtype or value.
 
     >>> picture = np.full((16, 16, 3), 0.5)
     >>> flip(picture, picture)
@@ -133,7 +133,7 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
 
 
 def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Score:
-    """Returns the learned perceptual distance LPIPS (Zhang et al. 2018); 0 means equal. Nothing is downloaded.
+    """Returns the learned perceptual distance LPIPS (Zhang et al. 2018). No weights are downloaded.
 
     Args:
         image: [H, W, 3] rendered image.
@@ -141,10 +141,10 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
         backbone: "vgg", as reported for 3D Gaussian Splatting, or "alex".
 
     Returns:
-        The score. Its value is None if the lpips package or its weights are not installed.
+        The score, 0 for equal images. Its value is None if a required package or the weights are not installed.
 
     Raises:
-        ValueError: if the shapes differ, if values are not finite, or if the backbone is unknown.
+        ValueError: if the shapes differ, if an image has an invalid dtype or value, or if the backbone is unknown.
 
     >>> picture = np.full((64, 64, 3), 0.5)
     >>> score = lpips(picture, picture)

@@ -12,11 +12,10 @@ from sklearn.metrics import adjusted_rand_score
 def adjusted_rand_index(
     labels: NDArray[Any], truth: NDArray[Any], foreground: NDArray[np.bool_] | None = None
 ) -> float:
-    """Returns the agreement of two partitions of the foreground pixels, corrected for chance (Hubert and Arabie 1985).
+    """Returns the chance-corrected agreement between two partitions of the foreground (Hubert and Arabie 1985).
 
-    Pixels from several frames and cameras can be stacked and are then pooled, so a part must have the same label in all
-    of them. The label values themselves do not matter. Foreground pixels where no part was rendered count as a part of
-    their own.
+    Pixels from several frames and cameras can be stacked. They are then pooled, so each part must have the same label
+    throughout. The label values themselves do not matter. Foreground pixels without a rendered part count as one part.
 
     Args:
         labels: [...] rendered integer labels.

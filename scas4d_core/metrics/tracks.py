@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 ORACLE_RADIUS_PX = 10.0
-"""Radius around the ground-truth point in the first frame, in pixels, from the paper (section "Point-Tracking")."""
+"""Radius around a true point, in pixels, within which the oracle selects a candidate (paper, Point-Tracking)."""
 
 LOST_PERCENT = 2.0
-"""Median error of a part's points, in percent of the extent, above which the part is considered lost."""
+"""A part is lost if the median error of its points exceeds this threshold, in percent of the extent."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ def median_trajectory_error(
         counted: [T, Q] bool mask of the positions to evaluate, i.e. those visible in the camera. Tracks without such
             positions are ignored.
         diagonal: image diagonal in pixels.
-        query: frame in which the query points were given; excluded from the error.
+        query: index in T of the query frame, which is excluded from the error.
 
     Returns:
         Error in %, or NaN if there are no positions to evaluate.
 
     Raises:
-        ValueError: if the shapes differ.
+        ValueError: if the shapes differ, or if the diagonal is not positive.
 
     >>> truth = np.zeros((3, 1, 2))
     >>> tracks = truth + [[[0, 0]], [[3, 4]], [[3, 4]]]
@@ -82,19 +82,19 @@ def oracle_tracks(
     radius: float = ORACLE_RADIUS_PX,
     query: int = 0,
 ) -> NDArray[np.float64]:
-    """Returns oracle tracks as defined in the paper, which follow the best candidate near each point.
+    """Returns oracle tracks, which follow the best candidate near each point, as defined in the paper.
 
-    Among the candidates near a point in the query frame, the oracle selects the one with the smallest error. Because it
-    uses the ground truth, its error (``median_trajectory_error`` of these tracks) bounds what the centroids can achieve
-    and does not measure tracking. Report it together with the error without the oracle.
+    Among the candidates near a point in the query frame, the oracle selects the one with the smallest error. The oracle
+    uses the ground truth, so the ``median_trajectory_error`` of these tracks is a bound for the centroids and does not
+    measure tracking. Report it together with the error of the actual tracks.
 
     Args:
         candidates: [T, N, 2] positions of all Gaussian centroids in pixels, NaN behind the camera.
         truth: [T, Q, 2] true positions in pixels.
         counted: [T, Q] bool mask of the positions to evaluate.
-        radius: radius around the true point in the query frame, in pixels. If it contains no candidate, the nearest one
-            is used; the paper does not specify this case.
-        query: frame in which candidates are selected.
+        radius: radius around the true point in the query frame, in pixels. If it contains no candidate, the nearest
+            candidate is used. The paper does not specify this case.
+        query: index in T of the query frame, in which candidates are selected.
 
     Returns:
         [T, Q, 2] tracks of the selected candidates.
@@ -139,10 +139,10 @@ def track_error_3d(
         moving: [P] bool mask of the moving points. Only these are evaluated, because static points would lower the
             median.
         extent: longest side of the foreground's bounding box, in user units.
-        query: frame in which the query points were given; excluded from the error.
+        query: index in T of the query frame, which is excluded from the error.
 
     Raises:
-        ValueError: if the shapes differ, if the extent is not positive, or if no point moves.
+        ValueError: if the shapes differ, if the extent is not positive, or if there is nothing to evaluate.
 
     >>> truth = np.zeros((3, 4, 3))
     >>> track_error_3d(truth + [0, 0, 0.25], truth, moving=np.ones(4, bool), extent=2.0)
@@ -169,7 +169,7 @@ def track_error_3d(
 def lost_parts(
     tracks: NDArray[Any], truth: NDArray[Any], part_id: NDArray[Any], moving: NDArray[np.bool_], extent: float
 ) -> list[int]:
-    """Returns the ids of all parts that are lost in the last frame, with a median error above ``LOST_PERCENT``.
+    """Returns the ids of all lost parts, whose median error in the last frame exceeds ``LOST_PERCENT``.
 
     Args:
         tracks: [T, P, 3] predicted positions in user units, not finite if lost.
@@ -203,10 +203,10 @@ def error_by_confidence(
     query: int = 0,
     groups: int = 4,
 ) -> list[float]:
-    """Returns the median 3D error, in % of the extent, of equally sized groups of positions, most confident first.
+    """Returns the median 3D error of each group of positions, in % of the extent, most confident group first.
 
-    If the confidence is meaningful, errors increase from group to group. The evaluated positions are those of
-    ``track_error_3d``.
+    The evaluated positions are the same as in ``track_error_3d``. They are sorted by confidence and divided into groups
+    of equal size. If the confidence is meaningful, errors increase from group to group.
 
     Args:
         tracks: [T, P, 3] predicted positions in user units.
@@ -214,8 +214,9 @@ def error_by_confidence(
         confidence: [T, P] confidence of each predicted position.
         moving: [P] bool mask of the points to evaluate.
         extent: extent of the scene in user units; see ``track_error_3d``.
-        query: frame in which the query points were given; excluded from the error.
-        groups: number of groups. If positions cannot be divided evenly, the least confident ones are ignored.
+        query: index in T of the query frame, which is excluded from the error.
+        groups: number of groups. If positions cannot be divided evenly, the least confident ones are ignored. With
+            fewer positions than groups, all errors are NaN.
 
     Raises:
         ValueError: if the confidence has a different shape; see also ``track_error_3d``.
@@ -240,10 +241,12 @@ def error_by_confidence(
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
     """Returns the fraction of correct visibility predictions in 0…1, called occlusion accuracy in TAP-Vid.
 
+    The fraction is NaN if there is no frame other than the query frame.
+
     Args:
         predicted: [T, Q] bool predicted visibility.
         truth: [T, Q] bool true visibility.
-        query: frame in which the query points were given; excluded from the accuracy.
+        query: index in T of the query frame, which is excluded from the accuracy.
 
     Raises:
         ValueError: if the shapes differ.

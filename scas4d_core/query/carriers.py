@@ -10,13 +10,13 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 WEISZFELD_ROUNDS = 12
-"""Number of iterations for the geometric median; more would change it by a small fraction of the carriers' spread."""
+"""Number of iterations for the geometric median. More would change it by a small fraction of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
 """Working memory limit for the carrier search, in bytes."""
 ABSENT = -1e9
 """Log opacity assigned to retired Gaussians, so that they carry no points."""
 MIN_PRESENT_WEIGHT = 0.05
-"""Fraction of a point's carrier weight that must be present; a few distant carriers cannot determine its position."""
+"""Minimum total weight of a point's present carriers. A few distant carriers cannot determine its position."""
 
 
 def carriers(
@@ -30,12 +30,15 @@ def carriers(
         gaussians: state of N Gaussians.
         points: [Q, 3] points in the internal world, in metres.
         count: number K of Gaussians that carry each point; limited to N.
-        softening: softening in metres; m is computed with Σ + softening²·I.
+        softening: length in metres added in quadrature to the axes of each Gaussian to compute m.
 
     Returns:
-        Rows [Q, K] of the carriers, largest weight first. Weights [Q, K] proportional to o·exp(−½ m²), which sum to 1;
-        far from all Gaussians, only the nearest has a significant weight. Combined opacity 1 − Π(1 − o·exp(−½ m²)) of
-        the K carriers at each point, [Q].
+        A tuple of three arrays:
+
+        - The rows of the carriers, [Q, K], largest weight first.
+        - The weights of the carriers, [Q, K], which are proportional to o·exp(−½ m²) and sum to 1 for each point. Far
+          from all Gaussians, only the nearest one has a significant weight.
+        - The combined opacity of the K carriers at each point, [Q], which is 1 − Π(1 − o·exp(−½ m²)).
 
     >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
     >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
@@ -90,7 +93,17 @@ def geometric_median(points: Float, weights: Float) -> Float:
 
 
 def drop_absent(answers: Float, weights: Float, there: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Excludes absent carriers; returns positions [Q, K, 3], weights [Q, K], and whether enough weight remains [Q]."""
+    """Excludes absent carriers from the predicted positions of points.
+
+    Args:
+        answers: [Q, K, 3] position predicted by each carrier.
+        weights: [Q, K] weight of each carrier.
+        there: [Q, K] whether each carrier is present.
+
+    Returns:
+        The positions [Q, K, 3], with zeros for absent carriers; the weights [Q, K] of the remaining carriers, which sum
+        to 1; and whether the remaining carriers had more than ``MIN_PRESENT_WEIGHT`` of the weight, [Q].
+    """
     if there.all():
         return answers, weights, np.ones(len(answers), np.bool_)
     shares = np.where(there, weights, 0)

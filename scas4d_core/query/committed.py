@@ -21,7 +21,14 @@ from scas4d_core.storage.history import History
 
 
 class CommittedScene:
-    """Queries on a history. Cameras and points are in the user's world; if ``index`` is None, the newest frame is used.
+    """Committed states of a scene, which can be rendered, tracked, segmented into parts and exported.
+
+    Cameras and points are in the user's world. If ``index`` is None, the newest frame is used.
+
+    Args:
+        history: history of committed states.
+        world: transform from the user's world to the internal world.
+        limits: rasterizer constants.
 
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
@@ -48,14 +55,14 @@ class CommittedScene:
         background: tuple[float, float, float] | None = None,
         labels: NDArray[Any] | None = None,
     ) -> View:
-        """Renders a novel view.
+        """Renders a committed frame from any camera.
 
         Args:
             camera: camera in the user's world.
             index: index of a committed frame, or None for the newest.
             background: RGB in 0…1, or None for the scene's background.
             labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest
-                frame are valid for any frame, because labels of Gaussians added later are ignored.
+                frame can be used for any frame, because the labels of Gaussians added later are ignored.
 
         Raises:
             HistoryError: if the frame was not committed.
@@ -79,7 +86,7 @@ class CommittedScene:
         return tracks_of_history.tracks_of_points(self.history, self.world, points, index, indices)
 
     def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
-        """Tracks the surface points at pixels [Q, 2] of frame ``index``; see ``tracks.tracks_of_pixels``."""
+        """Tracks the points seen at pixels [Q, 2] of a camera in frame ``index``; see ``tracks.tracks_of_pixels``."""
         return tracks_of_history.tracks_of_pixels(
             self.history, self.world, camera, uv, index, indices, self._depth, limits=self._limits
         )
@@ -89,7 +96,7 @@ class CommittedScene:
         return tracks_of_history.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
-        """Adds the visibility in another camera to tracks that were queried at frame ``index``."""
+        """Returns a copy of tracks queried at frame ``index``, with their visibility in another camera added."""
         tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
         return tracks.with_visibility(camera, self._depth, tolerance)
 
@@ -98,7 +105,7 @@ class CommittedScene:
 
         Args:
             count: number of parts, or None to choose it by silhouette score.
-            previous: [N] labels computed from fewer frames; parts that persist keep their labels.
+            previous: [N] labels computed from fewer frames, or None. Parts that persist keep their labels.
         """
         return parts_of_history.parts(self.history, count, previous=previous)
 

@@ -16,14 +16,14 @@ COUNT = 16
 DIRECTIONS = 100
 """Number of evenly distributed directions for the integration."""
 FAR_M = 1e4
-"""Camera distance in metres at which the viewing direction is the same for all Gaussians."""
+"""Camera distance in metres, large enough that all Gaussians are seen from the same direction."""
 
 
 def harmonics(gaussians: Gaussians) -> Float:
-    """Returns the coefficients [N, 16, 3] of each Gaussian's RGB − 0.5 over viewing directions in world axes.
+    """Returns the harmonic coefficients [N, 16, 3] of each Gaussian's RGB − 0.5 as a function of viewing direction.
 
-    The coefficients are only valid for this frame, because highlights are fixed to the world while objects rotate.
-    Degree 3 is too coarse for a lamp's highlight, which becomes wider and dimmer.
+    Directions are in world axes. The coefficients are only valid for this frame, because highlights are fixed to the
+    world while objects rotate. Degree 3 is too coarse for the highlight of a lamp, which becomes wider and dimmer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[0.5, 0.5, 1.0])
     >>> dull = state.replace(gloss=np.zeros((1, 3), np.float32), environment=np.zeros((259, 3), np.float32))
@@ -50,7 +50,7 @@ def harmonics(gaussians: Gaussians) -> Float:
 
 
 def basis_of(directions: NDArray[Any]) -> Float:
-    """Evaluates harmonics [D, 16] at unit directions [D, 3], with signs and order as in 3DGS (Kerbl et al. 2023)."""
+    """Returns the harmonics [D, 16] at unit directions [D, 3], with signs and order as in 3DGS (Kerbl et al. 2023)."""
     x, y, z = np.asarray(directions, np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     columns = [

@@ -1,8 +1,8 @@
 """Part segmentation: clusters Gaussians by motion, using K-means on positions and material rotations over time.
 
 Implements the section "Visualization of Part Segmentation" of the paper. The feature of Gaussian i is ``[λp·p_i(t),
-λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here, p is in units of the extent of the moving Gaussians, so that the
-same λ values suit every scene.
+λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here, p is in units of the extent of the moving Gaussians, so the same λ
+values suit every scene.
 
 When parts are computed again after more frames, they keep their labels. The clustering also starts from the previous
 parts, and replaces them only if a fresh clustering is clearly better. New labels are matched to previous ones by their
@@ -28,25 +28,25 @@ Features = NDArray[np.float32]
 NO_PART = -1
 """Label of static Gaussians, which belong to no part."""
 SILHOUETTE_SAMPLE = 1000
-"""Number of Gaussians sampled to choose the number of parts; the silhouette score needs all pairwise distances."""
+"""Number of samples for choosing the number of parts. The silhouette score needs all their pairwise distances."""
 ROWS_AT_ONCE = 8192
 """Number of Gaussians labelled at a time, to limit the memory for features."""
 
 LAMBDA_POSITION = 0.25
 """λp, the weight of p over time, with p in units of the extent."""
 LAMBDA_ROTATION = 1.0
-"""λR, the weight of the entries of R over time; a rotation by angle a changes them by 2.8 sin(a/2). Rotation separates
-parts; position separates only those that rotate alike. A larger position weight would split long parts."""
+"""λR, the weight of the entries of R over time, which a rotation by angle a changes by 2.8 sin(a/2). Rotations separate
+most parts, and positions only those that rotate alike. A larger position weight would split long parts."""
 LAMBDA_INITIAL = 0.25
 """λp0, the weight of p in the first frame, which the paper repeats in every frame."""
 MAX_FRAMES = 32
-"""Maximum number of frames in the features, evenly spaced over the history; limits memory use."""
+"""Maximum number of frames in the features, evenly spaced over the history. It limits memory use."""
 SAMPLE = 20_000
-"""Maximum number of Gaussians used for clustering; all moving Gaussians are then labelled."""
+"""Maximum number of Gaussians used for clustering. All moving Gaussians are labelled afterwards."""
 MAX_PARTS = 12
 """Maximum number of parts to try if no number is given."""
 STAY = 0.05
-"""Margin by which the inertia of the previous parts must exceed that of a fresh clustering before they are replaced."""
+"""Previous parts are kept unless their inertia exceeds that of a fresh clustering by more than this fraction."""
 STAY_COUNT = 0.02
 """Bonus added to the mean silhouette score for keeping the previous number of parts."""
 RESTARTS = 10
@@ -62,19 +62,19 @@ def parts(
 ) -> NDArray[np.int64]:
     """Returns the part label of each Gaussian, [N] int64: 0…count−1, largest part first; −1 for static Gaussians.
 
-    The newest committed frame determines which Gaussians move. Each Gaussian is weighted by its opacity times the
-    product of its two longest axes, approximately its image area, so that many small Gaussians do not dominate.
+    The newest committed frame determines which Gaussians move. Each Gaussian is weighted by its approximate image area
+    (``coverage``), so many small Gaussians do not dominate.
 
     Args:
-        history: history with at least one committed frame; with only one, positions alone separate parts.
-        count: number of parts, or None for the number from 2 to ``MAX_PARTS`` with the largest mean silhouette score
-            (Rousseeuw 1987) on up to 1,000 Gaussians.
+        history: history with at least one committed frame. With a single frame, only positions separate parts.
+        count: number of parts, or None to choose up to ``MAX_PARTS`` parts by the mean silhouette score (Rousseeuw
+            1987) of up to 1,000 Gaussians.
         previous: [N] labels computed from fewer frames with the same ``count``, or None. Parts that persist then keep
             their labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
 
     Raises:
-        ValueError: if no frame is committed, no Gaussian moves, count is below 1 or above the number of moving
-            Gaussians, or ``previous`` has a different number of Gaussians.
+        ValueError: if no frame is committed, no Gaussian moves, ``count`` is not between 1 and the number of moving
+            Gaussians, or ``previous`` has the wrong shape.
 
     >>> from scas4d_core.storage.history import History
     >>> boxes = np.random.default_rng(0).random((40, 3))
@@ -251,7 +251,7 @@ def _cluster(
 
 
 def _best_count(features: Features, known: int) -> int:
-    """Returns the number of parts with the best mean silhouette score, favouring the previous number (0 if none)."""
+    """Returns the number of parts with the best mean silhouette score, which includes a bonus for ``known`` parts."""
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0
@@ -264,7 +264,7 @@ def _best_count(features: Features, known: int) -> int:
 
 
 def _kmeans(count: int, **given: Any) -> Any:
-    """Returns scikit-learn's K-means; the import takes a second, so it is deferred for callers that only render."""
+    """Returns a scikit-learn K-means model. The import takes a second, so it is deferred until a model is needed."""
     from sklearn.cluster import KMeans
 
     return KMeans(n_clusters=count, **{"n_init": RESTARTS, "random_state": SEED, **given})

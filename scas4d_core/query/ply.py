@@ -31,7 +31,7 @@ SH_DEGREE_0 = 0.28209479177387814
 OPACITY_MARGIN = 1e-6
 """Minimum distance of opacities from 0 and 1, where the logit is infinite."""
 JACOBI_SWEEPS = 12
-"""Number of one-sided Jacobi sweeps; convergence is quadratic, and a 3×3 matrix takes about five."""
+"""Number of one-sided Jacobi sweeps. A 3×3 matrix takes about five, because convergence is quadratic."""
 ORTHOGONAL = 1e-6
 """Cosine below which two axes are considered orthogonal, given the precision of float32 factors."""
 
@@ -42,7 +42,7 @@ _FIELDS = (
 
 
 class PlyError(InputError):
-    """Raised if Gaussians cannot be exported or a file is invalid; the message names the affected rows or the path."""
+    """Raised if Gaussians cannot be exported, or a file is invalid. The message names the affected rows or the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Splats:
 
 
 def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
-    """Writes one frame atomically, without its retired Gaussians.
+    """Writes a state to a splat file atomically, without its retired Gaussians.
 
     Args:
         path: path of the file.
@@ -112,7 +112,7 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
 
 
 def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
-    """Reads a splat file; only degree 0 of the spherical harmonics is read.
+    """Reads a splat file, ignoring spherical harmonics above degree 0.
 
     Args:
         source: path or open file.
@@ -145,7 +145,7 @@ def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
 
 
 def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
-    """Converts a state to centres, axes and scales in the user's world.
+    """Returns the centres, scales, rotations, opacities and colours of a state in the user's world.
 
     Raises:
         PlyError: if some Gaussians have non-finite values or no volume.
@@ -164,10 +164,9 @@ def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
 def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
     """Splits factors into rotations Q [N, 3, 3] and lengths s [N, 3] with Q diag(s²) Qᵀ = F Fᵀ.
 
-    This is the one-sided Jacobi method: columns of F are rotated pairwise, by at most 45°, until they are orthogonal.
-    Columns that are already orthogonal do not change, even if lengths are equal and eigenvectors would be arbitrary. Of
-    the 24 ways to label the axes of a right-handed frame, the one with the largest trace against the columns of F is
-    used.
+    The one-sided Jacobi method rotates columns of F pairwise, by at most 45°, until they are orthogonal. Columns that
+    are already orthogonal do not change, even if their lengths are equal and eigenvectors would be arbitrary. The axes
+    can be ordered and signed in 24 ways to form a right-handed frame. The frame closest to the columns of F is used.
 
     Args:
         factors: [N, 3, 3] factors F of full rank.
@@ -198,7 +197,7 @@ def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
 
 
 def _nearest_naming(axes: Float, scales: Float, wanted: Float) -> tuple[Float, Float]:
-    """Permutes and flips axes to the right-handed frame with the largest trace(axesᵀ wanted)."""
+    """Returns axes and scales, permuted and flipped to the right-handed frame with the largest trace(axesᵀ wanted)."""
     rows = np.arange(len(axes))
     dots = np.einsum("nki,nkj->nij", axes, wanted)  # axis i with wanted column j
     handed = np.linalg.det(axes)

@@ -1,9 +1,9 @@
-"""Surface depth along single rays, for pixel queries that need more accuracy than rendered depth.
+"""Surface depth along single rays, for pixel queries that need more accuracy than rendered depth provides.
 
 Rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here, each Gaussian absorbs light along the
 ray itself, around the point on the ray with the smallest Mahalanobis distance to its centre. The surface is at the
-depth where half of the light lost along the ray has been absorbed. At an edge, the mean depth is between two surfaces,
-but this median is on one of them.
+depth where half of the light lost along the ray has been absorbed. At an edge, the mean depth lies between two
+surfaces, whereas this median lies on one of them.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 TILE_PX = 16
-"""Size in pixels of the square tiles in which rays share a search for Gaussians."""
+"""Side length, in pixels, of the square tiles in which rays share one search for Gaussians."""
 RAYS_AT_ONCE = 64
 """Number of rays processed at once, to limit working memory to a few megabytes."""
 DEEPEST = 96
-"""Maximum number of Gaussians per ray. Those that absorb the most light are used; the others have no visible effect."""
+"""Maximum number of Gaussians per ray. Only those that absorb the most light have a visible effect."""
 BISECTIONS = 26
 """Number of bisection steps, which reduce a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
@@ -40,18 +40,18 @@ def ray_depths(
     limits: Limits = DEFAULT,
     softening: float = 0.0,
 ) -> tuple[Float, Float]:
-    """Returns the depth of the surface at continuous pixel positions.
+    """Returns the depth and coverage of the surface at continuous pixel positions.
 
     Args:
         gaussians: state of N Gaussians in the internal world.
         camera: camera in the internal world.
         uv: [Q, 2] pixel positions; (0.5, 0.5) is the centre of the first pixel.
-        limits: rasterizer constants; with them, a ray hits the same Gaussians that the rendered pixel shows.
-        softening: uncertainty of the surface in metres, added to every axis in quadrature.
+        limits: rasterizer constants. They ensure that a ray hits the same Gaussians that the rendered pixel shows.
+        softening: uncertainty of the surface in metres, added in quadrature to every axis of each Gaussian.
 
     Returns:
-        Depth z [Q] in metres along the camera's axis, NaN if the ray hits nothing; coverage [Q] in 0…1, the fraction of
-        light that is absorbed.
+        The depth z [Q] along the camera's axis in metres, and the coverage [Q], which is the fraction of light in 0…1
+        that is absorbed along the ray. The depth is NaN if the ray hits nothing.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -114,7 +114,12 @@ class _Splats:
         self.spread = np.sqrt(softened[:, 2, 2])
 
     def depths(self, near: NDArray[np.intp], uv: Float) -> tuple[Float, Float]:
-        """Returns the depth and coverage of rays, given the candidate Gaussians in front-to-back order."""
+        """Returns the depth [Q] and coverage [Q] of rays; see ``ray_depths``.
+
+        Args:
+            near: indices of the candidate Gaussians, in front-to-back order.
+            uv: [Q, 2] pixel positions of the rays.
+        """
         limits = self.limits
         off = uv[:, None] - self.centre[near]
         power = 0.5 * np.einsum("qni,nij,qnj->qn", off, self.conic[near], off, optimize=True)

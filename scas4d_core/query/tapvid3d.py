@@ -1,4 +1,4 @@
-"""Exports tracks in the npz format of TAPVid-3D, whose tools can then read them as predictions.
+"""Converts tracks to the npz format of TAPVid-3D, whose tools can read them as predictions.
 
 Names and axes follow the benchmark's evaluation (google-deepmind/tapnet, ``tapvid3d/evaluation/evaluate_model.py``).
 Points are in metres, in the axes of one camera (OpenCV: x right, y down, z forward).
@@ -23,21 +23,26 @@ def tapvid3d(
     metres_per_unit: float = 1.0,
     pixels: NDArray[Any] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Returns the arrays of one TAPVid-3D file, without images (``images_jpeg_bytes``), which predictions do not need.
+    """Returns the arrays of one TAPVid-3D file, keyed by name.
+
+    Images (``images_jpeg_bytes``) are omitted, because predictions do not need them.
 
     Args:
         positions: [T, Q, 3] positions in the user's world and units, NaN if unknown.
-        visibility: [T, Q] visibility in the camera.
+        visibility: [T, Q] bool visibility in the camera.
         camera: camera in the user's world.
         queried: index in T of the frame in which the points were queried, or −1 if that frame is not included.
         metres_per_unit: metres per user unit.
         pixels: [Q, 2] queried pixels, or None for the projections of the points in the queried frame.
 
     Returns:
-        ``tracks_XYZ`` [T, Q, 3] float32: positions in camera axes, in metres. ``visibility`` [T, Q] bool.
-        ``queries_xyt`` [Q, 3] float32: u, v (pixel centres at +0.5) and the index in T; u and v are NaN if unknown.
-        ``fx_fy_cx_cy`` [4] float32. ``extrinsics_w2c`` [T, 4, 4] float32: transform from the user's world in metres to
-        the camera.
+        A dict with five arrays:
+
+        - ``tracks_XYZ``: [T, Q, 3] float32 positions in metres, in camera axes.
+        - ``visibility``: [T, Q] bool visibility, as given.
+        - ``queries_xyt``: [Q, 3] float32 u, v and index in T. Pixel centres are at +0.5, and unknown u and v are NaN.
+        - ``fx_fy_cx_cy``: [4] float32 intrinsics in pixels.
+        - ``extrinsics_w2c``: [T, 4, 4] float32 transforms from the user's world, in metres, to the camera.
 
     Raises:
         ValueError: if the shapes do not match.

@@ -1,8 +1,8 @@
 """Point tracking: each point is carried rigidly by the Gaussians that contain it (paper, Point-Tracking).
 
 Gaussian i carries a point p from frame q to frame t as ``μ_i(t) + R_i(t) R_i(q)ᵀ (p − μ_i(q))``, where R is the
-material rotation. Several Gaussians carry each point, and the track is the geometric median of their positions. This
-prevents a single outlier from displacing the point. ``ray_depth`` converts a pixel to a point. See docs/tracks.md for
+material rotation. Several Gaussians carry each point, and the track is the geometric median of their predictions, so a
+single outlier cannot displace the point. Pixels are converted to points with ``ray_depth``. See docs/tracks.md for
 definitions and accuracy.
 """
 
@@ -38,7 +38,7 @@ SOFTENING = 0.01
 Gaussians are thinner than the uncertainty of the surface, and more carriers average out more noise. Compared with
 0.001, the median 3D error decreases by 2 % (cloth) to 18 % (stage)."""
 RAY_SOFTENING = 0.003
-"""Like ``SOFTENING``, but for the position of a Gaussian along the ray of a pixel query."""
+"""Equivalent of ``SOFTENING`` for the position of a Gaussian along the ray of a pixel query."""
 AGREEMENT = 0.01
 """Mean deviation of the carriers from the track that halves the confidence, as a fraction of the extent."""
 DEPTH_TOLERANCE = 0.0075
@@ -71,11 +71,11 @@ class Tracks:
     visibility: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def pixels(self, camera: Camera) -> Float:
-        """Projects the tracks into a camera in the user's world; returns pixels [T, Q, 2], NaN behind the camera."""
+        """Returns the pixels [T, Q, 2] of the tracks in a camera in the user's world, NaN behind the camera."""
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
-        """Adds the visibility in another camera; see ``find_visibility`` for the arguments."""
+        """Returns a copy with the visibility in another camera added; see ``find_visibility`` for the arguments."""
         visible = find_visibility(self.positions, self.indices, camera, render_depth, tolerance)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
@@ -96,7 +96,7 @@ def tracks_of_points(
         points: [Q, 3] points in the user's world at frame ``index``.
         index: committed frame in which the points are given.
         indices: committed frames over which to track the points, in any order.
-        count: number of Gaussians that carry a point.
+        count: number of Gaussians that carry each point.
 
     Raises:
         ValueError: if the points do not have shape [Q, 3], or are not finite.
@@ -166,6 +166,7 @@ def tracks_of_pixels(
 
     Raises:
         ValueError: if the pixels do not have shape [Q, 2], are not finite, or are outside the image.
+        HistoryError: if a frame was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
@@ -212,7 +213,9 @@ def tracks_of_pixels(
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-    """Returns the trajectories of the Gaussians with the given ids; confidence is 1, or 0 in frames without them.
+    """Returns the trajectories of the Gaussians with the given ids.
+
+    The confidence is 1 in frames in which a Gaussian is present, and 0 in all other frames.
 
     Raises:
         ValueError: if an id is unknown.
@@ -240,14 +243,14 @@ def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
 def find_visibility(
     positions: Float, indices: Sequence[int] | NDArray[Any], camera: Camera, render_depth: RenderDepth, tolerance: float
 ) -> NDArray[np.bool_]:
-    """Returns the visibility of points in a camera, [T, Q] bool: in the image, in front of the camera and not occluded.
+    """Returns whether points are visible in a camera, [T, Q] bool: in its image, in front of it and not occluded.
 
     A point is occluded if it is more than ``tolerance`` behind the farthest rendered depth in the 3×3 pixels around it.
-    Tracks are often off by a pixel, which matters at edges; this rule is also more accurate for exact positions. A
-    pixel that is less than half covered does not occlude.
+    The neighbourhood allows for tracks that are off by a pixel near an edge, and improves the accuracy even for exact
+    positions. Pixels that are less than half covered do not occlude points.
 
     Args:
-        positions: [T, Q, 3] positions in the user's world; NaN is never visible.
+        positions: [T, Q, 3] positions in the user's world. Points at NaN are not visible.
         indices: [T] committed frames.
         camera: camera in the user's world.
         render_depth: function that returns rendered depth and alpha.
@@ -269,7 +272,7 @@ def find_visibility(
 def _covered_near(
     depth: NDArray[Any], alpha: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp], reach: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Finds the nearest covered pixel to each pixel; returns whether it is within reach, its row and its column."""
+    """Returns whether the covered pixel nearest to each given pixel is within reach, with its row and its column."""
     covered = (alpha >= ALPHA_OF_A_SURFACE) & np.isfinite(depth)
     if not covered.any():
         return np.zeros(len(row), dtype=np.bool_), row, column

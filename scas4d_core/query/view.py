@@ -19,7 +19,7 @@ from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
 Array = NDArray[np.float32]
 
 MAX_LABEL = 254
-"""Largest label; parts are stored in 8 bits, and 0 means no part."""
+"""Largest part label. A part is stored in 8 bits as 1 + its label, and 0 means no part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class View:
         alpha: [H, W] float32 opacity.
         depth: [H, W] float32 alpha-weighted mean z along the camera's axis, in user units; NaN if less than half of
             the pixel is covered.
-        parts: [H, W] uint8: 1 + the label that covers most of the pixel, or 0 for no part. None without labels.
+        parts: [H, W] uint8: 1 + the label that covers most of the pixel, or 0 for no part; None without labels.
 
     >>> black = np.zeros((2, 2), np.float32)
     >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
@@ -46,7 +46,7 @@ class View:
 
 
 class ViewRenderer:
-    """Renders views of states; buffers are reused between views.
+    """Renderer for views of states, which reuses its buffers between views.
 
     Args:
         world: transform from the user's world to the internal world of the states.
@@ -106,7 +106,7 @@ class ViewRenderer:
         return View(colour, alpha, depth, parts)
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], camera: CameraArrays) -> NDArray[np.uint8]:
-        """Returns [H, W] uint8: 1 + the label with the largest weight. Each pass renders ``CHANNELS`` labels."""
+        """Returns the part that covers most of each pixel (``View.parts``). Each pass renders ``CHANNELS`` labels."""
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MAX_LABEL)).all():
             raise ValueError(
                 f"labels must have shape [{len(gaussians)}], one per Gaussian, with values in -1...{MAX_LABEL}; got "

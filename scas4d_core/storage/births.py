@@ -22,11 +22,11 @@ COLUMNS = 4
 """Number of columns of the log: frame, kind, first id and last id."""
 NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
 NO_PARENT = -1
-"""Parent value of a Gaussian that has no parent and starts its own structure."""
+"""Value for the parent of a Gaussian that has none, in place of a row."""
 
 
 class Event(IntEnum):
-    """Kind of an event in the log."""
+    """Kind of event in the log."""
 
     BORN = 0
     RETIRED = 1
@@ -40,9 +40,9 @@ class Life:
     Attributes:
         id: id of the Gaussian.
         born: frame of its birth; for initial Gaussians, the first frame.
-        retired: frames in which it was retired, in increasing order. It is present from its birth, or from a revival,
-            until the next retirement.
-        revived: frames in which it was revived, in increasing order.
+        retired: frames in which the Gaussian was retired, in increasing order. It is present from its birth, or from a
+            revival, until the next retirement.
+        revived: frames in which the Gaussian was revived, in increasing order.
     """
 
     id: int
@@ -52,7 +52,9 @@ class Life:
 
 
 def events_of(index: int, kind: Event, rows: NDArray[np.intp], ids: Int) -> Int:
-    """Returns log rows [E, 4] for one kind of event in a frame; runs of consecutive rows and ids share one log row.
+    """Returns the log rows [E, 4] for one kind of event in a frame.
+
+    Gaussians with consecutive rows and ids share one log row.
 
     Args:
         index: frame of the events.
@@ -81,7 +83,7 @@ def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
 
     Args:
         events: event log.
-        ids: [N] id of the Gaussian in each row; the Gaussians of one event are in consecutive rows.
+        ids: [N] id of the Gaussian in each row. The Gaussians of an event must be in consecutive rows.
 
     >>> events = np.array([[5, 1, 3, 4], [6, 2, 4, 4]])
     >>> retired_after(events, np.array([2, 3, 4]))
@@ -126,7 +128,7 @@ def rows_among(ids: Int, wanted: Int) -> Int:
 
 
 def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
-    """Returns the lifetimes of the wanted Gaussians as recorded in a log.
+    """Returns the lifetimes of Gaussians as recorded in a log.
 
     Args:
         events: event log.
@@ -145,7 +147,7 @@ def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gau
     """Returns the roots of a state: Θ_0, plus newborn Gaussians at the positions that they would have had in frame 0.
 
     Clusters and neighbours are computed from the roots. A newborn Gaussian is moved back by the inverse rigid motion of
-    its parent; a Gaussian without a parent keeps its position at birth.
+    its parent. A Gaussian without a parent keeps its position at birth.
 
     Args:
         roots: [N] roots before this frame.

@@ -1,8 +1,8 @@
 """Chunks: compact files in a history's folder, each with a series of older frames. Requires NumPy and zstandard.
 
 ``states_<index>.s4d`` starts with the frame of that index. A frame is in a chunk once the record of its state is
-complete; the preceding note contains the frame's report. If a frame also has its own file, that file takes precedence.
-Exact data is stored elsewhere: ids and opacities with the first frame and the births, retirements in later logs.
+complete. The preceding note contains the frame's report. If a frame also has its own file, that file takes precedence.
+Exact data is stored elsewhere: ids and opacities with the first frame and the births, and retirements in later logs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from scas4d_core.storage.npz import open_atomically
 REPORT = "report"
 """Key of the report in a frame's note."""
 READERS = 2
-"""Number of chunks that each process keeps open, with a cached state: one for tracks, and one for random views."""
+"""Number of chunks that each process keeps open with a cached state, one for tracks and one for random views."""
 _CHUNK_FILE = re.compile(r"states_(\d{6,})\.s4d")
 
 
@@ -43,9 +43,9 @@ class Chunk:
         size: size in bytes when the file was last checked.
         changed: modification time in ns when the file was last checked.
         times: time of each frame in seconds, keyed by frame index.
-        stamps: stamp of each frame: its size in the file in bytes, and −1 minus the checksum of the state. The negative
-            value distinguishes it from stamps of frame files.
-        damage: description of the first damage in the file, or None; frames after the damage are not listed.
+        stamps: stamp of each frame, keyed by frame index. It consists of the frame's size in the file in bytes, and −1
+            minus the checksum of the state. The negative value distinguishes it from stamps of frame files.
+        damage: description of the first damage in the file, or None. Frames after the damage are not listed.
         foreign: whether the file has an unsupported format.
     """
 
@@ -64,7 +64,7 @@ class Chunk:
 
 
 class Chunks:
-    """Reads the chunks in a folder.
+    """Reader for the chunks in a folder.
 
     Args:
         directory: folder of the history.
@@ -81,7 +81,7 @@ class Chunks:
         weakref.finalize(self, _close_all, self._readers)
 
     def refresh(self) -> None:
-        """Updates the list of chunks; only new or changed chunks are opened."""
+        """Updates the list of chunks, opening only new or changed ones."""
         firsts = sorted(first for name in os.listdir(self.directory) if (first := chunk_of(name)) is not None)
         known = {first: chunk for first in firsts if (chunk := self._load_chunk(first)) is not None}
         for first in self.known.keys() - known.keys():
@@ -132,20 +132,25 @@ class Chunks:
 
     @property
     def damaged(self) -> list[str]:
-        """One sentence per chunk whose frames cannot all be listed because of damage."""
+        """One sentence for each chunk with frames that cannot be listed because of damage."""
         return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
 
     @property
     def foreign(self) -> list[str]:
-        """One sentence per chunk with an unsupported format."""
+        """One sentence for each chunk with an unsupported format."""
         return [str(chunk.damage) for chunk in self.known.values() if chunk.foreign]
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Reads arrays of a frame as if from its own file; ``report`` is read from its note.
+        """Reads arrays of a frame, with the same names as in the file of a frame.
+
+        Args:
+            index: index of the frame.
+            names: names of the arrays.
+            optional: names of additional arrays to read if present.
 
         Raises:
             FileNotFoundError: if no chunk contains the frame.
-            FileError: if the frame cannot be read.
+            FileError: if the frame cannot be read, or lacks an array.
         """
         try:
             return self._read(index, names, optional)
@@ -205,7 +210,7 @@ class Chunks:
             known[1].close()
 
     def fault(self, index: int) -> str | None:
-        """Rereads a frame of a chunk from disk, and returns the problem, or None if the frame is intact."""
+        """Rereads a frame from disk. Returns the problem found, or None if the frame is intact."""
         if (chunk := self.of(index)) is None:
             return f"frame {index} is missing"
         self._close(chunk.path)
@@ -244,7 +249,7 @@ def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
 def make_note(report: Mapping[str, Any], log: Int, before: int) -> dict[str, Any]:
     """Returns the note of a frame, which contains its report and its events.
 
-    The note of the first frame in a chunk contains the whole log, so that no other chunk is needed to read it.
+    The note of the first frame in a chunk contains the whole log, so no other chunk is needed to read it.
 
     Args:
         report: report of the frame.
@@ -277,7 +282,7 @@ def chunk_of(name: str) -> int | None:
 
 
 def _listed(path: Path, status: os.stat_result) -> Chunk:
-    """Returns a chunk with a list of its frames, which is empty if the chunk cannot be opened."""
+    """Returns a chunk with the list of its frames, which is empty if the file cannot be opened."""
     size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:

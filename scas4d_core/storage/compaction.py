@@ -20,7 +20,8 @@ from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
 
 CHUNK_FRAMES = 120
-"""Frames per chunk. The first state of a chunk is as large as five to ten others; retention deletes whole chunks."""
+"""Maximum number of frames per chunk. The first state of a chunk is as large as five to ten others, which favours long
+chunks. Retention deletes whole chunks, which favours short ones."""
 
 NOT_ENCODED = (ValueError, ArithmeticError, MemoryError)
 """Exceptions for states that cannot be read or encoded, including the errors of histories and compact files."""
@@ -29,11 +30,14 @@ log = logging.getLogger("scas4d.storage")
 
 
 class Compaction:
-    """Moves the oldest exact states of a history to chunks, in the process that appends to it.
+    """Compaction of a history, which moves its oldest exact states to chunks one step at a time.
+
+    It must run in the process that appends to the history.
 
     Args:
         history: history stored in a directory.
-        head: function that returns the file header with the error bounds; called when a chunk is created or resumed.
+        head: function that returns the file header with the error bounds. It is called whenever a chunk is created or
+            resumed.
         exact: number of newest states that are kept bit-exact, at least ``NEWEST_KEPT``.
 
     Attributes:
@@ -70,16 +74,16 @@ class Compaction:
 
     @property
     def due(self) -> int:
-        """Lower bound on the number of states to be moved; at least 1 if there are any."""
+        """Lower bound on the number of states to move, which is at least 1 if there are any."""
         if not self._queue:
             self._queue.extend(self._history.older_than_newest(self.exact, self._passed))
         return len(self._queue)
 
     def step(self) -> int | None:
-        """Moves one state and returns its frame, or None if there is none to move.
+        """Moves one state and returns the index of its frame, or None if there is no state to move.
 
         Raises:
-            OSError: if the disk is full or failing; nothing is lost, and the next step retries.
+            OSError: if the disk is full or failing. Nothing is lost, and the next step tries again.
         """
         while self.due:
             index = self._queue[0]
@@ -178,7 +182,7 @@ class Compaction:
         self._writer = None
 
     def _release_writer(self) -> None:
-        """Closes the current chunk without an index; an incomplete record is truncated when the chunk is resumed."""
+        """Closes the current chunk without an index. An incomplete record is truncated when the chunk is resumed."""
         if self._writer is not None:
             self._writer.abandon()
         self._writer = None

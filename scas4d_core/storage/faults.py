@@ -4,11 +4,11 @@ from __future__ import annotations
 
 
 class HistoryError(ValueError):
-    """Raised if a history cannot be extended or read; the message names the frame or file and the problem."""
+    """Raised if a history cannot be extended or read. The message names the frame or file and the problem."""
 
 
 class OtherFormatError(HistoryError):
-    """Raised for files of an unsupported format; they are left unchanged."""
+    """Raised if files have an unsupported format. The files are left unchanged."""
 
 
 class UnreadableFrameError(HistoryError):
@@ -16,7 +16,7 @@ class UnreadableFrameError(HistoryError):
 
 
 class DamagedFrameError(UnreadableFrameError):
-    """Raised if a frame's file is damaged rather than deleted."""
+    """Raised if the file of a frame is damaged rather than deleted."""
 
 
 def other_format(what: str, written: int | None, read: int) -> OtherFormatError:

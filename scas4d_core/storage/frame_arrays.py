@@ -38,7 +38,7 @@ def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
 
 
 def unpack_effects(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
-    """Inverts ``pack_effects``; returns the arrays keyed by effect and array name."""
+    """Returns the arrays packed by ``pack_effects``, keyed by effect and array name; empty for None."""
     effects: dict[str, Arrays] = {}
     if given is not None:
         with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:

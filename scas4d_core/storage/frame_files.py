@@ -1,13 +1,13 @@
-"""A history's folder: file names, and functions to read, write and repair the files. Requires only NumPy.
+"""Reads, writes and repairs the files in a history's folder. Requires only NumPy.
 
-``fixed.npz``, written once, contains the data that all frames share; ``frame_<index>.npz`` contains a committed frame.
+``fixed.npz``, written once, contains the data that all frames share. ``frame_<index>.npz`` contains a committed frame.
 Every file is written under a temporary name, synced and renamed. A file with its final name is therefore complete, and
 the directory listing is the only index. All frames depend on ``fixed.npz`` and the first frame, so these files have
 copies that are read if the original is damaged or missing.
 
 ``born_<index>.npz`` contains the Gaussians born in a frame. It also has a copy, because all later frames need it. It is
 written before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks
-(``chunks``); a frame's own file takes precedence over its chunk.
+(``chunks``). A frame's own file takes precedence over its chunk.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
 FORMAT = 1
-"""Format of a folder of states and checkpoints, stored in ``fixed.npz``; folders with other formats are rejected."""
+"""Format of a folder of states and checkpoints, stored in ``fixed.npz``. Folders with other formats are rejected."""
 _FORMAT = "format"
 INDEX = "index"
 """Name of the array that stores the frame index in the copy of the first frame."""
@@ -39,12 +39,12 @@ _BORN_FILE = re.compile(r"born_(\d{6,})(\.copy)?\.npz")
 
 
 class FrameFiles:
-    """Reads and writes the files of a history in one directory.
+    """Reader and writer for the files of a history in one directory.
 
     Attributes:
         chunks: compact files that contain older frames.
-        faults: maps the name of each unreadable file to the reason; cleared when reported. A frame in a
-            chunk is listed under the name that its own file would have.
+        faults: maps the name of each unreadable file to the reason until the fault is reported. A frame in a chunk is
+            listed under the name that its own file would have.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -136,7 +136,7 @@ class FrameFiles:
 
         Args:
             index: index of the frame.
-            stamp: stamp of the frame, if known, which avoids reading the file if the frame is in a chunk.
+            stamp: stamp of the frame, or None if unknown. If it is given, no file is read for a frame in a chunk.
 
         Raises:
             FileNotFoundError: if the frame does not exist.
@@ -147,7 +147,7 @@ class FrameFiles:
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Reads arrays of a frame from its own file, or else from its chunk or, for the first frame, from its copy.
+        """Reads arrays of a frame from its own file, or else from its chunk or the copy of the first frame.
 
         Args:
             index: index of the frame.
@@ -181,7 +181,7 @@ class FrameFiles:
             raise UnreadableFrameError(str(error)) from error
 
     def fault(self, index: int) -> str | None:
-        """Verifies all stored data of a frame, and returns the problem found, or None if the frame is intact."""
+        """Verifies all stored data of a frame. Returns the problem found, or None if the frame is intact."""
         if not self.path(index).exists() and index in self.chunks:
             return self.chunks.fault(index)
         return fault_of(self.path(index))
@@ -209,7 +209,10 @@ class FrameFiles:
         return self._either(self.fixed, self.fixed_copy, names)
 
     def write_born(self, index: int, arrays: Mapping[str, Any]) -> None:
-        """Writes the arrays of Gaussians born in a frame, and a copy, before the frame is committed."""
+        """Writes the arrays of the Gaussians born in a frame to a file and its copy.
+
+        Call this before the frame is committed.
+        """
         write_npz(self.directory / born_file(index), arrays)
         write_npz(self.directory / born_file(index, copy=True), arrays)
 
@@ -239,14 +242,15 @@ class FrameFiles:
     def repair_copies(self, first: int, fixed: Arrays, born: Mapping[int, Arrays]) -> dict[str, str]:
         """Rewrites ``fixed.npz``, birth files, the first frame and their copies if they are damaged or missing.
 
+        If the first frame and its copy are damaged, they are left unchanged.
+
         Args:
             first: index of the first committed frame.
             fixed: arrays that all frames share.
             born: arrays of the births, keyed by frame.
 
         Returns:
-            The problem found in each rewritten file, keyed by file name. The first frame is left unchanged if its copy
-            is also damaged.
+            The problem found in each rewritten file, keyed by file name.
         """
         mended: dict[str, str] = {}
         needed = dict.fromkeys((self.fixed, self.fixed_copy), with_format(fixed))
@@ -287,7 +291,7 @@ class FrameFiles:
         return [index] if chunk is None else list(chunk.times)
 
     def remove_oldest(self, deleted: Collection[int], left: Container[int]) -> None:
-        """Deletes frames, and all chunks without any remaining frames.
+        """Deletes the files of frames, and the chunks that contain no remaining frames.
 
         Args:
             deleted: indices of the frames to delete.
@@ -347,7 +351,7 @@ def checkpoint_of(name: str) -> int | None:
 
 
 def fault_of(file: Path) -> str | None:
-    """Verifies a whole file, and returns the problem found, or None if the file is intact."""
+    """Verifies a whole file. Returns the problem found, or None if the file is intact."""
     try:
         verify(file)
     except (FileNotFoundError, ValueError) as error:

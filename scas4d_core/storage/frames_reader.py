@@ -24,7 +24,10 @@ FRAMES_KEPT = 4
 
 
 class FramesReader:
-    """Committed frames, in the memory of this process or in a directory to which another process writes.
+    """Reader for committed frames, in the memory of this process or in a directory to which another process writes.
+
+    Args:
+        directory: folder of the states, or None for a history in memory.
 
     Attributes:
         damaged: maps each unreadable frame to the reason; these frames are not in ``indices``.
@@ -38,7 +41,7 @@ class FramesReader:
         self._times: dict[int, float] = {}
         self._stamps: dict[int, Stamp] = {}
         self._texts: dict[int, bytes] = {}
-        """Reports of frames in memory."""
+        """JSON reports of the frames in memory, keyed by frame."""
         self._scratch_reports: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
         """Reports of frames moved to a scratch file (``History.move_to_scratch``)."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
@@ -77,7 +80,7 @@ class FramesReader:
         return history
 
     def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
-        """Reads the changes made by the process that writes to this directory, without reopening known frames.
+        """Reads the changes made by the process that writes to this directory, without reopening unchanged frames.
 
         Args:
             only: indices of frames that may have changed. If None, all states are listed, which is slow for long
@@ -116,14 +119,14 @@ class FramesReader:
         return added, gone
 
     def older_than_newest(self, newest: int, after: int) -> list[int]:
-        """Returns frames after ``after``, in increasing order, without the first one and the ``newest`` latest ones."""
+        """Returns the frames after ``after`` in increasing order, except the first and the ``newest`` latest frames."""
         first = next(iter(self._times), -1)
         frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
         return list(frames)[::-1]
 
     @property
     def damaged_chunks(self) -> list[str]:
-        """One sentence per damaged compact file of which some frames are missing from ``indices``."""
+        """One sentence for each damaged compact file with frames that are missing from ``indices``."""
         return [] if self._files is None else self._files.chunks.damaged
 
     def is_compacted(self, index: int) -> bool:
@@ -131,14 +134,14 @@ class FramesReader:
         return index in self._times and self._files is not None and self._files.is_compacted(index)
 
     def mark_compacted(self, index: int) -> None:
-        """Records that the state of a frame was moved to a chunk, from which it is read from now on."""
+        """Records that a frame was moved to a chunk, and discards the cached original."""
         if self._files is not None and index in self._times and (stamp := self._files.chunks.stamp(index)) is not None:
             self._stamps[index] = stamp
             for kept in (self._frames, self._texts, self._packed):
                 kept.pop(index, None)
 
     def pop_faults(self) -> dict[str, str]:
-        """Returns the problem of each file found damaged or missing since the last call, keyed by file name."""
+        """Returns the problem with each file found damaged or missing since the last call, keyed by file name."""
         if self._files is None:
             return {}
         faults, self._files.faults = self._files.faults, {}
@@ -217,11 +220,14 @@ class FramesReader:
         return self._background or (0.0, 0.0, 0.0)
 
     def effects(self, index: int) -> dict[str, Arrays]:
-        """Returns the effect arrays of a committed frame for a cold start, or an empty dict if they are unreadable."""
+        """Returns the effect arrays of a committed frame for a cold start, keyed by effect and array name.
+
+        The result is empty if the frame has no such arrays, or if they cannot be read.
+        """
         return unpack_effects(self._left(index))
 
     def _left(self, index: int) -> NDArray[np.uint8] | None:
-        """Returns the packed effect arrays of a frame, or None if there are none."""
+        """Returns the packed effect arrays of a frame, or None if there are none or they cannot be read."""
         self._require(index)
         left = self._packed.get(index)
         if left is None and self._files is not None:
@@ -262,7 +268,7 @@ class FramesReader:
         return {name: array[:count] for name, array in arrays.items()}
 
     def _born(self, birth: tuple[int, int, int]) -> Arrays:
-        """Returns the stored arrays of a birth, given as (frame, first id, last id)."""
+        """Returns the stored arrays of the Gaussians of a birth, given as (frame, first id, last id)."""
         index, first, last = birth
         known = self._births.get(index)
         if self._files is not None and (known is None or known["ids"][0] != first):
@@ -285,7 +291,7 @@ class FramesReader:
         raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
     def _newest(self) -> int:
-        """Returns the index of the newest frame, or -1 if there is none; unlike ``indices``, it copies nothing."""
+        """Returns the index of the newest frame, or −1 if there is none, without copying all indices."""
         return next(reversed(self._times), -1)
 
     def _from_file(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:

@@ -1,9 +1,9 @@
 """Stores the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Requires only NumPy.
 
 On disk (``frame_files``), a history has one file with opacities and ids, written once, and one file per committed
-frame with its state, time and report. Frames with newborn Gaussians have a second file. Renaming a frame's file to its
-final name is the commit. Only one process appends and deletes, through a ``History``; other processes only read, and
-see changes after calling ``refresh``.
+frame with its state, time and report. Frames with newborn Gaussians have a second file. A frame is committed by
+renaming its file to its final name. Only one process appends and deletes frames, through a ``History``. Other processes
+only read, and see changes after calling ``refresh``.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class History(HistoryReader):
             ``History.open``.
 
     Attributes:
-        record_seconds: time that the last ``append`` spent on the report, in seconds: the encoding time, and a share of
-            the write time proportional to the report's size.
+        record_seconds: time in seconds that the last ``append`` spent on the report. It consists of the encoding time
+            and a share of the write time proportional to the report's size.
 
     Raises:
         HistoryError: if ``directory`` already contains states.
@@ -100,7 +100,14 @@ class History(HistoryReader):
         self.copy_frames(self.indices, directory)
 
     def copy_frames(self, indices: Iterable[int], directory: Path | str | None = None) -> History:
-        """Copies committed frames to memory or to another directory; ids, births and lifetimes are preserved."""
+        """Returns a copy of the given frames, in memory or in another directory.
+
+        Ids, births and lifetimes are preserved.
+
+        Args:
+            indices: indices of committed frames.
+            directory: folder of the copy, created if missing, or None for a copy in memory.
+        """
         copy = History(directory)
         for index in sorted(set(indices)):
             arrays, log = self.gaussians(index).arrays(), self.log_at(index)
@@ -121,7 +128,9 @@ class History(HistoryReader):
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:
-        """Commits the state of one frame with its report. If there is a directory, both are on disk when this returns.
+        """Commits the state and the report of one frame.
+
+        In a history with a directory, they are on disk when this method returns.
 
         Args:
             index: frame index, greater than all previous indices.
@@ -131,7 +140,7 @@ class History(HistoryReader):
             report: report as JSON values (finite numbers, strings, lists, mappings).
             parents: [B] row of each newborn Gaussian's parent, or None if no newborn Gaussian has a parent.
             roots: roots of all Gaussians (``births.extend_roots``), or None if newborn Gaussians are their own roots.
-            effects: arrays that a cold start needs, keyed by effect and array name.
+            effects: arrays that effects need for a cold start, keyed by effect and array name.
 
         Raises:
             HistoryError: if the index is not greater than the last index, Gaussians are missing, ids or opacities
@@ -182,7 +191,7 @@ class History(HistoryReader):
         self._write(index, time, frame, text, log, births, self._fixed or fixed, pack_effects(effects))
 
     def _birth(self, index: int, born: Gaussians, parents: Int | None, roots: Gaussians | None) -> Arrays:
-        """Returns the stored arrays of a birth.
+        """Returns the arrays to store for the Gaussians born in a frame.
 
         If a truncated frame is committed again with the same birth, its Gaussians keep their ids. In any other case,
         they get ids that have never been used, not even in a truncated frame.
@@ -209,7 +218,7 @@ class History(HistoryReader):
         self, index: int, time: float, frame: Arrays, text: str, log: Int, births: Mapping[int, Arrays], fixed: Arrays,
         left: NDArray[np.uint8] | None,
     ) -> None:  # fmt: skip
-        """Commits a frame that has been validated.
+        """Commits a validated frame.
 
         Args:
             index: index of the frame.
@@ -278,9 +287,9 @@ class History(HistoryReader):
         return deleted
 
     def move_to_scratch(self, folder: Path | None, keep_newest: int = 1) -> None:
-        """Moves all states except the first and the newest from memory to a scratch file, bit-identically.
+        """Moves all states except the first and the newest from memory to a scratch file, without changing any value.
 
-        If there is no disk space, states stay in memory. The file is deleted with this history.
+        If there is no disk space, states stay in memory. The file is deleted together with this history.
 
         Args:
             folder: folder for the scratch file, or None for the system's temporary folder.
@@ -333,7 +342,7 @@ class History(HistoryReader):
         """Rewrites the file of a committed frame with identical content.
 
         Returns:
-            Whether the file was rewritten; false if the frame is not in memory.
+            True if the file was rewritten, or False if the frame is not in memory.
         """
         frame, text = self._frames.get(index), self._texts.get(index)
         if self._files is None or frame is None or text is None or index not in self._times:
@@ -352,9 +361,9 @@ class History(HistoryReader):
         Args:
             index: index of a frame before the newest one.
             time: time of the frame in seconds.
-            arrays: arrays named in ``PER_FRAME``, and those named in ``WHOLES`` if there are any.
+            arrays: all arrays named in ``PER_FRAME``, and any of those named in ``WHOLES``.
             report: report as JSON values; see ``append``.
-            effects: arrays that a cold start needs; see ``append``.
+            effects: arrays that effects need for a cold start; see ``append``.
 
         Raises:
             HistoryError: if the frame is not before the newest one, or the number of Gaussians differs.

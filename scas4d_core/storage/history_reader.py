@@ -31,7 +31,7 @@ ROOTS = ("means", "factors", "rotations")
 
 
 class HistoryReader(FramesReader):
-    """Reads committed states from the memory of this process, or from a directory to which another process writes.
+    """Reader for committed states, in the memory of this process or in a directory to which another process writes.
 
     Attributes:
         damaged: maps each unreadable frame to the reason; these frames are not in ``indices``.
@@ -89,10 +89,14 @@ class HistoryReader(FramesReader):
         return roots.replace(ids=fixed["ids"], retired=retired_after(log, fixed["ids"]))
 
     def complete_state(self, index: int, state: Gaussians) -> Gaussians:
-        """Completes a recomputed state of a frame with the Gaussians that were born or revived in it.
+        """Returns a recomputed state, completed with the Gaussians that were born or revived in its frame.
 
         Newborn Gaussians are read from their birth file. Revived Gaussians are not stored separately, so they are taken
         from the next readable frame.
+
+        Args:
+            index: index of the frame.
+            state: recomputed state, possibly without the Gaussians born in the frame.
         """
         log = self.log_at(index)
         for birth in births_in(log):
@@ -114,13 +118,13 @@ class HistoryReader(FramesReader):
 
     @property
     def ids(self) -> Int:
-        """[count] id of the Gaussian in each row, for all Gaussians so far."""
+        """[count] ids of all Gaussians so far, in row order."""
         ids: Int = self._fixed_after(births_in(self._events())).get("ids", np.zeros(0, np.int64))
         return ids
 
     @property
     def count(self) -> int:
-        """Number of all Gaussians so far."""
+        """Number of Gaussians so far, including retired ones."""
         return len(self.ids)
 
     @property
@@ -132,13 +136,13 @@ class HistoryReader(FramesReader):
 
     @property
     def parents(self) -> Int:
-        """[count] row of the parent of the Gaussian in each row; −1 if it has none."""
+        """[count] row of the parent of the Gaussian in each row; −1 for Gaussians without a parent."""
         none = np.full(len(self._fixed.get("ids", ())), NO_PARENT, np.int64)
         return np.concatenate([none, *(self._born(birth)["parents"] for birth in births_in(self._events()))])
 
     @property
     def highest_id(self) -> int:
-        """Highest id that any Gaussian ever had, including those of truncated frames; −1 if there is none."""
+        """Highest id of any Gaussian ever, including Gaussians of truncated frames; −1 if there are none."""
         known = [self.ids, *(arrays["ids"] for arrays in self._births.values())]
         if (files := self._files) is not None:
             for index in set(files.births()) - self._births.keys():
@@ -191,8 +195,8 @@ class HistoryReader(FramesReader):
     ) -> NDArray[Any]:
         """Returns one array over several frames, [T, N, ...].
 
-        Values are NaN before a Gaussian's birth, and keep the last value while it is retired. Only this array is read
-        from the files, so memory use is limited to the result.
+        Values are NaN before a Gaussian's birth, and constant while it is retired. Only this array is read from the
+        files, so memory use is limited to the result.
 
         Args:
             name: name of the array, one of ``PER_FRAME``.
@@ -225,7 +229,7 @@ class HistoryReader(FramesReader):
 
 
 def _taken(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
-    """Returns the given rows of an array; NaN for rows beyond its end."""
+    """Returns the given rows of an array, with NaN for rows beyond its end."""
     if not rows.size or int(rows.max()) < len(array):
         return array[rows]
     taken = np.full((*rows.shape, *array.shape[1:]), np.nan, array.dtype)

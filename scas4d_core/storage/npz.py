@@ -1,8 +1,8 @@
 """Writes npz files atomically with a checksum per array, and reads them with verification. Requires only NumPy.
 
-The zip comment contains a 128-bit BLAKE2b digest of the dtype, shape and values of every array. The CRC-32 of the zip
-does not suffice: a flipped bit in an array header can make numpy read too few bytes, and then the CRC is never checked.
-Files without these checksums are rejected.
+The zip comment contains a 128-bit BLAKE2b digest of the dtype, shape and values of every array. Files without these
+checksums are rejected. The CRC-32 of the zip does not suffice, because a flipped bit in an array header can make numpy
+read too few bytes. The CRC is then never checked.
 """
 
 from __future__ import annotations
@@ -53,7 +53,10 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 @contextmanager
 def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
-    """Opens the temporary file ``beside``; on success, syncs it and renames it to ``path``, otherwise deletes it."""
+    """Opens the temporary file ``beside`` for writing.
+
+    On success, the file is synced and renamed to ``path``. Otherwise, it is deleted.
+    """
     try:
         with beside.open("wb") as file:
             yield file
@@ -67,7 +70,7 @@ def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
 
 
 def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
-    """Writes the zip like ``np.savez``, with the checksums as its comment."""
+    """Writes a zip file like ``np.savez``, with the checksums as its comment."""
     checksums = {}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, given in arrays.items():
@@ -117,7 +120,7 @@ def _checksums(archive: zipfile.ZipFile) -> dict[str, str]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs a folder, so that renames and deletions in it survive a power failure."""
+    """Syncs a folder so that renames and deletions in it survive a power failure."""
     if os.name != "posix":  # other systems cannot open a directory for syncing
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -128,12 +131,12 @@ def sync_folder(folder: Path) -> None:
 
 
 def member(name: str) -> str:
-    """Returns the file name of an array in an npz; numpy treats array names that end in ".npy" ambiguously."""
+    """Returns the file name of an array in an npz. Array names that end in ".npy" would be ambiguous in numpy."""
     return f"{name}.npy"
 
 
 def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Reads arrays from an npz file and verifies their checksums; nothing is unpickled.
+    """Reads arrays from an npz file and verifies their checksums. Pickled objects are rejected.
 
     Args:
         path: path of the file.
@@ -142,7 +145,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
 
     Raises:
         FileNotFoundError: if the file does not exist.
-        ValueError: if the file is damaged, or an array is missing; the message contains the file name, without its
+        ValueError: if the file is damaged, or an array is missing. The message contains the file name, without its
             folder, and the reason.
 
     >>> from tempfile import TemporaryDirectory
@@ -193,13 +196,21 @@ def iter_verified(path: Path) -> Iterator[int]:
 
 
 def verify(path: Path) -> None:
-    """Verifies a whole npz file; raises the same errors as ``iter_verified``."""
+    """Verifies a whole npz file.
+
+    Raises:
+        FileNotFoundError: if the file does not exist.
+        ValueError: if the file is damaged; see ``read_npz``.
+    """
     for _ in iter_verified(path):
         pass
 
 
 def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
-    """Reads one array in pieces, yields their sizes, and returns its checksum; the CRC is verified at the end."""
+    """Reads one array in pieces, yields the size of each piece, and returns the checksum of the array.
+
+    The CRC is verified when the end is reached.
+    """
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, fortran, dtype = readers[version](file)
@@ -219,6 +230,6 @@ def _damage(path: Path, error: BaseException) -> ValueError:
 
 
 def clear_parts(folder: Path) -> None:
-    """Removes temporary files of interrupted ``write_npz`` calls. Only the folder's writer may call this."""
+    """Removes temporary files of interrupted ``write_npz`` calls. Only the process that writes may call this."""
     for part in folder.glob(".*.npz.*.part"):
         part.unlink(missing_ok=True)

@@ -1,11 +1,11 @@
-"""Selects the states that retention deletes, oldest first; the states of a chunk are deleted together."""
+"""Selects the states that retention deletes, oldest first. The states of a chunk are deleted together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
 GoWith = Callable[[int], list[int]]
-"""Function that returns a frame and all frames to delete together with it; some may already have been deleted."""
+"""Function that returns a frame and all frames to delete together with it. Some may already have been deleted."""
 
 
 def surplus(
@@ -16,7 +16,7 @@ def surplus(
     size_bytes: int | None,
     go_with: GoWith | None = None,
 ) -> list[int]:
-    """Returns the indices of the states to delete, in increasing order; the first and newest states are never deleted.
+    """Returns the indices of the states to delete, in increasing order. The first and newest states are always kept.
 
     Args:
         indices: indices of all states, in increasing order.
@@ -25,7 +25,7 @@ def surplus(
         last: number of states to keep in addition to the first, or None to keep all. A chunk is deleted once it
             contains none of these states.
         size_bytes: maximum total size in bytes, enforced by deleting whole chunks, or None for no limit.
-        go_with: function that returns the states to delete together, or None to delete each state separately.
+        go_with: function that returns the states to delete together with a state, or None to delete each separately.
 
     >>> ten = lambda index: 10
     >>> surplus(range(8), ten, 2, None, 61)

@@ -1,4 +1,4 @@
-"""Moves frames of an in-memory history to a scratch file, from which they are read on every access."""
+"""Scratch files for frames of an in-memory history. Frames in a scratch file are read again on every access."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 ROUNDED = 512
-"""Granularity of block sizes, in bytes."""
+"""Block sizes are multiples of this number of bytes."""
 IN_MEMORY = 16
 """Number of newest states that a history without a directory keeps in memory; older states go to a scratch file."""
 
 
 class ScratchFile:
-    """Unnamed temporary file that is removed even if the process crashes. It is neither synced nor checksummed.
+    """Unnamed temporary file for frames, which is removed even if the process crashes.
+
+    The file is neither synced nor checksummed.
 
     Args:
         within: folder in which the file is created on first use, or None for the system's temporary folder.
@@ -31,12 +33,15 @@ class ScratchFile:
         self._file: IO[bytes] | None = None
         self._end = 0
         self._free: dict[int, list[int]] = {}
-        """Offsets of the free blocks of each size."""
+        """Offsets of free blocks, keyed by block size."""
         self._full = False
         self._one_at_a_time = Lock()
 
     def store(self, frame: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
-        """Moves the arrays of a frame to the file, or returns them unchanged if the disk is full."""
+        """Moves the arrays of a frame to the file, and returns the frame as a ``ScratchFrame``.
+
+        If the disk is full, or the frame has already been moved, it is returned unchanged.
+        """
         if isinstance(frame, ScratchFrame) or self._full:
             return frame
         try:
@@ -70,7 +75,7 @@ class ScratchFile:
             left, begins = left[count:], begins + count
 
     def get(self, begins: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """Reads the array at an offset."""
+        """Reads the array at an offset of the file."""
         assert self._file is not None
         array = np.empty(shape, dtype)
         left, at = array.reshape(-1).view(np.uint8).data, begins
@@ -82,18 +87,21 @@ class ScratchFile:
         return array
 
     def free(self, places: Mapping[str, tuple[int, int]]) -> None:
-        """Releases blocks, given as (offset, size), for reuse. Lock-free, because the garbage collector may call it."""
+        """Releases blocks, given as (offset, size) in bytes, for reuse.
+
+        This method takes no lock, because the garbage collector may call it at any time.
+        """
         for begins, size in places.values():
             self._free.setdefault(_size_class(size), []).append(begins)
 
 
 def _size_class(size: int) -> int:
-    """Returns the block size for an array of ``size`` bytes; blocks of equal size are interchangeable."""
+    """Returns the block size for an array of ``size`` bytes. Blocks of equal size are interchangeable."""
     return -(-size // ROUNDED) * ROUNDED
 
 
 class ScratchFrame(Mapping[str, NDArray[Any]]):
-    """The arrays of one frame, stored in a scratch file.
+    """Mapping from names to the arrays of one frame, which are read from a scratch file.
 
     Args:
         file: file that contains the arrays.

@@ -22,7 +22,7 @@ def cluster(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Measures how much a three-node Ray cluster on this machine slows updates and views, against local processes.
+    """Measures how much a three-node Ray cluster on this machine slows updates and views, relative to local processes.
 
     Example: scripts/bench cluster samples/robot --set static.iterations=300 --set update.iterations=20
     """

@@ -41,7 +41,7 @@ class CostFigures:
 def measure(
     study: Study, address: str, *, scenes: int, turns: int, views: int, echo: Echo = print
 ) -> dict[str, CostFigures]:
-    """Measures both placements alternately.
+    """Measures both placements alternately and returns the figures of each.
 
     Args:
         study: study whose frames are sent to each scene.
@@ -50,6 +50,9 @@ def measure(
         turns: number of measurements of each placement.
         views: number of views rendered per turn.
         echo: callback that prints progress messages.
+
+    Raises:
+        StudyError: a frame was not committed, or a view failed.
     """
     figures = {name: CostFigures() for name in PLACEMENTS}
     services = {
@@ -79,7 +82,7 @@ def measure(
 
 
 def summarize(found: dict[str, CostFigures], scenes: int) -> str:
-    """Formats the measurements as Markdown."""
+    """Formats the measurements as a Markdown table, followed by the ratio per frame."""
     local, ray = found["local"], found["ray"]
     ratios = [there / here for here, there in zip(local.updates, ray.updates, strict=True)]
     rows = [
@@ -101,7 +104,7 @@ def summarize(found: dict[str, CostFigures], scenes: int) -> str:
 
 
 def _begun(study: Study, service: Service) -> str:
-    """Creates a scene and waits for its first frame."""
+    """Creates a scene, waits until its first frame is committed, and returns its id."""
     scene = study.create(service)
     FrameSender(study, service, scene).send(0)
     service.finish(scene, 1)
@@ -121,7 +124,7 @@ def _views(service: Service, scene: str, camera: str, count: int) -> list[float]
 
 
 def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str, str]) -> dict[str, list[float]]:
-    """Returns the seconds of each update, keyed by service; the services take turns, frame by frame."""
+    """Sends frames to the services in turn and returns the seconds of each update, keyed by service."""
     seconds: dict[str, list[float]] = {name: [] for name in scenes}
     for index in range(1, len(study.frames)):
         for name in (PLACEMENTS, PLACEMENTS[::-1])[index % 2]:

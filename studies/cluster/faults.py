@@ -25,19 +25,19 @@ from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests,
 Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 
 GOES_ON_S = 30.0
-"""Time within which a scene must resume after its node is lost."""
+"""Seconds within which a scene must resume after its node is lost."""
 HEAD_GONE_S = 10.0
-"""How long the head stays down."""
+"""Seconds for which the head stays down."""
 WAITS_S = 5.0
-"""Time after which an unplaced worker counts as waiting for resources; otherwise, it starts within a few seconds."""
+"""Seconds after which an unplaced worker counts as waiting for resources. Workers with resources start earlier."""
 SWEPT_S = 180.0
-"""Time within which the folders of earlier workers must be removed."""
+"""Seconds within which the folders of earlier workers must be removed."""
 
 
 def killed_nodes(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Kills the node of the scene's worker with `kill -9` at `count` random moments; a new node joins each time."""
+    """Kills the node of the scene's worker with `kill -9` at `count` random moments. A new node joins each time."""
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []
@@ -183,7 +183,11 @@ def _second_half(study: Study, service: Service, scene: str, sender: FrameSender
 
 
 def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
-    """Waits until the scene has a worker; returns its node and process id."""
+    """Waits until the scene has a worker, and returns its node and process id.
+
+    Raises:
+        StudyError: no worker is running on any node within the time limit.
+    """
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         pid = service.worker_pid(scene)
@@ -194,7 +198,7 @@ def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
 
 
 def _changed(folder: Path) -> dict[str, int]:
-    """Returns the modification time of each file in a folder, keyed by name; files that disappear are skipped."""
+    """Returns the modification time of each file in a folder, keyed by name. Files that disappear are skipped."""
     changes = {}
     for name in os.listdir(folder) if folder.is_dir() else ():
         with suppress(FileNotFoundError):
@@ -203,7 +207,7 @@ def _changed(folder: Path) -> dict[str, int]:
 
 
 def _fill(study: Study, service: Service) -> list[str]:
-    """Creates scenes until no node has room for another worker; returns the scene ids."""
+    """Creates scenes until no node has room for another worker, and returns their ids."""
     scenes: list[str] = []
     while not scenes or not _waits(service, scenes[-1]):
         scenes.append(study.create(service))
@@ -247,13 +251,16 @@ def _works(service: Service, scene: str, before: int | None) -> bool:
 ON_NODES = ("nodes", "stopped", "full")
 """Names of the node scenarios."""
 OF_THE_HEAD = "head"
-"""Name of the scenario whose head uses Redis; it runs in a cluster of its own."""
+"""Name of the scenario in which the head is killed. It runs in a cluster of its own, whose head uses Redis."""
 AS_LOCALLY = ("kills", "beginnings", "log", "bits")
-"""Scenarios shared with the single-machine study. The others test the service itself, wherever its workers run."""
+"""Names of the scenarios that are shared with the single-machine study.
+
+The remaining scenarios of that study do not depend on where the workers run.
+"""
 
 
 def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
-    """Runs the node scenarios on three nodes, and `local`; compares the states with a single-machine run.
+    """Runs the scenarios named in `parts` on a cluster and compares the states with a single-machine run.
 
     Args:
         study: study that defines the frames and the service.
@@ -262,6 +269,9 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         parts: names of the scenarios to run.
         local: function that runs the named scenarios of a study whose service uses the cluster.
         echo: callback that prints progress messages.
+
+    Raises:
+        StudyError: the scenario "head" is requested alone, but redis-server is not installed.
     """
     outcomes = []
     if set(parts) & {*ON_NODES, OF_THE_HEAD}:

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 HEALTH = {"period_ms": 1000, "timeout_ms": 2000, "failure_threshold": 3, "initial_delay_ms": 1000}
-"""Ray's health checks: a node that does not respond is lost after 3 to 9 s (Ray's default: about a minute)."""
+"""Ray's health checks. A silent node is declared lost after 3 to 9 s instead of the default of about a minute."""
 REDIS, REDIS_S = "RAY_REDIS_ADDRESS", 10.0
 STORE_BYTES = 80 * 2**20
 """Size of each node's object store, which scenes do not use."""
@@ -62,7 +62,7 @@ class Nodes:
             del os.environ[REDIS]
 
     def add(self, labels: Mapping[str, str] | None = None) -> int:
-        """Adds a node with the given labels; returns the process id of its raylet."""
+        """Adds a node with the given labels and returns the process id of its raylet, which identifies the node."""
         node = self._cluster.add_node(
             num_cpus=self._cpus, object_store_memory=STORE_BYTES, labels=dict(labels) if labels else None
         )
@@ -71,7 +71,7 @@ class Nodes:
         return pid
 
     def of(self, pid: int) -> int | None:
-        """Returns the node on which a process runs, by its raylet's pid; None if it runs elsewhere or has ended."""
+        """Returns the node on which a process runs, or None if the process runs elsewhere or has ended."""
         while pid > 1:
             if pid in self._nodes:
                 return pid
@@ -79,7 +79,7 @@ class Nodes:
         return None
 
     def kill(self, node: int) -> None:
-        """Kills all processes of a node with `kill -9`; the node does not restart."""
+        """Kills all processes of a node with `kill -9`. The node does not restart."""
         tree = [node, *_below(node)]
         for pid in tree:
             _signal(pid, signal.SIGKILL)
@@ -93,7 +93,7 @@ class Nodes:
             _signal(pid, signal.SIGSTOP)
 
     def kill_node_of_head(self) -> None:
-        """Kills the raylet on the head's machine with `kill -9`; services that joined through it lose their actors."""
+        """Kills the head's raylet with `kill -9`. Services that joined the cluster through it lose their actors."""
         self._cluster.head_node.kill_raylet()
 
     def stop_head(self) -> None:
@@ -102,17 +102,21 @@ class Nodes:
         self.kill_node_of_head()
 
     def start_head(self) -> None:
-        """Restarts the head at its old address; its raylet stays down, and services join through another node."""
+        """Restarts the head at its old address, without its raylet. Services join through another node."""
         self._cluster.head_node.start_gcs_server()
 
     def resume(self, node: int) -> None:
-        """Resumes a node with SIGCONT: workers first, before their raylet learns that the node was declared dead."""
+        """Resumes a node with SIGCONT, workers first, before their raylet learns that the node was declared dead."""
         for pid in (*reversed(_below(node)), node):
             _signal(pid, signal.SIGCONT)
 
 
 def redis(program: str) -> subprocess.Popen[bytes]:
-    """Starts an in-memory Redis server, whose address Ray reads from the environment."""
+    """Starts an in-memory Redis server and stores its address in the environment, where Ray reads it.
+
+    Raises:
+        TimeoutError: the server does not listen in time.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

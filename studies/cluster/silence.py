@@ -27,13 +27,17 @@ from studies.running.process import StudyError, wait_until
 HEAD, NODE, PORT = "127.0.0.1", "127.0.0.2", 6397
 APART = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 BETWEEN_S = (8.0, 14.0)
-"""Shortest and longest pause between two kills."""
+"""Shortest and longest pause between two kills, in seconds."""
 PATIENCE_S = 60.0
 NOT_STARTED = "the cluster did not start"
 
 
 class SupervisedCluster:
-    """A cluster with one node, and a head that is restarted whenever it exits."""
+    """A cluster with one node, and a head that is restarted whenever it exits.
+
+    Raises:
+        StudyError: the process does not have root privileges, or redis-server is not installed.
+    """
 
     def __init__(self) -> None:
         if os.geteuid() != 0:
@@ -77,7 +81,7 @@ class SupervisedCluster:
             head.wait()
 
     def _start(self, *options: str) -> subprocess.Popen[bytes] | None:
-        """Starts a Ray node; returns None if the study has ended."""
+        """Starts a Ray node and returns its process, or None if the study has ended."""
         store = ("--object-store-memory", str(STORE_BYTES), "--block", "--disable-usage-stats")
         with self._starting:
             if self._over:
@@ -93,15 +97,15 @@ class SupervisedCluster:
 
 
 class Answers:
-    """An actor that confirms that it is alive."""
+    """A Ray actor that confirms that it is running."""
 
     def is_there(self) -> bool:
-        """Returns True."""
+        """Returns True, as a response from a running actor."""
         return True
 
 
 def silences(count: int, echo: Callable[[str], None]) -> list[float]:
-    """Kills the head `count` times; returns the seconds from each kill until a new actor responds."""
+    """Kills the head `count` times and returns the seconds from each kill until a new actor responds."""
     import ray
 
     gaps = []
@@ -135,7 +139,7 @@ def summarize(found: Sequence[float]) -> str:
 
 
 def _joined(ray: Any) -> bool:
-    """Returns whether this process has joined the cluster through the node, not the head, and an actor responds."""
+    """Tries to join the cluster through the node, not the head, and returns whether an actor then responds."""
     with contextlib.suppress(Exception):  # whatever Ray raises while the node is starting
         ray.init(address=f"{HEAD}:{PORT}", _node_ip_address=NODE, log_to_driver=False, logging_level="ERROR")
         ray.get(ray.remote(Answers).options(num_cpus=0.1).remote().is_there.remote(), timeout=PATIENCE_S)

@@ -29,7 +29,7 @@ from scas4d_core.storage.history import History
 POINTS = 1000
 """Number of tracked points, drawn from the moving Gaussians."""
 VIEWS = 6
-"""Number of frames whose test cameras are rendered, spread evenly over the capture."""
+"""Number of frames in which the test cameras are rendered, spread evenly over the capture."""
 READS = 40
 """Number of frames read in random order."""
 
@@ -39,6 +39,7 @@ class CompactFigures:
     """Measurements of one capture.
 
     Attributes:
+        capture: capture name.
         gaussians: number of Gaussians.
         moving: number of moving Gaussians.
         frames: number of frames in the file.
@@ -76,7 +77,7 @@ class CompactFigures:
 
 
 def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
-    """Returns ``count`` indices that alternate between forward and backward order.
+    """Returns ``count`` indices by going through the given ones back and forth.
 
     >>> back_and_forth([0, 1, 2], 7)
     [0, 1, 2, 1, 0, 1, 2]
@@ -87,7 +88,20 @@ def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
 def measure(
     folder: Path, states: Path, frames: int, bounds: Mapping[str, float], key_every: int | None
 ) -> CompactFigures:
-    """Writes a capture's states, played back and forth, to a compact file and compares it with the states."""
+    """Writes a capture's states, played back and forth, to a compact file and compares it with the states.
+
+    Histories in which Gaussians are born are played only once, because births cannot be reversed.
+
+    Args:
+        folder: capture folder.
+        states: folder that contains the capture's committed states.
+        frames: number of frames in the file.
+        bounds: changed error bounds, keyed by name.
+        key_every: frames between keyframes; the default if None.
+
+    Raises:
+        InputError: ``frames`` is smaller than the number of states.
+    """
     capture = open_source(folder)
     history = History.load(states)
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
@@ -160,7 +174,7 @@ def summarize(found: CompactFigures) -> str:
 
 
 def _write(file: Path, head: FileHeader, states: Iterator[Gaussians], key_every: int) -> list[float]:
-    """Returns the CPU time to write each frame after the first, in seconds."""
+    """Writes the states to a file and returns the CPU seconds of each frame after the first."""
     seconds = []
     with CompactWriter(file, head, key_every) as writer:
         for place, state in enumerate(states):
@@ -177,7 +191,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _reads(reader: CompactReader) -> list[float]:
-    """Returns the CPU seconds per frame read in random order, after the last frame has been read once."""
+    """Reads the last frame, then ``READS`` frames in random order, and returns the CPU seconds of each random read."""
     draw = np.random.default_rng(0)
     seconds = []
     reader.state(reader.frames[-1])

@@ -17,7 +17,7 @@ from scas4d_core.storage.compaction import CHUNK_FRAMES
 from scas4d_core.storage.history import History
 
 GAUSSIANS = 200
-"""Gaussians per state. Opening a history only locates its states, so their size does not matter."""
+"""Number of Gaussians per state. Opening a history only locates its states, so their size does not matter."""
 EXACT, TURNS, READS = 48, 5, 200
 
 

@@ -1,6 +1,7 @@
 """Updates the same frames on both devices, from the same frame 0, and compares images, tracks and times.
 
-Without a GPU, the kernels of the GPU run on the CPU device of NVIDIA Warp: results are comparable, times are not.
+Without a GPU, the kernels of the GPU run on the CPU device of NVIDIA Warp. The results are then comparable, but the
+times are not.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class DeviceRow:
 
 
 def use_cpu_without_gpu() -> str:
-    """Maps device "gpu" to Warp's CPU device if there is no GPU; returns a description of the device in use.
+    """Maps device "gpu" to Warp's CPU device if there is no GPU, and returns a description of the device in use.
 
     Raises:
         SystemExit: NVIDIA Warp is not installed.
@@ -122,7 +123,10 @@ def with_last_bits_changed(gaussians: Gaussians) -> Gaussians:
 
 
 def track_errors(scenes: dict[Device, Reconstruction], capture: Capture, last: int) -> dict[Device, float]:
-    """Returns the median track error over all frames, in percent of the extent; empty if nothing can be measured."""
+    """Returns the median track error over all frames in percent of the extent, keyed by device.
+
+    The result is empty without ground truth.
+    """
     if capture.ground_truth is None:
         return {}
     scores = {device: measure_tracks(scene, capture, range(last + 1)) for device, scene in scenes.items()}
@@ -131,7 +135,10 @@ def track_errors(scenes: dict[Device, Reconstruction], capture: Capture, last: i
 
 
 def distances(scenes: dict[Device, Reconstruction], index: int) -> NDArray[np.float64]:
-    """Returns the distance in metres between the two positions of each moving Gaussian that both states share."""
+    """Returns the distance in metres between the two positions of each moving Gaussian that both states contain.
+
+    Returns a single 0 if there are none.
+    """
     mine, true = (scenes[device].history.gaussians(index) for device in ("gpu", "cpu"))
     _, here, there = np.intersect1d(mine.ids[mine.moving], true.ids[true.moving], return_indices=True)
     away: NDArray[np.float64] = np.linalg.norm(

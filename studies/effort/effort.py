@@ -25,7 +25,7 @@ from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TOLERANCE = 0.05
-"""Fraction of the budget by which a frame may deviate; one iteration if that is more."""
+"""Fraction of the budget by which a frame's time may deviate, or one iteration if that takes longer."""
 FRAMES = 50
 """Number of frames of a capture played back and forth."""
 FEW = 8
@@ -33,14 +33,21 @@ FEW = 8
 SEEDS = 3
 """Number of seeds for the updates of a capture as recorded."""
 SEEN_DB = 45.0
-"""PSNR cap: differences above it are invisible; slowed captures reach 54 dB."""
+"""Cap of the PSNR. Differences above it are invisible, and slowed captures reach 54 dB."""
 COUNTED_FROM = 2
-"""First update that counts; earlier ones have no previous motion to start from and no measured speed."""
+"""First update that counts. Earlier ones have no previous motion to start from and no measured speed."""
 
 
 @dataclass
 class Kept:
-    """Measurements under one budget: seconds, iterations and seconds per iteration of each frame."""
+    """Measurements under one time budget.
+
+    Attributes:
+        milliseconds: the budget in milliseconds.
+        seconds: time of each frame in seconds.
+        iterations: number of iterations of each frame.
+        each: seconds per iteration of each frame.
+    """
 
     milliseconds: float
     seconds: list[float] = field(default_factory=list)
@@ -56,7 +63,7 @@ class Kept:
         return [max(TOLERANCE * self.milliseconds, 1000 * each) for each in self.each]
 
     def row(self) -> Row:
-        """Returns the result for one budget; shares are fractions of the number of frames."""
+        """Returns the row of the budget, in which ``within`` and ``not_over`` are fractions of the frames."""
         off, allowed = np.array(self.off()), np.array(self.allowed())
         return {
             "milliseconds": self.milliseconds,
@@ -73,7 +80,7 @@ class Kept:
 def measure_budgets(
     folder: Path, out: Path, milliseconds: Sequence[float], *, frames: int = FRAMES, report: Report = print
 ) -> Row:
-    """Plays a capture back and forth under each budget; writes ``out/effort/<capture>-budgets.json``.
+    """Plays a capture back and forth under each budget and writes ``out/effort/<capture>-budgets.json``.
 
     A frame's time is measured from the start of image decoding until its commit is synced to disk.
 
@@ -199,7 +206,7 @@ def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np
 
 
 def _each(report: Any) -> float:
-    """Returns the seconds per iteration of an update."""
+    """Returns the seconds per iteration of an update, or 0 if its curve has fewer than two points."""
     points = report.curve
     if len(points) < 2:
         return 0.0
@@ -215,7 +222,7 @@ def changed(settings: Settings, **changes: Any) -> Settings:
 
 
 def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
-    """Writes a result to ``out/effort/<name>.json``, with the machine and the source version."""
+    """Writes a result to ``out/effort/<name>.json`` with the machine and the source version, and returns the row."""
     from scas4d_core.kernels.jit import threads
 
     row: Row = {

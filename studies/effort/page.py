@@ -13,13 +13,16 @@ from studies.effort.effort import SEEDS, TOLERANCE
 from studies.effort.report import TARGET
 
 KEPT = 0.95
-"""Share of the frames that must meet a budget."""
+"""Fraction of the frames that must meet a budget."""
 TIME, LOSS_DB, REPEATS = 0.60, 0.10, 0.10
-"""Targets of the adaptive preset against the fixed one: share of its time, PSNR loss, share of its time on repeats."""
+"""Targets of the adaptive preset compared with the fixed one.
+
+These are the fraction of the time, the PSNR loss in dB, and the fraction of the time on repeated frames.
+"""
 
 
 def effort_text(out: Path, captures: Sequence[str]) -> str:
-    """Returns the Markdown sections for which measurements exist; an empty string if there are none."""
+    """Returns the Markdown sections for which measurements exist, or an empty string if there are none."""
     budgets = _rows(out, captures, "budgets")
     adaptive = _rows(out, captures, "adaptive")
     report = _rows(out, captures, "report")

@@ -1,4 +1,4 @@
-"""Cost of an update's report: its stage's share of the time, and a check that the stage covers the whole cost.
+"""Cost of an update's report: the share of its stage in the time, and a check that the stage covers the whole cost.
 
 The stage ``report`` covers the stage timers, losses that are computed only for the curve, the cameras' colour shifts,
 and assembling and writing the record. Publishing the record, as a worker does, is timed here and added to the stage.
@@ -26,11 +26,11 @@ from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TARGET = 0.02
-"""Largest share of an update that its report may cost."""
+"""Largest fraction of an update's time that its report may take."""
 
 
 def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report = print) -> Row:
-    """Runs updates of ``scas4d`` with and without a full report; writes ``out/effort/<capture>-report.json``.
+    """Runs updates of ``scas4d`` with and without a full report and writes ``out/effort/<capture>-report.json``.
 
     Args:
         folder: capture folder.

@@ -18,7 +18,13 @@ from studies.quality.settings import settings_of
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame of a sequence, the images of the test cameras, and whether it repeats the previous frame."""
+    """A frame of a sequence.
+
+    Attributes:
+        frame: the frame.
+        truth: true images of the test cameras, from 0 to 1, keyed by camera name.
+        repeats: whether the frame repeats the previous one.
+    """
 
     frame: Frame
     truth: Mapping[str, NDArray[np.float32]]
@@ -36,7 +42,7 @@ def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
 
 
 def as_it_is(capture: Capture, updates: int) -> Iterator[Shown]:
-    """Yields the first ``updates`` frames of a capture after frame 0."""
+    """Yields the first ``updates`` frames of a capture after frame 0, or fewer if the capture is shorter."""
     for index in range(1, min(updates + 1, capture.frame_count)):
         yield Shown(capture.frame(index), _truth(capture, index))
 
@@ -54,9 +60,9 @@ def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
 
 
 def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterator[Shown]:
-    """Renders a slowed-down capture (by default, to a third of its speed) from interpolated reconstructed states.
+    """Yields the frames of a capture slowed down by ``factor``, rendered from interpolated states of a reconstruction.
 
-    Both the training images and the ground truth are rendered, so the results are comparable only with each other.
+    The training images and the ground truth are both rendered, so the results are comparable only with each other.
     """
     source = started(capture, settings_of("scas4d"), out)
     for index in range(1, min(updates + 1, capture.frame_count)):

@@ -37,7 +37,15 @@ TITLE, GAP = 24, 12
 
 @dataclass(frozen=True)
 class Found:
-    """Gaussians from a reader: [N, 3] means, scales, colours; [N, 4] rotations (x, y, z, w); [N] opacities."""
+    """Gaussians returned by a reader, in the coordinates of the file.
+
+    Attributes:
+        means: [N, 3] means.
+        rotations: [N, 4] quaternions (x, y, z, w).
+        scales: [N, 3] lengths of the axes.
+        colours: [N, 3] colours.
+        opacities: [N] opacities.
+    """
 
     means: Float
     rotations: Float
@@ -64,7 +72,7 @@ class Found:
 
 @dataclass(frozen=True)
 class ExportFigures:
-    """Measurements of one format.
+    """Measurements of one export format.
 
     Attributes:
         format: format name.
@@ -84,7 +92,15 @@ class ExportFigures:
 def measure(folder: Path, states: Path) -> list[ExportFigures]:
     """Exports the last committed state of a capture in every format, and renders what the readers return.
 
-    All test cameras are rendered. In `glb-parts`, the last state is the first one, moved to the end of the animation.
+    The views are those of the test cameras, or of the training cameras if there are none. In `glb-parts`, the last
+    state is the first one, moved to the end of the animation.
+
+    Args:
+        folder: capture folder.
+        states: folder that contains the capture's committed states.
+
+    Returns:
+        The measurements of each format.
     """
     capture = open_source(folder)
     history = History.load(states)
@@ -112,7 +128,7 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
 
 
 def summarize(figures: list[ExportFigures]) -> str:
-    """Formats the measurements as Markdown."""
+    """Formats the measurements as a Markdown table, with one row per format."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
     return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])
 

@@ -1,6 +1,7 @@
 """Comparison of the moving parts of an exported asset, read back with pygltflib, with their true poses.
 
-Each true part is matched one to one (Hungarian algorithm) with the node that contains most of its points in frame 0.
+True parts and nodes are matched one to one (Hungarian algorithm), so that nodes contain as many points of their parts
+in frame 0 as possible.
 The comparison covers the motion since frame 0: the angle of the residual rotation, and the mean position error over the
 points of the part.
 """
@@ -35,7 +36,13 @@ BAR_PERCENT, BAR_DEGREES = 1.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A node of the asset: [N, 3] positions of its Gaussians in frame 0, and [T, 4, 4] motion, in user coordinates."""
+    """A node of the asset.
+
+    Attributes:
+        name: node name.
+        places: [N, 3] positions of its Gaussians in frame 0, in user coordinates.
+        motion: [T, 4, 4] motion since frame 0, in user coordinates. NaN in frames without a key.
+    """
 
     name: str
     places: Float
@@ -66,13 +73,19 @@ class PartFigures:
 
     @property
     def covered(self) -> bool:
-        """Whether the asset contains the part."""
+        """Whether the matching node contains at least ``COVERED`` of the part's points."""
         return self.share >= COVERED
 
 
 @dataclass(frozen=True, eq=False)
 class AssetFigures:
-    """Measurements of an asset: how the number of parts was chosen, the number, and the errors of the true parts."""
+    """Measurements of an asset.
+
+    Attributes:
+        count: how the number of parts was chosen, in words.
+        nodes: number of moving parts in the asset.
+        parts: errors of the true parts.
+    """
 
     count: str
     nodes: int
@@ -180,7 +193,7 @@ def compare(
         nodes: nodes of the asset.
         wanted: ground truth parts.
         points: [P, 3] true points in frame 0.
-        part_id: [P] part of each point.
+        part_id: [P] id of the part to which each point belongs.
         frames: the T frames of the capture.
         extent: extent of the scene in the user's unit.
     """
@@ -207,7 +220,7 @@ def compare(
 
 
 def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Float, Float]:
-    """Returns [T − 1] rotation errors in degrees and [T − 1] position errors in percent of the extent, after frame 0.
+    """Returns the [T − 1] rotation errors in degrees and position errors in percent of the extent after frame 0.
 
     Args:
         found: [T, 4, 4] reconstructed motion.
@@ -229,7 +242,10 @@ def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Flo
 
 
 def told_asset(figures: list[AssetFigures]) -> str:
-    """Formats the measurements as Markdown: one row per part, and one row for all covered parts."""
+    """Formats the measurements as a Markdown table.
+
+    For each asset, there is one row per true part, and one row for all covered parts.
+    """
     head = "| parts | true part | points | in the node | rotation, median (worst) | at its points, median (worst) |"
     rows = [head, "|---|---|---|---|---|---|"]
     for one in figures:

@@ -1,7 +1,7 @@
 """Convergence of an update: PSNR of the test cameras after some of its iterations.
 
 Learning rates and layer starts depend on the fraction of completed iterations, so the curve of a long update does not
-pass through the end points of shorter ones. The test cameras are only rendered; the update never uses them.
+pass through the end points of shorter ones. The test cameras are only rendered. The update never uses them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from studies.quality.first_frame import started
 CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
 """Iterations after which the state is evaluated, if the update has that many. Its last state is always evaluated."""
 WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
-"""Pairs of preset and number of iterations."""
+"""Preset and number of iterations of the settings that are measured by default."""
 
 Look = Callable[[int, UpdateEngine], None]
 """Callback that receives the number of completed iterations and the engine in that state."""
@@ -43,7 +43,7 @@ class WatchedEngine:
         self._done = 0
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
-        """See ``UpdateEngine.iterate``."""
+        """Calls the observer, then runs the iteration; see ``UpdateEngine.iterate``."""
         self._look(self._done, self.inner)
         self._done += 1
         self.inner.iterate(views, step)
@@ -55,7 +55,7 @@ class WatchedEngine:
 def measure_convergence(
     folder: Path, out: Path, *, updates: int = 5, variants: Sequence[Variant] = (), report: Report = print
 ) -> Row:
-    """Records how a capture's first updates converge; writes the curves to ``out/convergence/<capture>.json``.
+    """Records how a capture's first updates converge and writes the curves to ``out/convergence/<capture>.json``.
 
     Args:
         folder: capture folder with test cameras.
@@ -97,7 +97,7 @@ def read_convergence(out: Path, capture: str) -> Row | None:
 
 
 def once(settings: Settings) -> Settings:
-    """Returns the settings with one attempt per frame and a fixed number of iterations, including the first frame."""
+    """Returns the settings with one attempt per frame and the same number of iterations in every update."""
     update = settings.update.model_copy(update={"reject_outliers": False, "cold_start_iterations": 1.0})
     return settings.model_copy(update={"update": update})
 
@@ -124,7 +124,7 @@ def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> lis
 
 
 def _psnr(reconstruction: Any, capture: Capture, state: Gaussians, true: Any) -> float:
-    """Returns the mean PSNR of a state over the test cameras; the state need not be committed."""
+    """Returns the mean PSNR in dB of a state over the test cameras. The state need not be committed."""
     from scas4d_core.query.committed import CommittedScene
     from scas4d_core.storage.history import History
 

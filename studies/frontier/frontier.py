@@ -28,7 +28,7 @@ DEFAULT_ITERATIONS = 100
 UPDATES = 5
 """Updates per row."""
 SEEDS = (0, 1, 2)
-"""Seeds of the updates on the axis "seeds"; all other rows use the first."""
+"""Seeds of the updates on the axis "seeds". All other rows use the first seed."""
 DRIFT = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
 """Preset and number of iterations of the rows that cover a whole capture."""
 MAX_SCALE = "scas4d_core.engines.plan.MAX_SCALE"
@@ -69,7 +69,7 @@ class Variant:
 
     @property
     def record(self) -> Row:
-        """Returns the settings and constants as stored in a row."""
+        """The settings and constants as stored in a row."""
         return settings_record(self.settings, self.constants)
 
 
@@ -111,7 +111,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     ),
     "drift": tuple(Variant(f"{name} {count}", name, count, whole=True) for name, count in DRIFT),
 }
-"""Axes of the study, each of which varies one setting and includes the default.
+"""Axes of the study. Each axis varies one aspect of the default.
 
 Additional layers are evenly spaced in log scale. A separate covariance consists of ΔR and Δs alone, so the deltas of
 each Gaussian start immediately, with the first layer.
@@ -119,11 +119,11 @@ each Gaussian start immediately, with the first layer.
 
 
 def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
-    """Returns the distinct settings of the given axes, default first; of all axes if none are given.
+    """Returns the default, followed by the other distinct settings of the given axes.
 
     Args:
-        axes: names from ``AXES``.
-        most_iterations: settings with more iterations are left out.
+        axes: names from ``AXES``; all axes if empty.
+        most_iterations: settings with more iterations are left out; no limit if None.
 
     Raises:
         ValueError: an axis is unknown.
@@ -153,7 +153,7 @@ def measure_frontier(
         out: study folder.
         axes: names from ``AXES``; all axes if empty.
         updates: updates per row, except on the axis "drift", which covers whole captures.
-        most_iterations: settings with more iterations are left out.
+        most_iterations: settings with more iterations are left out; no limit if None.
         report: callback that prints progress messages.
 
     Returns:

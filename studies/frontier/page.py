@@ -26,7 +26,7 @@ from studies.frontier.tradeoff import (
 from studies.machine import in_words
 
 PREVIEW_LOSS_DB = 4.0
-"""Largest PSNR loss of a preview against the default."""
+"""Largest PSNR loss of a preview relative to the default."""
 LIVE_GAIN_DB = 1.0
 """A live show moves to a slower setting while each doubling of the time gains at least this much."""
 ARCHIVE_GAIN_DB = 0.1
@@ -104,7 +104,13 @@ def chosen(means: Sequence[Point]) -> dict[str, Point]:
 
 
 def score_table(points: Sequence[Point], default: Point | None = None, counts: bool = False) -> str:
-    """Returns a Markdown table of settings, with times relative to ``default``; ``counts`` adds Gaussian counts."""
+    """Returns a Markdown table with one row per point.
+
+    Args:
+        points: points in the order of the rows.
+        default: point to which times are relative; if None, no relative times are shown.
+        counts: whether to add a column with the number of Gaussians.
+    """
     head = ["setting", *(["Gaussians"] if counts else []), "s/frame", "× default", *(h for h, _, _ in COLUMNS)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for point in points:
@@ -123,7 +129,7 @@ def score_table(points: Sequence[Point], default: Point | None = None, counts: b
 
 
 def equal_table(compared: Sequence[EqualSeconds]) -> str:
-    """Returns a Markdown table of captures by budgets; each cell shows the lead and both PSNR values."""
+    """Returns a Markdown table of captures by budgets, whose cells show the lead and the PSNR of both methods."""
     budgets = sorted({one.iterations for one in compared})
     head = ["capture", *(f"{count} iterations" for count in budgets)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
@@ -147,7 +153,7 @@ def equal_words(compared: Sequence[EqualSeconds]) -> str:
 def _draw(
     out: Path, points: Sequence[Point], means: Sequence[Point], captures: Sequence[str], folder: Path, updates: int
 ) -> list[str]:
-    """Draws the plots for which rows exist; returns the file names."""
+    """Draws the plots for which rows exist and returns their file names."""
     words = f"mean of {', '.join(captures)}; first {updates} updates"
     plots.draw_frontier(means, words, folder / "frontier.png", _deviations(points, captures))
     plots.draw_captures(points, captures, folder / "captures.png")
@@ -166,7 +172,7 @@ def _draw(
 
 
 def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
-    """Returns each method's standard deviation in dB, over independent seeds, of the mean over captures."""
+    """Returns the standard deviation of each method's mean over captures in dB, assuming independent seeds."""
     deviations = {method: [spread(points, method, name) for name in captures] for method in METHODS}
     return {
         method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)

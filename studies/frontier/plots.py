@@ -1,8 +1,8 @@
 """Plots of the frontier as PNG files: accuracy against time, within an update and over frames, and time per stage.
 
 Each plot is as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that
-width. The palette of Okabe and Ito is distinguishable with any colour vision; shapes and labels carry the same
-information. In every plot, a colour stands for the same method, axis or stage, and a dash pattern for the same number
+width. The palette of Okabe and Ito is distinguishable with any colour vision, and shapes and labels carry the same
+information. In all plots, a colour denotes the same method, axis or stage, and a dash pattern denotes the same number
 of iterations.
 """
 
@@ -80,7 +80,7 @@ PSNR = "PSNR on the test cameras (dB)"
 DASHES = {25: ":", 100: "-", 300: "--"}
 """Line style of each number of iterations."""
 SMALL_STAGES = 0.02
-"""Share of the longest bar; stages that stay below it in every bar are combined, except the report."""
+"""Fraction of the longest bar. Stages that are shorter than this in every bar are combined, except the report."""
 DEVIATION = "± 1 standard deviation over seeds"
 SIDES = (
     *((5, 0, "left", "center"), (-5, 0, "right", "center"), (0, 4, "center", "bottom"), (0, -4, "center", "top")),
@@ -326,7 +326,7 @@ def _steps(axes: Any, best: Sequence[Point]) -> Any:
 def _curve(
     axes: Any, points: Sequence[Point], method: str, best: Sequence[Point], deviation: float | None, size: float = 24
 ) -> Any:
-    """Draws a method's curve over iterations, with error bars at the default; returns its legend entry."""
+    """Draws a method's curve over iterations, with an error bar at the default, and returns its legend entry."""
     line, colour = curve(points, method), COLOURS[method]
     axes.plot([p.seconds for p in line], [p.psnr for p in line], color=colour, linewidth=1.2, zorder=2)
     _markers(axes, line, best, MARKERS[method], colour, size)
@@ -354,7 +354,7 @@ def _key(plt: Any, marker: str, colour: str, words: str, line: bool = False) -> 
 
 
 def _log_seconds(axes: Any, label: bool = True) -> None:
-    """Makes the time axis logarithmic; without a label, it gets fewer ticks, for a small panel."""
+    """Makes the time axis logarithmic. Without a label, it gets fewer ticks, for a small panel."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -446,7 +446,7 @@ def _along(line: tuple[Any, Any]) -> list[tuple[float, float]]:
 
 
 def _grouped_stages(points: Sequence[Point]) -> Mapping[str, list[float]]:
-    """Returns the seconds of each stage per point, slowest stage first; short stages are combined as "rest"."""
+    """Returns the seconds of each stage per point, slowest stage first, with short stages combined as "rest"."""
     names = dict.fromkeys(name for point in points for name in point.stages)
     by_name = {name: [point.stages.get(name, 0.0) for point in points] for name in names}
     longest = max(sum(point.stages.values()) for point in points)

@@ -44,7 +44,7 @@ class TimedVariant:
     stages: list[dict[str, float]] = field(default_factory=list)
 
     def step(self, capture: Capture, index: int, *, counts: bool) -> float:
-        """Reads a frame and updates the reconstruction; returns the seconds, and records them if ``counts`` is true."""
+        """Reads a frame, updates the reconstruction and returns the seconds. Records them if ``counts`` is True."""
         started, cpu = time.perf_counter(), time.process_time()
         with all_varied(self.variant.constants):
             done = self.reconstruction.step(capture.frame(index))
@@ -121,7 +121,10 @@ def read_times(out: Path, capture: str) -> Row | None:
 
 
 def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
-    """Returns results that only an earlier run has, scaled to the current times; none if the runs are incompatible."""
+    """Returns the results that only an earlier run has, scaled to the current times.
+
+    The result is empty if the two runs have different baselines.
+    """
     if before is None:
         return []
     first, *others = before["settings"]
@@ -153,7 +156,7 @@ def time_of(times: Row | None, variant: Variant) -> Row | None:
 
 
 def _distinct(variants: Sequence[Variant]) -> list[Variant]:
-    """Selects one setting of each group that differs only in seeds and frame counts, which do not affect the time."""
+    """Returns one setting of each group that differs only in seeds and frame counts, which do not affect the time."""
     by_settings = {json.dumps(_unseeded(v.record), sort_keys=True): v for v in variants[::-1]}
     chosen = set(by_settings.values())
     return [variant for variant in variants if variant in chosen]

@@ -33,7 +33,7 @@ SCORES = (
 )
 """Names of the scores in a row."""
 BUDGETS = (25, 50, 100, 200, 300)
-"""Baseline iteration counts; the methods are compared at the times that these take."""
+"""Iteration counts of the baseline. The methods are compared at the times that these take."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Point:
 
 
 def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]:
-    """Returns all settings that were measured on these captures, in the order of the axes."""
+    """Returns a point for every setting that was measured on each capture, in the order of captures and axes."""
     rows = list(Store(out).rows())
     points = []
     for capture in captures:
@@ -121,7 +121,7 @@ def undominated(points: Sequence[Point]) -> list[Point]:
 
 
 def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
-    """Interpolates the PSNR of a curve in dB at a given time, linearly in log time; None outside the curve.
+    """Returns the PSNR of a curve in dB at a given time, interpolated in log time, or None outside the curve.
 
     Settings that take longer than a better one are excluded. With very few iterations, updates end so far from the
     solution that the search for lost objects takes longer than the iterations that would have found them.
@@ -152,7 +152,7 @@ class EqualSeconds:
 
     @property
     def lead(self) -> float | None:
-        """Lead of ``scas4d`` in dB."""
+        """Lead of ``scas4d`` in dB, or None if its PSNR at this time is unknown."""
         return None if self.psnr is None else self.psnr - self.baseline_psnr
 
 
@@ -208,7 +208,7 @@ def _point(variant: Variant, row: Row, timed: Row | None, scale: float) -> Point
 
 
 def _mean(variant: Variant, points: Sequence[Point]) -> Point:
-    """Averages each score over the captures that have it."""
+    """Returns the mean of points of one setting. Each score is averaged over the captures that have it."""
     cpu = [point.cpu_seconds for point in points]
     names = dict.fromkeys(name for point in points for name in point.stages)
     scores = {name: [p.scores[name] for p in points] for name in SCORES}

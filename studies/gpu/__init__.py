@@ -1,1 +1,1 @@
-"""Check of the GPU engine on a machine with a GPU: tests, accuracy, times and their spread, in one run."""
+"""Check of the GPU engine in one run: tests, accuracy, times, and the spread of identical reconstructions."""

@@ -1,4 +1,4 @@
-"""Measurements of the GPU check; each function returns plain values for the JSON file and the page."""
+"""Measurements of the GPU check. Each function returns plain values for the JSON file and the page."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ SIZES = (
     Size(gaussians=107_000, width=1280, height=720, cameras=16, moving=1.0),
     Size(gaussians=517_000, width=1920, height=1080, cameras=12, moving=1.0),
 )
-"""Sizes of the prototype's measurements: a small object, a stage, and a large stage."""
+"""Scene sizes with which the prototype was measured: a small object, a stage, and a large stage."""
 VIEWS = (1, 2, 4)
-"""Views per iteration."""
+"""Numbers of views per iteration."""
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}
 
 Row = dict[str, Any]
@@ -55,7 +55,12 @@ def graphics_card() -> Row:
 
 
 def run_tests(root: Path, seconds: float) -> Row:
-    """Runs the engine's tests on the device with a time limit; returns the last line of their output."""
+    """Runs the engine's tests on the device and returns whether they passed, with the last line of their output.
+
+    Args:
+        root: folder of the checkout.
+        seconds: time limit in seconds.
+    """
     command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *TESTS]
     environment, began = {**os.environ, WARP_DEVICE: warp_device()}, perf_counter()
     try:
@@ -70,7 +75,7 @@ def run_tests(root: Path, seconds: float) -> Row:
 
 
 def whole_capture(folder: Path, device: str, frames: int | None = None, **changes: Any) -> Row:
-    """Reconstructs a capture with the default settings; returns times and PSNR on the test cameras.
+    """Reconstructs a capture with the default settings and returns times and PSNR on the test cameras.
 
     Args:
         folder: capture folder.
@@ -102,7 +107,7 @@ def whole_capture(folder: Path, device: str, frames: int | None = None, **change
 
 
 def measured(scene: Reconstruction, capture: Capture, index: int) -> float:
-    """Returns the mean PSNR on the test cameras in dB, or NaN without test cameras."""
+    """Returns the mean PSNR of a frame on the test cameras in dB, or NaN without test cameras."""
     if capture.test_rig is None:
         return float("nan")
     value = measure_pictures(scene, capture, index)[0]["psnr"]
@@ -110,7 +115,10 @@ def measured(scene: Reconstruction, capture: Capture, index: int) -> float:
 
 
 def one_size(size: Size, views: int, iterations: int = 100, updates: int = 4) -> Row:
-    """Returns the median seconds of an update, and the microseconds per kernel in one more update."""
+    """Updates a scene of one size, and returns the median seconds of an update and the microseconds per kernel.
+
+    The kernels are timed in a separate update.
+    """
     state, cameras = wall(size), rig(size)
     changes = {"iterations": iterations, "views": views, "stop_gain": 0, "skip_tolerance": 0}
     settings = preset("scas4d", {"device": "gpu", "scene": SCENE, "update": changes})
@@ -153,7 +161,7 @@ def kernel_times() -> Iterator[Row]:
 
 
 def spread(folder: Path, runs: int, frames: int, **changes: Any) -> Row:
-    """Repeats the same reconstruction; returns the range of the PSNR, and whether the states are bit-identical."""
+    """Repeats the same reconstruction, and returns the range of the PSNR and whether the states are bit-identical."""
     ends, digests = [], set()
     for _ in range(runs):
         capture = open_capture(folder)

@@ -50,7 +50,7 @@ def gpu_check(
     out.mkdir(parents=True, exist_ok=True)
 
     def write(part: str) -> bool:
-        """Writes all measurements so far; returns whether there is time for the next part."""
+        """Writes all measurements so far and returns whether there is time for the next part."""
         (out / "gpu-check.json").write_text(json.dumps(found, indent=1))
         (out / "gpu-check.md").write_text(check.page(found) + "\n")
         elapsed = perf_counter() - began

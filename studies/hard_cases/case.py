@@ -32,10 +32,10 @@ class BackendResult:
 
 
 class SizedCase(Protocol):
-    """A case instantiated for one size."""
+    """Protocol of a case at one size."""
 
     def run(self, backend: str) -> BackendResult | None:
-        """Runs the computation; returns None if the backend does not support it."""
+        """Runs the computation on a backend, or returns None if the backend does not support it."""
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """Returns descriptions of the violated checks."""
@@ -47,7 +47,7 @@ def _nothing_more(problem: Any, outcomes: Mapping[str, BackendResult]) -> list[s
 
 @dataclass(frozen=True, eq=False)
 class HardCase:
-    """One entry of the catalogue.
+    """One entry of the catalogue of hard cases.
 
     Attributes:
         name: case name.
@@ -88,7 +88,7 @@ def beyond(outcome: BackendResult, backend: str, bound: float) -> list[str]:
 
 
 def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> float:
-    """Returns the norm of the difference divided by the norm of the reference; 0 if both are 0."""
+    """Returns the norm of the difference divided by the norm of the reference, or by ``least`` if that is larger."""
     difference = np.linalg.norm((found - truth).astype(np.float64))
     return float(difference / max(float(np.linalg.norm(truth.astype(np.float64))), least)) if difference > 0 else 0.0
 
@@ -96,7 +96,13 @@ def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> flo
 def unexpected_counts(
     outcome: BackendResult, expected: Mapping[str, int] | None, silent: Sequence[str] = ()
 ) -> list[str]:
-    """Returns a line if the CPU guard counts are not as expected; None accepts any counts."""
+    """Returns a line if the CPU guard counts are not as expected.
+
+    Args:
+        outcome: result on the CPU.
+        expected: expected count of each guard; None accepts any counts.
+        silent: guards to ignore.
+    """
     if expected is None:
         return []
     counts = {name: count for name, count in outcome.guards.items() if count and name not in silent}

@@ -16,7 +16,7 @@ COUNT, COARSE, FINE = 120, 3, 12
 
 
 def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: float = 0.05) -> Deforming:
-    """Creates a cloud of 1 m in nested clusters of similar size, with every parameter near the identity."""
+    """Creates a cloud 1 m wide, in nested clusters of similar size. All parameters are near the identity."""
     rng = np.random.default_rng(count)
     means = rng.uniform(-0.5, 0.5, (count, 3))
     fine = np.arange(count) * sizes[-1] // count if sizes else np.zeros(count)
@@ -34,7 +34,13 @@ def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: 
 
 
 def first_cluster(column: slice | int, to: Any, **changes: Any) -> Deforming:
-    """Creates an ordinary case in which one parameter of the finest layer's first cluster is replaced."""
+    """Creates an ordinary case in which parameters of the finest layer's first cluster are replaced.
+
+    Args:
+        column: columns of the parameters to replace.
+        to: new values.
+        changes: other fields of the case to replace.
+    """
     made = ordinary()
     made.clusters[-1][0, column] = to
     return replace(made, **changes)
@@ -68,7 +74,7 @@ def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[st
 
 
 def _fold(strength: float) -> Deforming:
-    """Creates one cluster around its pivot with c·y from −strength to strength; above 1 the map folds."""
+    """Creates one cluster in which c·y ranges from −strength to strength. Above 1, the map folds."""
     rng = np.random.default_rng(8)
     made = ordinary(64, (1,), 0.0)
     means = rng.uniform(-1, 1, (64, 3)).astype(np.float32)
@@ -78,7 +84,7 @@ def _fold(strength: float) -> Deforming:
 
 
 def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Compares the number of counted folds with the number of negative determinants in float64."""
+    """Checks that the number of counted folds is within 1 of the number of negative determinants in float64."""
     before, after = problem.factors.astype(np.float64), outcomes[REFERENCE].values["factors"]
     folded = int(np.count_nonzero(np.linalg.det(before) * np.linalg.det(after) < 0))
     counted = outcomes[CPU].guards["folded"]
@@ -86,7 +92,10 @@ def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]
 
 
 def _straight_back(steepness: float) -> Deforming:
-    """Creates a map that folds along c: a half turn without a plane; at steepness 2 its cosine vanishes as well."""
+    """Creates a map that folds along c, which is a half turn without a defined plane.
+
+    At steepness 2, the cosine is also 0.
+    """
     made = ordinary(2, (1,), 0.0)
     means = np.array([[-1, 0, 0], [1, 0, 0]], np.float32)
     made.clusters[0][0, C] = (steepness, 0, 0)
@@ -158,7 +167,7 @@ def _unbalanced(count: int) -> Deforming:
 
 
 def _place(metres: float) -> Deforming:
-    """Moves the cloud far from the origin of the internal world, where float32 has a resolution of metres · 6e-8."""
+    """Moves the cloud far from the internal origin, where the resolution of float32 is about 6e-8 of the distance."""
     made = ordinary()
     # Pivots and offsets are differences of large numbers, so results agree to the local spacing times the layers.
     spacing = max(1e-5, 1e-6 * metres)
@@ -169,7 +178,7 @@ def _place(metres: float) -> Deforming:
 
 
 def _size(metres: float) -> Deforming:
-    """Scales the cloud, its Gaussians and displacements by a length; c is inversely proportional to length."""
+    """Scales the cloud, its Gaussians and its displacements by ``metres``, and c by the inverse."""
     made = ordinary()
     for clusters in made.clusters:
         clusters[:, T] *= metres

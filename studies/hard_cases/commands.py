@@ -66,7 +66,7 @@ def timing(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Gives two cameras of a capture images from between the frames, and reports which time offsets are found.
+    """Shifts two cameras of a capture in time and reports which time offsets are found.
 
     Writes timing.md to the study's folder. Runs that were already measured are not repeated.
     """
@@ -78,7 +78,7 @@ def timing(
 def _frame_studies(
     captures: Sequence[Path], store: Path, cases: Sequence[str], *, service: bool, soak: int | None
 ) -> None:
-    """Runs the soak test, or the frame cases on synthetic footage or captures; exits with 1 if a check fails.
+    """Runs the soak test, or the frame cases on synthetic footage or captures. Exits with 1 if a check fails.
 
     Args:
         captures: folders of captures for the frame cases; synthetic footage if empty.

@@ -68,7 +68,7 @@ class Deforming:
     kind: Literal["centred", "published"] = "centred"
 
     def weights(self) -> tuple[Array, Array]:
-        """Returns the random loss weights of the means [M, 3] and factors [M, 3, 3]; 0 for invalid rows."""
+        """Returns the random loss weights of the means [M, 3] and factors [M, 3, 3], which are 0 for invalid rows."""
         rng = np.random.default_rng(7)
         pulls = rng.normal(size=(len(self.means), 3)), rng.normal(size=(len(self.means), 3, 3))
         by_mean, by_factor = (pull.astype(np.float32) for pull in pulls)
@@ -86,7 +86,7 @@ class Deforming:
         return build_neighbours(where, 4, 1 / max(spread, 1e-30))
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``SizedCase``."""
+        """Runs the forward and backward pass on a backend."""
         if backend == CPU:
             return self._cpu()
         return self._torch(backend)
@@ -160,7 +160,11 @@ class Deforming:
         return BackendResult(values, {name: np.zeros(1) if g is None else g.numpy() for name, g in gradients.items()})
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``SizedCase``: checks finite values, bounds, unit rotations, unchanged invalid rows, and agreement."""
+        """Returns a line for each violated check.
+
+        The checks cover finite values, bounded gradients, unit rotations, unchanged invalid rows, guard counts, and
+        agreement with the reference.
+        """
         faults = []
         for backend, outcome in outcomes.items():
             sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
@@ -208,6 +212,6 @@ def no_turn(count: int) -> Array:
 
 
 def state(means: Array, factors: Array) -> Gaussians:
-    """Returns a state in which all Gaussians move."""
+    """Returns Gaussians with the given means and factors, all of which are labelled as moving."""
     ones = np.ones(len(means), np.float32)
     return Gaussians(means, factors, no_turn(len(means)), ones, np.zeros_like(means), ones, np.arange(len(means)))

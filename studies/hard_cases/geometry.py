@@ -30,7 +30,7 @@ def camera(
 
 
 def ordinary(count: int = COUNT, seed: int = 0, scale: float = 1.0, before: Camera | None = None) -> Rendering:
-    """Creates Gaussians of 1 to 6 pixels, 2 to 3 m in front of the camera; ``scale`` multiplies all lengths."""
+    """Creates Gaussians of 1 to 6 pixels, 2 to 3 m in front of the camera. ``scale`` multiplies all lengths."""
     rng = np.random.default_rng(seed)
     seen = before or camera()
     pixels = rng.uniform(0, (seen.width, seen.height), (count, 2))
@@ -52,7 +52,11 @@ def among(
     hard: int, means: Any = None, factors: Any = None, opacities: Any = None, features: Any = None, bad: bool = False,
     count: int = COUNT, before: Camera | None = None, **changes: Any,
 ) -> Rendering:  # fmt: skip
-    """Creates ordinary Gaussians and replaces some with hard ones; arrays are broadcast over the hard ones."""
+    """Creates ``count`` ordinary Gaussians, with ``hard`` hard ones inserted at random rows.
+
+    The given arrays are broadcast over the hard Gaussians. ``bad`` is True if the hard ones must be excluded from the
+    image. ``changes`` are other fields of the case.
+    """
     base = ordinary(count + hard, before=before)
     rows = np.random.default_rng(1).permutation(count + hard)[:hard]
     arrays: dict[str, Any] = {}
@@ -68,7 +72,7 @@ def among(
 
 
 def left_out(hard: int, guard: str = "not_finite", **given: Any) -> Rendering:
-    """Creates hard Gaussians that cannot be rendered."""
+    """Creates hard Gaussians that must be excluded from the image and counted by ``guard``."""
     return among(hard, bad=True, guards={guard: hard}, **given)
 
 
@@ -80,7 +84,7 @@ def _culled_as_behind(count: int) -> Rendering:
 
 
 def _near_plane(near: float) -> Rendering:
-    """Places Gaussians just in front of the near plane, on it, and just behind it, each as wide as its depth."""
+    """Places Gaussians just in front of the near plane, on it, and just behind it, with a width of 2 % of its depth."""
     z = np.float32(near)
     depths = np.array([np.nextafter(z, np.float32(0)), z, np.nextafter(z, np.float32(9))])
     limits = Rendering.limits._replace(near=float(z))
@@ -105,7 +109,7 @@ def _needle(length: float) -> Rendering:
 
 
 def _along_the_ray(length: float) -> Rendering:
-    """Creates needles that point at the camera; the longest ones extend behind it."""
+    """Creates needles that point at the camera. The longest ones extend behind it."""
     return among(6, means=(0, 0, 2.5), factors=np.diag([1e-3, 1e-3, length]), value=1e-3, gradient=1e-2)
 
 
@@ -161,11 +165,11 @@ def _on_a_pixel(seed: int) -> Culled:
 
 ARRAYS = ("means", "factors", "opacities", "features")
 TOGETHER = 100
-"""Gaussians rendered together. With more, pixels would saturate before all Gaussians contribute."""
+"""Number of Gaussians rendered together. With more, pixels would saturate before all Gaussians contribute."""
 
 
 def _culling_is_exact(problem: Rendering) -> list[str]:
-    """Checks for bit-identical results if tile lists contain every Gaussian in every block."""
+    """Checks that the image is bit-identical to one rendered with every Gaussian in every block of every tile."""
     changed = 0
     for first in range(0, len(problem.means), TOGETHER):
         rows = slice(first, first + TOGETHER)
@@ -190,11 +194,11 @@ class Culled(Rendering):
     """A case that only checks culling, on the CPU."""
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``SizedCase``."""
+        """Renders the Gaussians on the CPU, or returns None for other backends."""
         return self._cpu() if backend == CPU else None
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``SizedCase``."""
+        """Returns a line if culling changes any pixel."""
         return _culling_is_exact(self)
 
 
@@ -249,7 +253,7 @@ def _far_and_near(far: float) -> Rendering:
 
 
 def _few(count: int) -> Rendering:
-    """Creates a last group of sixteen that is incomplete and ends with an invalid Gaussian."""
+    """Creates Gaussians whose last group of sixteen may be incomplete and ends with an invalid one."""
     made = ordinary(count)
     made.means[-1] = np.nan
     made.bad[-1] = True
@@ -257,7 +261,7 @@ def _few(count: int) -> Rendering:
 
 
 def _steep(weight: float) -> Rendering:
-    """Uses pixel weights so large that gradients overflow in float32 and only in float32."""
+    """Uses pixel weights so large that gradients overflow in float32, but not in float64."""
     return replace(
         ordinary(), weight=weight, bound=1e38, value=2e-4, gradient=None, guards=None, why="beyond the range of float32"
     )
@@ -276,7 +280,7 @@ def _small_picture(size: tuple[int, int]) -> Rendering:
 
 
 def _principal_point(offset: float) -> Rendering:
-    """Places the principal point outside the image, by a number of image widths."""
+    """Places the principal point outside the image, ``offset`` image widths from the left edge."""
     before = camera(centre=(offset * WIDTH, 0.5 * HEIGHT))
     return replace(ordinary(before=before), value=1e-3, gradient=1e-2, bound=1e8)
 
@@ -286,7 +290,7 @@ def _focal(pixels: float) -> Rendering:
 
 
 def _scaled(scale: float) -> Rendering:
-    """Scales the scene and the near plane by a length; gradients with respect to lengths scale inversely."""
+    """Scales the scene and the near plane. Gradients with respect to lengths scale inversely."""
     made = ordinary(scale=scale)
     return replace(made, limits=made.limits._replace(near=0.01 * scale), bound=1e7 / min(scale, 1.0))
 

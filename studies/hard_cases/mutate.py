@@ -1,8 +1,8 @@
 """Mutation test of guards: disables each guard in a copy of the sources and records which cases fail.
 
-The value in the copy's ``guards.py`` is replaced with the guard's ``without``. If the guard is a comparison
-without a value, the line in ``PATCHES`` is replaced. Compiled kernels of the copies are discarded. Results are stored
-per digest of the sources, so that an interrupted study can be continued.
+The value in the copy's ``guards.py`` is replaced with the guard's ``without``. If the guard is a comparison without a
+value, the edits in ``PATCHES`` are made instead. Compiled kernels of the copies are discarded. Results are stored per
+digest of the sources, so an interrupted study can be continued.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scas4d_core.guards import CONVENTIONS, GUARDS, Guard
 
 CORE = Path(scas4d_core.__file__).parent
 SECONDS = 900
-"""Time limit of a run; a run that takes longer counts as failing."""
+"""Time limit of a run in seconds. A run that takes longer counts as failing."""
 CONTROL = "nothing"
 """Name of the copy without changes, on which all cases must pass."""
 
@@ -62,7 +62,7 @@ SECTIONS = (
     (("cascade", "deformation", "neighbour_terms", "lanes"), "cluster_map"),
     (("adam", "activation", "image_loss", "hierarchy", "losses", "jit"), "steps"),
 )
-"""Pairs of file names that contain guards, and the module whose cases exercise these guards."""
+"""Each entry pairs the names of files that contain guards with the module whose cases exercise these guards."""
 
 PROGRAM = """
 import json, sys
@@ -80,7 +80,7 @@ print("\\n" + json.dumps(found))
 
 
 class MutationError(RuntimeError):
-    """Raised if a mutation cannot be made or measured; the message names the mutation and the reason."""
+    """Raised if a mutation cannot be made or measured. The message contains the mutation and the reason."""
 
 
 def mutants() -> Iterator[Guard]:
@@ -153,11 +153,11 @@ LOOKED_AT = (
     "studies/hard_cases/ca*.py", "studies/hard_cases/*ing.py", "studies/hard_cases/geometry.py",
     "studies/hard_cases/cluster_map.py", "studies/hard_cases/steps.py",
 )  # fmt: skip
-"""Files that determine the result of the mutations."""
+"""Patterns of the files that determine the results of the mutations."""
 
 
 def sources() -> str:
-    """Returns a digest of the files that determine the result of the mutations."""
+    """Returns a digest of the files that determine the results of the mutations."""
     hasher = hashlib.sha256()
     for path in sorted({path for pattern in LOOKED_AT for path in CORE.parent.glob(pattern)}):
         hasher.update(str(path.relative_to(CORE.parent)).encode() + path.read_bytes())
@@ -173,7 +173,7 @@ def known(store: Path) -> dict[str, list[str]] | None:
 
 
 def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[str]]:
-    """Disables each guard in turn; returns the failing cases of each guard.
+    """Disables each guard in turn and returns the cases that fail without it, keyed by guard.
 
     Args:
         store: results folder; results for the same sources are reused.

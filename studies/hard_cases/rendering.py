@@ -19,7 +19,7 @@ Array = NDArray[np.float32]
 LEAST_LIGHT = 9e-5
 """Lower bound on the transmittance of the densest pixel, far above denormal numbers."""
 KINK_SHARE = 0.005
-"""Maximum share of pixels that may fall on the other side of the alpha floor or the transmittance stop in float32."""
+"""Maximum fraction of pixels that may cross the alpha floor or the transmittance stop because of float32 rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Rendering:
         )
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``SizedCase``."""
+        """Runs the forward and backward pass on a backend, or returns None for float32 PyTorch."""
         if backend == CPU:
             return self._cpu()
         if backend == REFERENCE:
@@ -122,7 +122,11 @@ class Rendering:
         )  # fmt: skip
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``SizedCase``: checks finite and bounded values, colour range, isolated invalid rows, and agreement."""
+        """Returns a line for each violated check.
+
+        The checks cover finite values, bounded gradients, the range of the image values, guard counts, the influence of
+        invalid rows, and agreement with the reference.
+        """
         faults = []
         for backend, outcome in outcomes.items():
             faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound * self.weight)

@@ -1,4 +1,4 @@
-"""Runs the catalogue on every available backend and formats its table."""
+"""Runs the catalogue of hard cases on every available backend and formats the results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def backends() -> list[str]:
 
 
 def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
-    """Returns the cases whose name contains one of ``names``, or all; slow ones only if requested or named.
+    """Returns the cases whose name contains one of ``names``, or all cases if it is empty.
+
+    Slow cases are returned only if they are named or ``slow`` is True.
 
     Raises:
         ValueError: no case name contains one of the names.
@@ -61,7 +63,7 @@ def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
 
 
 def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
-    """Runs one case at one size; an exception counts as a violation."""
+    """Runs one case at one size on the given backends. An exception counts as a violation."""
     line = CaseResult(case.name, str(size))
     started = time.perf_counter()
     try:
@@ -79,7 +81,7 @@ def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
 
 
 def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = print) -> list[CaseResult]:
-    """Runs all sizes of the selected cases; reports each result immediately."""
+    """Runs all sizes of the selected cases, reports each result immediately, and returns the results."""
     on = backends()
     lines = []
     for case in selected(names, slow):
@@ -100,7 +102,7 @@ def in_words(guards: dict[str, int]) -> str:
 
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
-    """Returns a table with one row per section: number of cases, number including sizes, and failing cases."""
+    """Returns a Markdown table with one row per section: numbers of cases and of their sizes, and failing cases."""
     text = ["| section | cases | counting sizes | failures |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
         names = {case.name for case in cases}
@@ -111,7 +113,7 @@ def catalogue_table(lines: Sequence[CaseResult]) -> str:
 
 
 def guards_table(guards: Iterable[Guard]) -> str:
-    """Returns a table with one row per guard: its value, the first clause of its reason, and what it counts."""
+    """Returns a Markdown table with one row per guard: value, first clause of its reason, and what it counts."""
     lines = ["| guard | value | acts on | counts |", "|" + "---|" * 4]
     for guard in guards:
         clause = guard.reason.split(":")[0].split(". ")[0].rstrip(".")

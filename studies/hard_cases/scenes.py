@@ -25,9 +25,9 @@ class HardScene:
     """A ball that moves over a floor, for two updates that start from the true frame 0.
 
     Attributes:
-        rig: rig that takes the images, in the world in which the ball has a radius of 0.25 m.
+        rig: rig for which the images are rendered, in the world in which the ball has a radius of 0.25 m.
         user: conversion between that world and the user's coordinates.
-        metres_per_unit: value of this setting as specified by the user.
+        metres_per_unit: setting ``scene.metres_per_unit`` as given by the user.
         least: minimum PSNR in dB of the last update on its own views, close to the PSNR of the same scene in metres.
     """
 
@@ -37,7 +37,7 @@ class HardScene:
     least: float = 0.0
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``SizedCase``; runs only on the CPU."""
+        """Reconstructs the scene on the CPU, or returns None for other backends."""
         if backend != CPU:
             return None
         from scas4d_core.first_frame.static_result import StaticResult
@@ -71,7 +71,10 @@ class HardScene:
         return BackendResult(values)
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``SizedCase``: checks finite values, unit rotations, unchanged static Gaussians, and image fit."""
+        """Returns a line for each violated check.
+
+        The checks cover finite values, unit rotations, unchanged static Gaussians, position errors and PSNR.
+        """
         values = outcomes[CPU].values
         faults = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
         lengths = np.linalg.norm(values["rotations"], axis=1)

@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class HardStep:
-    """A function of arrays, computed on the CPU and, if available, in float64.
+    """A function of arrays, computed on the CPU and, if there is a reference for it, in float64.
 
     Attributes:
         compute: functions that compute the result, keyed by backend.
@@ -50,11 +50,14 @@ class HardStep:
     more: Callable[[Mapping[str, BackendResult]], list[str]] = lambda outcomes: []
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``SizedCase``."""
+        """Computes the result on a backend, or returns None if there is no function for it."""
         return self.compute[backend]() if backend in self.compute else None
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``SizedCase``."""
+        """Returns a line for each violated check.
+
+        The checks cover finite values, bounds, guard counts, further requirements, and agreement with the reference.
+        """
         faults = []
         for backend, outcome in outcomes.items():
             faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound)
@@ -122,7 +125,7 @@ def _spoil(value: float, once: bool) -> Callable[[int, Array], None]:
 
 
 def _tiny(value: float) -> Callable[[int, Array], None]:
-    """Fills the whole table with tiny gradients, for which no value or moment may be denormal."""
+    """Returns a function that sets all gradients of a table to ``value``."""
 
     def spoil(step: int, table: Array) -> None:
         table[:] = value
@@ -148,7 +151,7 @@ def _decaying(outcomes: Mapping[str, BackendResult]) -> list[str]:
 def _activation(
     columns: slice, value: Any, guards: dict[str, int], agreement: float | None = 1e-4, pull: float = 1.0
 ) -> HardStep:
-    """Replaces some columns of the parameters of frame 0, in a tenth of 300 rows."""
+    """Activates 300 rows of parameters of frame 0, with some columns replaced by ``value`` in every tenth row."""
     rng = np.random.default_rng(12)
     table = rng.normal(size=(300, activation.COLUMNS)).astype(np.float32)
     table[::10, columns] = value
@@ -289,11 +292,11 @@ def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: t
 
 
 MILLION_MB = 600
-"""Largest additional memory that clustering a million Gaussians may take."""
+"""Largest additional memory, in MB, that clustering a million Gaussians may use."""
 
 
 def _megabytes_of_clustering(count: int) -> float:
-    """Returns the peak memory of ``build_hierarchy`` for points on a surface, above the initial memory, in MB."""
+    """Returns the increase of the peak memory by ``build_hierarchy`` for ``count`` points on a sphere, in MB."""
     rng = np.random.default_rng(16)
     means = rng.normal(size=(count, 3)).astype(np.float32)
     means /= np.linalg.norm(means, axis=1, keepdims=True)

@@ -18,13 +18,13 @@ from studies.hard_frames.frames import Footage, FrameCase, FrameStep, Holds, Pic
 FRAMES = 3
 """Number of consecutive faulty frames."""
 SOON = 2
-"""Number of faulty frames within which the alarm must be raised; a frozen image is recognized by its third frame."""
+"""Number of faulty frames within which the alarm must be raised. A frozen image is recognized by its third frame."""
 SMEARED = 0.02
 """Blur caused by dirt on a lens, as a fraction of the image width."""
 FIELD = "operators of rigs: lenses, gains and frame grabbers"
 
 Fault = Callable[[Picture, Any], Picture]
-"""Applies a fault of the given size to an image."""
+"""Function that applies a fault of the given size to an image."""
 
 
 def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
@@ -62,7 +62,12 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
 
 
 def reports_alarm(name: str, soon: int) -> Holds:
-    """Checks that only this camera raises an alarm, by frame ``soon`` of the fault, and that no damage is done."""
+    """Returns a check that only one camera raises an alarm, soon enough, and that tracking is almost as good as usual.
+
+    Args:
+        name: name of the faulty camera.
+        soon: number of faulty frames within which the alarm must be raised.
+    """
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
         faults = (
@@ -84,13 +89,13 @@ def _names(step: FrameStep, name: str) -> bool:
 
 
 def blurred(picture: Picture, pixels: float) -> Picture:
-    """Blurs an image, as if out of focus, with a standard deviation in pixels."""
+    """Blurs an image as if it were out of focus. ``pixels`` is the standard deviation of the blur."""
     picture_blurred: Picture = gaussian_filter(picture.astype(np.float32), (pixels, pixels, 0)).round().astype(np.uint8)
     return picture_blurred
 
 
 def scaled(picture: Picture, factor: Any) -> Picture:
-    """Multiplies an image by one factor, or by one per colour channel, saturating at 255."""
+    """Multiplies an image by one factor, or by one factor per colour channel, saturating at 255."""
     picture_scaled: Picture = (picture * np.asarray(factor)).round().clip(0, 255).astype(np.uint8)
     return picture_scaled
 

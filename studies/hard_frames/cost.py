@@ -12,7 +12,7 @@ from scas4d_core.frame_report import FrameReport
 from studies.hard_frames.footage import AnyFootage
 
 TARGET = 0.03
-"""Largest share of an update that the checks may cost."""
+"""Largest fraction of an update's time that the checks may take."""
 
 Share = tuple[float, float, float]
 
@@ -33,7 +33,7 @@ def shares(reports: Sequence[FrameReport]) -> Share:
 
 
 def cost(footage: AnyFootage, updates: int = 8) -> Share:
-    """Returns the cost over a number of updates of some footage, excluding the first one, which is a cold start."""
+    """Runs updates of some footage and returns their ``shares``, excluding the first update, which is a cold start."""
     with TemporaryDirectory() as folder:
         scene = footage.start(Path(folder) / "states")
         reports = [scene.step(footage.frame(index)) for index in range(1, updates + 2)]

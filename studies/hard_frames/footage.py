@@ -27,7 +27,7 @@ Pictures = Mapping[str, NDArray[np.uint8]]
 CAMERAS, SIZE = 10, 64
 """Number of cameras in the synthetic rig, and width and height of its images in pixels."""
 ANGLE = 0.08
-"""Angle by which the ball circles per frame, in radians: 11 mm and 5 degrees."""
+"""Angle by which the ball circles per frame, in radians, which corresponds to 11 mm and 5 degrees."""
 NOISE = 3.0
 """Standard deviation of the noise in the training images, in levels of 255."""
 RATE = 30.0
@@ -35,7 +35,9 @@ RATE = 30.0
 
 
 class SyntheticFootage:
-    """A ball that circles over a floor next to a resting ball; frame 0 is known up to a few millimetres.
+    """Footage of a ball that circles over a floor, next to a resting ball.
+
+    Reconstructions start from a frame 0 with errors of a few millimetres.
 
     Attributes:
         name: footage name.
@@ -47,7 +49,10 @@ class SyntheticFootage:
     name = "synthetic"
     count = 24
     constants = (("scas4d_core.preparation.NEIGHBOUR_FALLOFF", 200.0),)
-    """Constants changed when a scene starts or resumes, because the Gaussians are far apart; name and value."""
+    """Constants to change when a scene starts or resumes, as pairs of dotted name and value.
+
+    The neighbour weights are changed because the Gaussians are far apart.
+    """
 
     def __init__(self, settings: Settings | None = None) -> None:
         self.settings = settings or Settings(
@@ -63,29 +68,29 @@ class SyntheticFootage:
 
     @property
     def held_out(self) -> tuple[Camera, ...]:
-        """Cameras between those of the rig."""
+        """The held-out cameras, which are placed between those of the rig."""
         return self._others.cameras
 
     def frame(self, index: int) -> Frame:
-        """See ``frames.Footage``."""
+        """Returns a frame with noisy training images."""
         return self._shown(index, (0.0, 0.0, 0.0))[0]
 
     def truth(self, index: int) -> Pictures:
-        """See ``frames.Footage``."""
+        """Returns the true images of the held-out cameras."""
         return self._shown(index, (0.0, 0.0, 0.0))[1]
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures]:
-        """See ``frames.Footage``; the ball jumps to a place that all cameras see."""
+        """Returns a frame and its true images, with the ball moved by ``sizes`` diameters and still in view."""
         return self._shown(index, (-0.8 * sizes * 2 * BALL, 0.0, -0.6 * sizes * 2 * BALL))
 
     @property
     def points(self) -> InitialPoints:
-        """Initial points for fitting frame 0."""
+        """The initial points for fitting frame 0."""
         true = self._true
         return InitialPoints(true.means.astype(np.float64), true.colours.copy(), true.foreground.copy())
 
     def start(self, folder: Path) -> Reconstruction:
-        """Returns a reconstruction with frame 0 committed."""
+        """Returns a reconstruction whose frame 0 is committed to ``folder``."""
         history, static = History.open(folder), StaticResult(self._fitted(), {}, [])
         with all_varied(self.constants):
             return Reconstruction.start(self.rig, self.frame(0), self.settings, history=history, static=static)
@@ -111,7 +116,7 @@ class SyntheticFootage:
 
 
 class CapturedFootage:
-    """A capture with test cameras, whose frame 0 is fitted once and stored.
+    """Footage of a capture with test cameras. Frame 0 is fitted once and stored.
 
     Args:
         capture: the capture.
@@ -135,19 +140,19 @@ class CapturedFootage:
         return () if rig is None else rig.cameras
 
     def frame(self, index: int) -> Frame:
-        """See ``frames.Footage``."""
+        """Returns a frame with the training images."""
         return self._capture.frame(index)
 
     def truth(self, index: int) -> Pictures:
-        """See ``frames.Footage``."""
+        """Returns the images of the test cameras."""
         return self._capture.test_frame(index).images
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
-        """See ``frames.Footage``; returns None, because captures contain no such footage."""
+        """Returns None, because captures do not contain jumping objects."""
         return None
 
     def start(self, folder: Path) -> Reconstruction:
-        """Returns a reconstruction with frame 0 committed."""
+        """Returns a reconstruction whose frame 0 is committed to ``folder``."""
         return started(self._capture, self.settings, self._study, folder)
 
 

@@ -1,8 +1,8 @@
 """Cases of faulty frames: the frames that each case sends, and the checks that its result must pass.
 
-A case takes undisturbed footage and defines the frames that are sent instead from some frame on: first faulty ones,
-then good ones. In every case, all values must be finite, the report must explain what is wrong, and the third good
-frame must be as good as in the undisturbed run.
+A case replaces the frames of undisturbed footage from some frame on, first with faulty frames and then with good ones.
+In every case, all values must be finite, the report must explain what is wrong, and the third good frame must be as
+good as in the undisturbed run.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ Picture = NDArray[np.uint8]
 Pictures = Mapping[str, Picture]
 
 AFTER = 3
-"""Number of good frames after the faulty ones; the last of them is compared with the undisturbed run."""
+"""Number of good frames after the faulty ones. The last good frame is compared with the undisturbed run."""
 WITHIN_DB = 0.5
-"""Largest PSNR loss of the last good frame against the undisturbed run."""
+"""Largest PSNR loss of the last good frame relative to the undisturbed run."""
 NEAR_DB = 1.0
-"""Largest PSNR loss, against the undisturbed run, of a faulty frame that can still be tracked."""
+"""Largest PSNR loss, relative to the undisturbed run, of a faulty frame that can still be tracked."""
 JUMPED_DB = 3.0
-"""Largest PSNR loss three frames after an object jumped; other sides of it are visible, and its shading changes."""
+"""Largest PSNR loss three frames after a jump, which reveals other sides of the object and changes its shading."""
 
 
 class Footage(Protocol):
@@ -87,7 +87,7 @@ Holds = Callable[[Sequence[FrameStep], Any], list[str]]
 
 @dataclass(frozen=True)
 class FrameCase:
-    """One entry of the catalogue.
+    """One entry of the catalogue of faulty frames.
 
     Attributes:
         name: case name.
@@ -137,13 +137,13 @@ def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[s
 
 
 def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that the state is unchanged and the report explains why."""
+    """Checks that every frame is rejected and leaves the state unchanged."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return faults + [f"frame {s.report.index}: not rejected" for s in steps if not s.report.outcome.rejected]
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:
-    """Checks that only these cameras, and possibly those in ``may``, are excluded, and that no damage is done.
+    """Returns a check that the right cameras are excluded, and that tracking is almost as good as usual.
 
     Args:
         names: function that returns the cameras that must be excluded, given the size of the case.
@@ -166,7 +166,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
 
 
 def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that the frames are tracked almost as well as usual."""
+    """Checks that the frames are tracked almost as well as usual, with a PSNR loss of at most ``NEAR_DB``."""
     return [
         f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB relative to the undisturbed run"
         for step in steps
@@ -181,7 +181,7 @@ def unchanged(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that the first frames are degraded and explained, and that tracking recovers."""
+    """Checks that the first frame is reported as degraded, and that the last one is within ``JUMPED_DB`` of usual."""
     faults = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
     if not last.psnr >= last.usual - JUMPED_DB:
@@ -207,7 +207,7 @@ def good(footage: Footage, index: int) -> Sent:
 
 
 def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame], Frame]) -> list[Sent]:
-    """Returns ``count`` changed frames from ``at`` on, during which the scene continues, followed by good frames."""
+    """Returns ``count`` changed frames from ``at`` on, followed by good frames. The scene continues meanwhile."""
     faulty = [
         Sent(change(number, footage.frame(at + number)), at + number, footage.truth(at + number), False)
         for number in range(count)
@@ -216,20 +216,20 @@ def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame
 
 
 def each(frame: Frame, change: Callable[[str, Picture], Picture]) -> Frame:
-    """Replaces all images; the masks stay unchanged."""
+    """Returns the frame with every image changed and the masks unchanged."""
     images = {name: change(name, np.asarray(frame.images[name])) for name in frame.images}
     return Frame(frame.index, frame.time, images, frame.masks)
 
 
 def filled(value: int) -> Make:
-    """Sends constant images, for as many frames as the size specifies."""
+    """Returns a function that sends constant images, for as many frames as the size specifies."""
     return lambda footage, at, size: replaced(
         footage, at, size, lambda number, frame: each(frame, lambda name, picture: np.full_like(picture, value))
     )
 
 
 def noise(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Sets random pixels to 0 or 255."""
+    """Sends ``size`` frames in which every pixel is randomly 0 or 255."""
     rng = np.random.default_rng(0)
 
     def saturated(name: str, picture: Picture) -> Picture:
@@ -239,7 +239,12 @@ def noise(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) -> Make:
-    """Multiplies the images by a factor, saturating at 255."""
+    """Returns a function that sends images multiplied by a factor, saturating at 255.
+
+    Args:
+        factors: function that returns the factor, given the size of the case and the number of the faulty frame.
+        count: function that returns the number of faulty frames, given the size of the case.
+    """
 
     def make(footage: Footage, at: int, size: Any) -> list[Sent]:
         def changed(number: int, frame: Frame) -> Frame:
@@ -252,7 +257,7 @@ def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) 
 
 
 def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Swaps the images of two cameras."""
+    """Swaps the images of two cameras in ``size`` frames."""
     one, two = two_cameras(footage)
 
     def change(number: int, frame: Frame) -> Frame:
@@ -266,7 +271,7 @@ def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Shifts the images of one camera permanently by a number of pixels; sends four frames."""
+    """Shifts the images of one camera by ``size`` pixels in four frames, without good frames after them."""
     name = two_cameras(footage)[0]
 
     def change(number: int, frame: Frame) -> Frame:
@@ -278,7 +283,7 @@ def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def capped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Blanks the images of a number of cameras for two frames."""
+    """Blackens the images of ``size`` cameras in two frames."""
     names = capped_names(footage, size)
     return replaced(
         footage, at, 2,
@@ -292,18 +297,18 @@ def capped_names(footage: Footage, size: int) -> list[str]:
 
 
 def still(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the previous frame a number of times, then continues."""
+    """Repeats the previous frame ``size`` times, then continues."""
     return _again(footage, at, size, lambda frame: frame)
 
 
 def stuck(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the images of the previous frame a number of times while the scene continues."""
+    """Repeats the images of the previous frame in ``size`` frames while the scene continues."""
     before = footage.frame(at - 1)
     return replaced(footage, at, size, lambda number, frame: before)
 
 
 def still_noisy(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the previous frame twice, with noise whose standard deviation is given in 8-bit levels."""
+    """Repeats the previous frame twice, with noise of standard deviation ``size`` in 8-bit levels."""
     rng = np.random.default_rng(0)
 
     def change(name: str, picture: Picture) -> Picture:
@@ -318,7 +323,7 @@ def _again(footage: Footage, at: int, count: int, change: Callable[[Frame], Fram
 
 
 def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Removes one or more further cameras in each frame until a minimum number remains; then all return."""
+    """Removes more cameras in each frame until ``size`` cameras remain. Then all of them return."""
     names = sorted(footage.frame(0).images)
     count = min(len(names) - size, 7)
     steps = np.linspace(1, len(names) - size, count).round().astype(int)
@@ -336,14 +341,17 @@ def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def elsewhen(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Sends one frame that shows the scene a number of frames later."""
+    """Sends one frame that shows the scene ``size`` frames later."""
     wrong = footage.frame(at + size)
     faulty = Sent(Frame(at, 0.0, wrong.images, wrong.masks), at + size, footage.truth(at + size), False)
     return [faulty, *(good(footage, at + 1 + number) for number in range(AFTER))]
 
 
 def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
-    """Moves the object by a multiple of its size and continues from there; sends four frames."""
+    """Sends four frames in which the object has moved by ``size`` times its own size and continues from there.
+
+    Returns None if the footage cannot show this.
+    """
     sent = []
     for number in range(4):
         jump = footage.jumped(at + number, size)
@@ -380,7 +388,7 @@ CASES = (
 
 
 def named(footage: Footage) -> tuple[FrameCase, ...]:
-    """Returns all cases; some refer to cameras of the footage."""
+    """Returns all cases for some footage, including those that refer to particular cameras."""
     one, two = two_cameras(footage)
     return (
         *CASES,

@@ -1,8 +1,9 @@
 """``scripts/bench timing``: cameras that are not synchronized, and how well their time offsets are estimated.
 
-A capture is played back and forth, as a stream of every second, third or fourth frame. Two cameras get images
-from the frames in between, one later and one earlier than the others, so their offsets are exact. The stream moves at
-least twice as fast as the capture. The synthetic footage can be rendered at any moment and for any duration.
+A capture is played back and forth, as a stream of all its frames or of every second, third or fourth frame. Two cameras
+may get images from the frames in between, one later and one earlier than the others, so their offsets are known
+exactly. Such a stream is at least twice as fast as the capture. The synthetic footage can be rendered at any moment and
+for any duration.
 """
 
 from __future__ import annotations
@@ -55,7 +56,12 @@ _TRUE = first_state(resting_may_move=False)
 
 
 class Case(NamedTuple):
-    """A case: the frame step through a capture, and the offset in frames of a late and an early camera, or 0."""
+    """A case of the study.
+
+    Attributes:
+        step: number of capture frames per frame of the stream.
+        shift: capture frames by which one camera is ahead of the others and another one is behind them; may be 0.
+    """
 
     step: int
     shift: int
@@ -84,6 +90,9 @@ def run(
         changes: changes to the settings.
         again: whether to repeat finished runs.
         report: callback that prints progress messages.
+
+    Returns:
+        One row per capture and case.
     """
     settings, rows = settings_of("scas4d", None, 0, changes), []
     for folder in captures:
@@ -122,7 +131,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
         capture: the capture.
         index: frame index in the stream.
         step: number of capture frames per stream frame.
-        shifts: delay of each camera relative to the others, in capture frames, keyed by camera name.
+        shifts: capture frames by which a camera is ahead (+) of the others or behind (−), keyed by camera name.
     """
     frame = capture.frame(ping_pong(abs(step * index), capture.frame_count))
     images, masks = dict(frame.images), dict(frame.masks)
@@ -136,7 +145,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
 
 @contextmanager
 def clocked() -> Iterator[list[float]]:
-    """Records how many seconds each frame's timing checks take within the context."""
+    """Yields a list to which the seconds of each frame's timing checks are appended."""
     spent, looked = list[float](), timing.record_timing
 
     def record_timing(*given: Any) -> Any:

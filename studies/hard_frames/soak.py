@@ -1,8 +1,8 @@
 """Soak test with thousands of frames of a small scene: static Gaussians, rotations, sizes and memory must not drift.
 
-A ball circles a vertical axis six times in 500 frames and spins as often about itself, then moves all the way back, and
-so on. Next to it are a resting ball that is labelled as moving, and a static floor. After each round trip the truth
-equals that of frame 0, bit for bit.
+A ball circles a vertical axis six times in 500 frames, spins six times about itself meanwhile, and then moves all the
+way back. This round trip is repeated. Next to the ball are a resting ball that is labelled as moving, and a static
+floor. After each round trip, the truth is bit-identical to that of frame 0.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SETTINGS = Settings(
     static=StaticSettings(iterations=1),
     update=UpdateSettings(iterations=20, clusters=(2, 12, 48)),
 )
-"""Few iterations, so that the errors of each update can accumulate over thousands of frames."""
+"""Settings with few iterations, so that the errors of each update can accumulate over thousands of frames."""
 
 PIXEL_M = 0.023
 """Size of a pixel at the centre of the scene in metres, which is the resolution of the images."""
@@ -50,7 +50,7 @@ RESTING_M = 4 * PIXEL_M
 """Target: largest RMS distance of the resting ball from its start, in any row. An update locates a ball of ten pixels
 with some error, and several errors in a row may have the same direction."""
 RESTING_MEAN_M = PIXEL_M
-"""Target: mean of this distance over a run."""
+"""Target: largest mean, over a run, of the resting ball's RMS distance from its start."""
 RETURN_M = PIXEL_M
 """Target: largest RMS distance of the moving ball from its start when it has returned there."""
 TREND = 1.5
@@ -60,7 +60,7 @@ UNIT = 1e-5
 GROWTH = 10.5
 """Target: largest ratio between the lengths of an axis now and in frame 0: ``checks.SHRUNK``, plus rounding."""
 HALF = 10
-"""Minimum number of rows in each half for this comparison."""
+"""Minimum number of rows in each half of a run for checking ``RESTING_MEAN_M`` and ``TREND``."""
 MEMORY = 1.1
 """Target: largest ratio of the memory in the last tenth to that in the first tenth."""
 
@@ -99,14 +99,14 @@ class Row:
 
 
 def true_state(state: Gaussians, index: int) -> Gaussians:
-    """Returns the ground truth of frame ``index``; ``state`` is the ground truth of frame 0."""
+    """Returns the ground truth of frame ``index``, given the ground truth of frame 0."""
     on = index % (2 * OUT)
     share = min(on, 2 * OUT - on) / OUT
     return gone(state, 2 * np.pi * ROUNDS * (1 - np.cos(np.pi * share)) / 2)
 
 
 class Soak:
-    """A soak test run stored in a folder; creating it again for the same folder resumes the run."""
+    """A run of the soak test, stored in a folder. Creating it again for the same folder resumes the run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -123,12 +123,12 @@ class Soak:
 
     @property
     def done(self) -> int:
-        """Number of frames after the first."""
+        """Number of processed frames after frame 0."""
         return self.scene.history.indices[-1]
 
     @property
     def rows(self) -> list[Row]:
-        """Rows up to the current frame."""
+        """The stored rows up to the current frame."""
         file = self.folder / "rows.jsonl"
         rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
         return [Row(**row) for row in rows if row["frame"] <= self.done]
@@ -139,7 +139,13 @@ class Soak:
         return Frame(index, index / RATE, shown.images, shown.masks)
 
     def run(self, frames: int, every: int = 100, echo: Callable[[Row], None] = lambda row: None) -> list[Row]:
-        """Continues to a number of frames after the first, adding rows at regular intervals; returns all rows."""
+        """Continues the run and returns all rows.
+
+        Args:
+            frames: number of frames after frame 0 at which the run ends.
+            every: number of frames per row.
+            echo: callback that receives each new row.
+        """
         rows, began, degraded, since = self.rows, 0.0, 0, 0
         while self.done < frames:
             frame, began = self.frame(self.done + 1), began - perf_counter()

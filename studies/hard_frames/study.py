@@ -21,7 +21,7 @@ from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, named, violations
 
 AT = 5
-"""Frame at which each case begins; by then the usual values are known."""
+"""Index of the frame at which each case begins. By then, the usual values are known."""
 UNIT = 1e-5
 """Largest deviation of a rotation's norm from 1."""
 
@@ -51,7 +51,7 @@ def cases_of(footage: AnyFootage) -> tuple[FrameCase, ...]:
 
 
 class FrameStudy:
-    """Runs cases on footage.
+    """Runs cases on footage and compares them with an undisturbed run.
 
     Args:
         footage: footage on which the cases are run.
@@ -70,14 +70,14 @@ class FrameStudy:
         self._scene = self._branch("undisturbed")
 
     def undisturbed(self, index: int) -> float:
-        """Returns the PSNR in dB of the held-out cameras in the undisturbed run."""
+        """Returns the PSNR in dB of the held-out cameras in a frame of the undisturbed run."""
         for at in range(max(self.usual) + 1, index + 1):
             self._scene.step(self.footage.frame(at))
             self.usual[at] = self._measured(self._scene, at, self.footage.truth(at))
         return self.usual[index]
 
     def run(self, case: FrameCase, size: Any) -> FrameCaseResult | None:
-        """Runs a case at one size; returns None if the footage cannot show it or is too short."""
+        """Runs a case at one size, or returns None if the footage cannot show it or is too short."""
         try:
             sent = case.make(self.footage, AT, size)
         except IndexError:
@@ -107,7 +107,7 @@ class FrameStudy:
         return steps
 
     def _branch(self, name: str) -> Reconstruction:
-        """Returns a copy of the scene as it was before the case; it continues bit-identically."""
+        """Returns a copy of the scene as it was before the case, which continues bit-identically."""
         folder = self.folder / name
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(self.folder / "before", folder)
@@ -126,7 +126,14 @@ def study(
     names: Sequence[str] = (),
     echo: Callable[[str], None] = print,
 ) -> list[FrameCaseResult]:
-    """Runs the cases whose name contains one of ``names``, or all, at all sizes; reports each result immediately."""
+    """Runs frame cases at all sizes, reports each result immediately, and returns the results.
+
+    Args:
+        footage: footage on which the cases are run.
+        folder: folder for committed states; its contents are deleted.
+        names: only cases whose name contains one of these texts are run; all cases if empty.
+        echo: callback that prints progress messages.
+    """
     of, lines = FrameStudy(footage, folder), []
     echo(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
     for case in of.cases:
@@ -150,7 +157,7 @@ def study(
 
 
 def table(lines: Sequence[FrameCaseResult]) -> str:
-    """Formats the results as Markdown, with one row per case and size."""
+    """Formats the results as a Markdown table, with one row per case and size."""
     rows = [
         "| case | size | description of the size | reports | dB relative to undisturbed | passes |",
         "|" + "---|" * 6,

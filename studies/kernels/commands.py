@@ -63,7 +63,7 @@ def moving(
     frames: Annotated[int, typer.Option(min=2, help="Updates per share; the first one is not counted.")] = 8,
     out: Page = None,
 ) -> None:
-    """Measures the time of an update against the share of moving pixels, on synthetic footage, in alternation."""
+    """Measures how the time of an update depends on the share of moving pixels, on synthetic footage."""
     from scas4d_core.warm_up import compile_in_processes
     from studies.kernels import moving as study
 
@@ -79,7 +79,7 @@ def startup(
     repeats: Annotated[int, typer.Option(min=1, help="Number of starts per checkout.")] = 3,
     out: Page = None,
 ) -> None:
-    """Measures a service from an empty kernel cache to the first committed update, for one checkout or two."""
+    """Times the start of a service, from an empty kernel cache to the first committed update."""
     from studies.kernels import startup as study
 
     checkouts = [study.ROOT] if against is None else [against.resolve(), study.ROOT]

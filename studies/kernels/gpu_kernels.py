@@ -1,4 +1,4 @@
-"""Compiles the GPU kernels without a GPU, and reports registers, stack and spills of each."""
+"""Compiles the GPU kernels without a GPU, and reports the registers, stack and spills of each kernel."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REGISTERS = re.compile(r"Used (\d+) registers")
 
 @dataclass(frozen=True)
 class KernelUse:
-    """Resources of a kernel on one architecture.
+    """Resources that a kernel uses on one architecture.
 
     Attributes:
         name: kernel name.
@@ -55,7 +55,7 @@ def uses_of(ptxas: Path, file: Path, architecture: int) -> list[KernelUse]:
 
 
 def parse(output: str, architecture: int) -> list[KernelUse]:
-    """Reads the verbose output of ptxas.
+    """Returns the resources of each kernel in the verbose output of ptxas.
 
     >>> said = '''ptxas info : Compiling entry function 'shade_0123abcd_cuda_kernel_forward' for 'sm_90'
     ... 8 bytes stack frame, 4 bytes spill stores, 12 bytes spill loads
@@ -75,7 +75,7 @@ def parse(output: str, architecture: int) -> list[KernelUse]:
 
 
 def measure(architectures: Sequence[int], ptxas: Path | None) -> list[KernelUse]:
-    """Compiles all kernels for each architecture; returns their resources if ptxas is given, else nothing."""
+    """Compiles all kernels for each architecture and returns their resources, or an empty list without ptxas."""
     uses = []
     for architecture in architectures:
         with tempfile.TemporaryDirectory() as folder:
@@ -92,7 +92,10 @@ def find_ptxas() -> Path | None:
 
 
 def table(uses: Sequence[KernelUse]) -> str:
-    """Formats the resources as a Markdown table, with a line per kernel and a column per architecture."""
+    """Formats the resources as a Markdown table, with one row per kernel and one column per architecture.
+
+    Each cell contains the registers per thread, and the spills in bytes if there are any.
+    """
     architectures = sorted({use.architecture for use in uses})
     lines = [
         "| kernel | " + " | ".join(f"sm_{each}" for each in architectures) + " |",

@@ -1,11 +1,11 @@
 """``scripts/bench kernels``: cost of the kernels, compared with their arithmetic alone.
 
-1. The rasterizer, forward and backward, against a micro-kernel that does only the arithmetic of as many blended pairs
-   (``studies.kernels.pairs``). Both alternate in this process, on the same threads. They run on all views of frame 0,
-   and on a cloud of wider Gaussians, where the cost of the pairs outweighs that of the Gaussians.
-2. Updates against their own rasterizer passes: seconds of ``Reconstruction.step``, including decoding and committing,
-   divided by those of its stages "render" and "render backward".
-3. Peak memory of that run, including the fit of frame 0, in a fresh process.
+1. The rasterizer, forward and backward, is compared with a micro-kernel that does only the arithmetic of the same
+   number of blended pairs (``studies.kernels.pairs``). The two alternate in this process, on the same threads. They run
+   on all views of frame 0, and on a cloud of wider Gaussians, where the pairs cost more than the Gaussians.
+2. Updates are compared with their own rasterizer passes: the seconds of ``Reconstruction.step``, including decoding and
+   committing, are divided by those of its stages "render" and "render backward".
+3. The peak memory of these updates, including the fit of frame 0, is measured in a fresh process.
 """
 
 from __future__ import annotations
@@ -44,13 +44,16 @@ PASSES = ("render", "render backward")
 CLOUD_GAUSSIANS, CLOUD_SIZE = 20_000, 256
 """Number of Gaussians in the cloud, and width and height of its image in pixels."""
 CLOUD_WIDTH = 2.1
-"""Standard deviation in pixels: about 145 pixels per Gaussian and 2.9 million pairs per image."""
+"""Standard deviation of the cloud's Gaussians in pixels.
+
+It results in about 145 pixels per Gaussian and 2.9 million pairs per image.
+"""
 
 
 def study(
     folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
 ) -> Row:
-    """Takes all three measurements on a capture, prints them, and writes them to ``store/kernels.json``.
+    """Takes all three measurements on a capture, prints them, writes them to ``store/kernels.json``, and returns them.
 
     Args:
         folder: capture folder.
@@ -102,7 +105,9 @@ def study(
 
 
 def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats: int, limits: Limits = DEFAULT) -> Row:
-    """Returns nanoseconds per pair of the rasterizer (four channels: colour and label) and of the micro-kernel.
+    """Returns the nanoseconds per pair of the rasterizer and of the micro-kernel, and their ratio.
+
+    The rasterizer renders four channels: colour and foreground.
 
     Args:
         gaussians: Gaussians to render.
@@ -161,7 +166,10 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
 
 
 def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
-    """Creates a camera, and round Gaussians spread evenly over its image, at 3 to 5 m with opacities of 0.1 to 0.9."""
+    """Creates a camera, and round Gaussians 3 to 5 m in front of it that cover its image evenly.
+
+    The opacities are between 0.1 and 0.9.
+    """
     rng = np.random.default_rng(seed)
     focal, middle = float(CLOUD_SIZE), CLOUD_SIZE / 2
     depth = rng.uniform(3, 5, CLOUD_GAUSSIANS)
@@ -200,7 +208,7 @@ def update_figures(updates: Sequence[Row]) -> Row:
 
 
 def spread(values: Any) -> dict[str, float]:
-    """Returns the minimum and the median."""
+    """Returns the minimum and the median of the values."""
     return {"min": float(np.min(values)), "median": float(np.median(values))}
 
 
@@ -285,7 +293,14 @@ def _scene_words(on: Row) -> str:
 
 
 def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
-    """Reconstructs a number of frames and stores frame 0; returns the seconds per update and the peak memory."""
+    """Reconstructs the first frames of a capture, and returns the seconds of each update and the peak memory in MB.
+
+    Args:
+        folder: capture folder.
+        settings: settings of frame 0 and the updates.
+        frames: number of frames, including frame 0.
+        first_file: file in which frame 0 is stored.
+    """
     capture = open_source(folder)
     count = min(frames, capture.frame_count)
     updates: list[Row] = []

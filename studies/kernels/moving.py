@@ -1,7 +1,7 @@
-"""Time of an update against the share of moving pixels, on synthetic footage.
+"""Time of an update depending on the share of moving pixels, on synthetic footage.
 
-Cameras in a row see a textured wall. A square in its middle slides; its size depends on the share. All variants have
-the same Gaussians, cameras and settings, and are updated alternately.
+Cameras in a row see a textured wall. A square in the middle of the wall slides, and its size depends on the share. All
+variants have the same Gaussians, cameras and settings, and are updated alternately.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from scas4d_core.settings import Settings
 from studies.synthetic.wall import Size, known, rig, shown, wall
 
 SIZE = Size(gaussians=22_500)
-"""Number of Gaussians of a typical captured object, with small images."""
+"""A scene with as many Gaussians as a typical captured object, but with small images."""
 
 
 @dataclass(frozen=True)
 class MovingTime:
-    """Measurements of one variant.
+    """Measurements of one variant, that is, one share of moving pixels.
 
     Attributes:
         share: requested share of pixels that show moving content.
@@ -38,12 +38,12 @@ class MovingTime:
 
 
 def measure(shares: Sequence[float], frames: int, settings: Settings | None = None) -> list[MovingTime]:
-    """Updates all variants alternately, frame by frame.
+    """Updates all variants alternately, frame by frame, and returns the measurements of each.
 
     Args:
         shares: shares of moving pixels, from 0 to 1.
         frames: updates per share. The first one searches for the motion and is not counted.
-        settings: reconstruction settings; defaults in metres if None.
+        settings: reconstruction settings; the defaults, with metres as the unit, if None.
     """
     settings = settings or Settings.model_validate({"scene": {"metres_per_unit": 1.0}})
     cameras = rig(SIZE)
@@ -69,7 +69,7 @@ def measure(shares: Sequence[float], frames: int, settings: Settings | None = No
 
 
 def table(results: Sequence[MovingTime]) -> str:
-    """Formats the results as Markdown, with times relative to the last one."""
+    """Formats the results as a Markdown table, with times also relative to the last variant."""
     last = results[-1].seconds
     lines = ["| moving pixels | moving Gaussians | s per update | of the last | PSNR |", "|---|---|---|---|---|"]
     lines += [

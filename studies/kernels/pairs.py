@@ -35,19 +35,19 @@ from scas4d_core.kernels.projection import (
 Array = NDArray[np.float32]
 
 GAUSSIANS = 32
-"""Number of Gaussians in the micro-kernel's tile; with their sums, they fit into the L1 cache next to the tile."""
+"""Number of Gaussians in the micro-kernel's tile. They fit into the L1 cache together with their sums and the tile."""
 CHANNELS = 4
 SIDE = 16
 """Width and height of the micro-kernel's tile in pixels."""
 PAIRS = GAUSSIANS * SIDE * SIDE
-"""Pairs in one round of the micro-kernel's tile; every lane is a pair."""
+"""Number of pairs in one round over the micro-kernel's tile. Every lane is a pair."""
 SUMS = 6 + CHANNELS
 
 
 def blended_pairs(
     splats: Array, counts: NDArray[np.int32], width: int, height: int, limits: Limits = DEFAULT
 ) -> tuple[int, int, Array]:
-    """Counts the pairs of an image without tiles, one Gaussian after the other in depth order.
+    """Counts the blended pairs of an image without tiles, Gaussian by Gaussian in depth order.
 
     Args:
         splats: [N, 16] splats of ``CpuRasterizer`` after ``forward``.
@@ -103,7 +103,12 @@ def _count(splats: Any, order: Any, limits: Any, alive: Any, light: Any, last_me
 
 
 class MicroKernel:
-    """Arithmetic of the pairs alone; ``run`` performs ``rounds`` of ``PAIRS`` pairs on each of ``tasks`` threads."""
+    """Micro-kernel that does only the arithmetic of blended pairs.
+
+    Args:
+        tasks: number of tiles that are processed in parallel, usually one per thread.
+        seed: random seed of the Gaussians.
+    """
 
     def __init__(self, tasks: int, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -121,7 +126,7 @@ class MicroKernel:
         self.sums = np.zeros((tasks, GAUSSIANS, SUMS, lanes.COUNT), np.float32)
 
     def run(self, rounds: int) -> int:
-        """Runs the forward and the backward pass; returns the number of pairs."""
+        """Runs the forward and backward pass ``rounds`` times per task and returns the total number of pairs."""
         _micro(self.splats, self.features, self.limits, rounds, self.image, self.sums)
         return rounds * self.tasks * PAIRS
 

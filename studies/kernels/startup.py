@@ -1,7 +1,8 @@
-"""Startup of a service, from an empty kernel cache to the first committed update.
+"""Times the start of a service, from an empty kernel cache to the first committed update.
 
 A service starts without compiled kernels. As soon as it is ready, the study sends it the first two frames of a capture,
-as a rig would. Two checkouts are measured alternately, because the speed of a shared machine drifts.
+as a rig would. Two checkouts can be compared. They are measured alternately, because the speed of a shared machine
+drifts.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class Start:
 
 
 def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> list[Start]:
-    """Starts a service from each checkout several times, alternating between checkouts.
+    """Starts a service from each checkout ``repeats`` times, alternating between checkouts, and returns all starts.
 
     Raises:
         RuntimeError: a service or one of its processes did not end, or no update was committed.
@@ -70,9 +71,9 @@ def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> l
 
 
 def start(capture: Path, checkout: Path) -> Start:
-    """Starts a service from a checkout with an empty cache, and sends it two frames.
+    """Starts a service from a checkout with an empty cache, sends it two frames, and returns the measurements.
 
-    It runs in a separate process, which waits for all its children and counts only their time.
+    The measurement runs in a separate process, which waits for all its child processes and counts only their CPU time.
     """
     begun: Start = in_a_process(_start, capture, checkout)
     return begun
@@ -103,7 +104,7 @@ def _start(capture: Path, checkout: Path) -> Start:
 
 
 def table(starts: list[Start]) -> str:
-    """Formats the medians of each checkout, and their ratios to the first checkout, as Markdown."""
+    """Formats the medians of each checkout, and their ratios to the first checkout, as a Markdown table."""
     lines = [
         f"{in_words(machine())}; medians of {sum(one.checkout == starts[0].checkout for one in starts)} starts each, "
         "in alternation.",

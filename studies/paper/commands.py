@@ -26,7 +26,7 @@ def paper(
 ) -> None:
     """Reproduces the paper's experiments on captures and reports where the results agree with the paper's figures.
 
-    A capture without rows in either study is measured, its cheapest rows first.
+    Rows that are missing in the frontier study are measured first, beginning with the cheapest.
 
     Example: scripts/bench paper captures/robot --page docs/paper-tables.md
     """

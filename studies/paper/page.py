@@ -1,4 +1,4 @@
-"""Page of the paper's tables: each experiment next to the paper's figures, and whether they agree."""
+"""Writes the page of the paper's tables: our figures next to the paper's, and whether they agree."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ar
 def write_paper_page(
     out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES, quality: Path | None = None
 ) -> str:
-    """Writes the page from the rows of the study; returns the text.
+    """Writes the page from the rows of the study and returns its text.
 
     Args:
         out: frontier study folder.
@@ -90,7 +90,7 @@ def section(
     captures: Sequence[str],
     ratio: float | None,
 ) -> str:
-    """Formats an experiment as Markdown: its table and its note."""
+    """Formats an experiment as a Markdown section with its source, table and note."""
     names = [name for name in SCENES if name in captures]
     digits = DIGITS[experiment.score]
     unit = f" {experiment.unit}" if experiment.unit else ""
@@ -113,7 +113,7 @@ def section(
 
 
 def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
-    """Returns the counts and the table of all claims."""
+    """Returns the numbers of claims that agree, disagree or are not measured, and a Markdown table of all claims."""
     known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
     counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [

@@ -28,7 +28,7 @@ SMALL: Mapping[str, float] = {
     "mte_2d_oracle": 0.1,
     "parts_ari": 0.05,
 }
-"""Differences below these count as zero."""
+"""Maps each score to the difference below which two values count as equal."""
 
 
 def variant(label: str) -> Variant:
@@ -64,7 +64,17 @@ class Claim:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment: a table of settings by captures, and the claims that it tests."""
+    """One experiment: a table of settings by captures, and the claims that it tests.
+
+    Attributes:
+        title: title of the experiment.
+        source: place in the paper.
+        score: name of the compared score.
+        unit: name and unit of the score in words.
+        sides: settings, in the order of the rows.
+        claims: claims that the experiment tests.
+        note: remarks for the page.
+    """
 
     title: str
     source: str
@@ -219,7 +229,11 @@ class ClaimResult:
 
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
-    """Returns our figures from the frontier study, or from the quality study over updates shared by both methods."""
+    """Returns our figures from the frontier study.
+
+    For captures without figures there, the PSNR of ``scas4d`` and ``dynamic3dgs`` is taken from the quality study, over
+    the updates that both cover.
+    """
     by_variant: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:
@@ -269,7 +283,7 @@ def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> ClaimResul
 
 
 def _agrees(own: float, paper: float, small: float) -> AgreementWord:
-    """Returns whether two gains agree in sign and size, only in sign, or not; two small gains agree."""
+    """Returns whether two gains agree in sign and size, only in sign, or not. Two small gains agree in both."""
     if abs(own) < small and abs(paper) < small:
         return "sign and size"
     if own * paper <= 0:
@@ -284,7 +298,10 @@ def _sign(value: float, small: float) -> int:
 
 
 def iteration_ratio(points: Sequence[Point]) -> float | None:
-    """Returns the time of 100 baseline iterations relative to ``scas4d``, averaged over captures that have both."""
+    """Returns the time of 100 baseline iterations relative to ``scas4d``, averaged over captures that have both.
+
+    Returns None if there is no such capture.
+    """
     own = {p.capture: p.seconds for p in points if p.variant == DEFAULT}
     base = {p.capture: p.seconds for p in points if p.variant == BASE_100}
     ratios = [base[name] / own[name] for name in own if name in base]

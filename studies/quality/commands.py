@@ -118,11 +118,11 @@ def effects(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Compares auto with each effect pinned off, pinned on or removed from the registry: dB, time and bits.
+    """Compares each effect pinned off, pinned on or removed from the registry with auto, in dB, time and bits.
 
-    Both are updated in alternation from the same frame 0, and each finished run is stored in a file. Effects that are
-    on in every scene are only tested off. "removed" shows what an effect costs while it is off. Writes effects.md to
-    the study's folder.
+    The two reconstructions start from the same frame 0 and are updated alternately. Each finished run is stored in a
+    file. Effects that are on in every scene are only tested off. "removed" shows what an effect costs while it is off.
+    Writes effects.md to the study's folder.
 
     Example: scripts/bench effects captures/robot --name entering --name leaving --frames 8
     """
@@ -151,7 +151,7 @@ def switches(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Updates captures for a while and reports which effects are switched on and off, and when.
+    """Plays captures and reports which effects are switched on and off, and when.
 
     Writes switches.md to the study's folder. Captures that were already played are not played again.
     """
@@ -173,9 +173,9 @@ def targets(
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, shown in the table.")] = None,
     again: Again = False,
 ) -> None:
-    """Measures every row that the targets need, or some of them; `scripts/bench table` compares them with the targets.
+    """Measures the rows that the targets need. `scripts/bench table` compares them with the targets.
 
-    The most expensive runs come last. dynamic3dgs-2000 takes 20 times as long as the others; --frames shortens it.
+    The most expensive runs come last. dynamic3dgs-2000 takes 20 times as long as the others. --frames shortens it.
     """
     from studies.quality.runs import measure_runs
 
@@ -192,7 +192,8 @@ def table(
 ) -> None:
     """Prints which targets the measured rows reach, as a Markdown table.
 
-    A row counts only if its settings equal those of the current presets; the one with the most frames is used.
+    Only rows with the settings of the current presets are used. Of several such rows, the one with the most frames
+    counts.
     """
     from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
 
@@ -219,8 +220,8 @@ def processors(
 ) -> None:
     """Compares a capture's result on this processor with that on less capable ones, and with the spread over seeds.
 
-    Kernels, numpy and BLAS compute as on a processor with only AVX2, and as on one of 2008 (x86-64). Exits with 1 if
-    the bits of a state differ.
+    Kernels, numpy and BLAS compute as on a processor with only AVX2, and as on an x86-64 processor from 2008. Exits
+    with 1 if the bits of a state differ.
     """
     from studies.quality import processors as study
 

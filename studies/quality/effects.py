@@ -1,8 +1,8 @@
 """``scripts/bench effects``: benefit and cost of each effect compared with `auto`, measured alternately.
 
 Two reconstructions start from the same frame 0 and are updated alternately, frame by frame, in one process. One
-follows `auto`; in the other, effects are pinned. An effect that waits for evidence is tested "on", "off" and "removed",
-that is, without its line in the registry, which shows what it costs while it is off.
+follows `auto`; in the other, effects are pinned. An effect that waits for evidence is tested "on", "off" and "removed".
+"removed" means without its line in the registry, and shows what the effect costs while it is off.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
-    """Measures every variant of each capture; prints the table and writes it to ``out/effects.md``.
+    """Measures every variant of each capture, prints the table and writes it to ``out/effects.md``.
 
     Args:
         captures: capture folders.
@@ -72,12 +72,15 @@ def run(
         names: effect names; all if empty, unless there are ``pins``.
         pins: further variants, each with effects that are pinned together.
         preset: preset that both reconstructions share.
-        seeds: seeds of frame 0 and the updates, each of which is measured.
+        seeds: seeds of frame 0 and the updates; every seed is measured.
         frames: number of frames; all if None.
         changes: changes to the settings that both reconstructions share.
         again: whether to repeat the runs that ``out`` already contains.
         options: options for reading the captures.
         report: callback that prints progress messages.
+
+    Returns:
+        One row per capture, seed and variant.
 
     Raises:
         ValueError: an effect or setting is unknown, the settings contradict a pin, or there are fewer than two frames.
@@ -101,7 +104,9 @@ def run(
 
 
 def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
-    """Returns the pins of single effects that the settings allow; only "off" for effects that are always on.
+    """Returns one variant for each effect and mode that the settings allow.
+
+    Effects that are always on are only pinned off.
 
     Raises:
         ValueError: an effect is unknown.
@@ -124,7 +129,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
 
 
 def pinned(settings: Settings, pins: Pins) -> Settings:
-    """Returns the settings with effects pinned; removed effects are left out.
+    """Returns the settings with the given effects pinned and the removed ones left out.
 
     Raises:
         ValueError: an effect or a mode is unknown.
@@ -219,7 +224,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
 
 
 def _words(scene: Reconstruction, pins: Pins) -> str:
-    """Describes whether each of these effects is on in auto at the end and, if so, since which frame."""
+    """Describes, for each pinned effect, whether it is on in auto at the end and since which frame."""
     record: Any = scene.history.report(scene.history.indices[-1]).get("effects", {})
     switches = {name: record[name] for name in pins if name in record}
     return ", ".join(f"on since {one['since']}" if one["on"] else "off" for one in switches.values())

@@ -1,6 +1,6 @@
 """Frame 0, fitted once and shared by all rows of a capture with the same inputs.
 
-Rows then differ only in their updates, and only the first row pays for frame 0.
+Rows then differ only in their updates, and frame 0 is fitted only for the first row.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
 
 
 def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
-    """Stores a frame 0 atomically."""
+    """Stores a frame 0 and its fitting time in seconds, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names, evidence = sorted(result.exposures), result.evidence or {}
     beside = path.with_suffix(f".{os.getpid()}.part")
@@ -92,7 +92,10 @@ def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
 
 
 def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
-    """Returns frame 0 from a study folder, fitting it on first use; each pin of gloss has its own frame 0."""
+    """Returns frame 0 from a study folder, fitting and storing it on first use.
+
+    Each mode of the gloss effect (``direction``) has its own frame 0.
+    """
     key = first_frame_key(capture, settings)
     gloss = settings.effects.get("direction", "auto")
     path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"

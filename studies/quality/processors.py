@@ -2,8 +2,8 @@
 
 The first frames of a capture are processed on this processor, as on one with only AVX2, and as on one from 2008. This
 applies to kernels (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``). For
-comparison, the updates are also run with other seeds. Each row runs in a separate process, including frame 0; rows
-already on disk are not run again.
+comparison, the updates are also run with other seeds. Each row runs in a separate process, including frame 0. Rows
+already on disk are run again only if the core has changed.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PROCESSORS: Mapping[str, Mapping[str, str]] = {
 def run(
     captures: Sequence[Path], out: Path, *, frames: int, seeds: int, changes: Sequence[str] = (), report: Report = print
 ) -> bool:
-    """Measures each capture on each target with seed 0, and on this processor with the other seeds.
+    """Measures each capture on each processor in ``PROCESSORS`` with seed 0, and on this one with the other seeds.
 
     Args:
         captures: folders of captures with test cameras.
@@ -60,7 +60,7 @@ def run(
         report: callback that prints progress messages.
 
     Returns:
-        Whether the states of every capture are bit-identical on all targets.
+        Whether the states of every capture are bit-identical on all processors.
 
     Raises:
         RuntimeError: a run failed; the message contains its last line of output.
@@ -89,7 +89,10 @@ def same_bits(rows: Sequence[Row], capture: str) -> bool:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Returns a table with a row per capture: PSNR in dB per target, bit identity, and the spread over seeds."""
+    """Returns a Markdown table with one row per capture.
+
+    The columns are the PSNR in dB on each processor, whether the states are bit-identical, and the spread over seeds.
+    """
     lines = [
         f"| capture | {' | '.join(PROCESSORS)} | states | seeds: spread (standard deviation) |",
         "|---" * (len(PROCESSORS) + 3) + "|",
@@ -109,7 +112,10 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Row:
-    """Runs frame 0 and updates in this process; returns the mean test PSNR and a digest of the state of each update."""
+    """Runs frame 0 and ``frames`` updates in this process and returns the row.
+
+    The row contains the mean test PSNR of each update in dB, and a digest of the state of each frame.
+    """
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.warm_up import compile_in_processes
 

@@ -1,9 +1,9 @@
 """``scripts/bench quality``: scores of images, tracks and parts of captures, and seconds per update.
 
 There is one row for every capture, preset, number of iterations and seed. Each row runs in a separate process, so that
-it has its own peak memory; rows already on disk are not run again. Rows of a capture with the same scene and frame 0
-settings share one frame 0 (``first/`` in the study folder), which is fitted only for the first of them. An interrupted
-row is restarted from frame 0.
+its peak memory can be measured. Rows already on disk are not run again. Rows of a capture with the same scene and
+frame 0 settings share one frame 0 (``first/`` in the study folder), which is fitted only once. An interrupted row is
+restarted from frame 0.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
 
 OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
-"""Captures whose mean is reported as well."""
+"""Captures for which the table also contains the mean scores."""
 LATER = ("scas4d_core.update.", "scas4d_core.robust.", "scas4d_core.structure.")
-"""Prefixes of constants that do not affect frame 0. Rows with other changed constants share no frame 0."""
+"""Prefixes of constants that do not affect frame 0. Rows share a frame 0 only if they agree in all other constants."""
 
 
 def run(
@@ -46,22 +46,22 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
-    """Measures every capture with every preset; prints the table and writes it to ``out/table.md``.
+    """Measures every capture with every preset, prints the table and writes it to ``out/table.md``.
 
     Args:
         captures: capture folders. Captures without test cameras are measured on their training cameras, and their rows
             are marked.
         out: folder for rows, per-frame lines and images; a second call with the same folder continues.
         presets: preset names.
-        iterations: numbers of iterations per update, each of which is measured; the preset's own if empty.
-        seeds: seeds of frame 0 and of the updates, each of which is measured.
+        iterations: numbers of iterations per update, all of which are measured; the preset's own if empty.
+        seeds: seeds of frame 0 and of the updates; every seed is measured.
         changes: further settings, such as ``"update.clusters=[64]"``, with a JSON value after the equals sign.
         frames: number of frames per capture; all if None.
         masks: whether the method is given the masks.
         points: whether the method is given the initial point cloud.
         pictures: frames to save as truth | render | difference; negative numbers count from the end.
         lpips: whether to measure LPIPS, if its weights are installed.
-        again: whether to measure rows again that are already on disk.
+        again: whether to repeat rows that are already on disk.
         options: options for reading the captures.
         report: callback that prints progress messages.
 
@@ -92,7 +92,10 @@ def run(
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
-    """Measures the missing rows, one process per row; prints the table and writes it to ``out/table.md``."""
+    """Measures the missing rows, each in its own process, and returns all rows in the order of the jobs.
+
+    Prints the table and writes it to ``out/table.md``. With ``again``, also repeats the rows already on disk.
+    """
     store = Store(out)
     if jobs:
         compile_in_processes()
@@ -116,7 +119,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
 
 
 def measure(job: Job, folder: Path, report: Report = print) -> Row:
-    """Measures one capture, from a frame 0 that other rows of the study may already have fitted.
+    """Measures one capture and returns its row. Reuses a frame 0 that another row of the study has already fitted.
 
     Raises:
         CaptureError: the capture cannot be read.
@@ -142,7 +145,8 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
 def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label: str = "mean of objects") -> list[Row]:
     """Returns the rows, followed by the means of each variant that has all captures in ``over``.
 
-    Rows with the same ``variant`` value form a variant; only numbers that all of its rows have are averaged.
+    Rows with the same ``variant`` value form a variant. Floating-point scores that all of its rows have are averaged,
+    except the worst PSNR and the peak memory.
     """
     result = list(rows)
     for variant in dict.fromkeys(row["variant"] for row in rows if "error" not in row):
@@ -163,7 +167,7 @@ def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label
 
 
 def _apart(job: Job, folder: Path) -> Row:
-    """Runs ``measure`` in a new process; a failure is stored as the row's ``error``."""
+    """Runs ``measure`` in a new process and returns the row. A failure is stored as the row's ``error``."""
     failed: Row = {
         "key": job.key,
         "variant": job.variant,

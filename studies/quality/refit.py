@@ -1,4 +1,4 @@
-"""``scripts/bench refit``: upper bound for the updates, from fitting a later frame alone with the method of frame 0.
+"""``scripts/bench refit``: upper bound for the updates, obtained by fitting a later frame like frame 0.
 
 A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. The
 gap to the updates at that frame shows what they still miss: changes that no effect explains, and quality lost over the
@@ -48,19 +48,22 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
-    """Fits a frame of each capture from scratch; prints the table and writes it to ``out/refit.md``.
+    """Fits a frame of each capture from scratch, prints the table and writes it to ``out/refit.md``.
 
     Args:
         captures: capture folders.
         out: quality study folder; a second call continues.
         frame: frame to fit; negative numbers count from the end.
         preset: settings preset.
-        seeds: seeds of frame 0, each of which is fitted.
+        seeds: seeds of the fit; every seed is measured.
         points: whether to start from the point cloud of the capture's first frame, instead of the images alone.
         changes: changes to the settings, such as ``"effects.direction=off"``.
         again: whether to repeat fits that ``out`` already contains.
         options: options for reading the captures.
         report: callback that prints progress messages.
+
+    Returns:
+        One row per capture and seed.
 
     Raises:
         ValueError: a capture does not have the frame, or a setting is unknown.
@@ -89,7 +92,7 @@ def _refitted(
     again: bool,
     options: CaptureOptions,
 ) -> Row:
-    """Returns the row of one frame, fitting it if it is missing."""
+    """Returns the row of one frame, fitting the frame if the row is missing."""
     capture = open_measured(folder, options, use_points=points)
     index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
     if index is None:
@@ -101,7 +104,7 @@ def _refitted(
 
 
 def _measured(capture: Capture, index: int, settings: Settings) -> Row:
-    """Returns the row of a frame that is fitted on its own."""
+    """Fits a frame on its own and returns its row."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
     scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
@@ -121,7 +124,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
 
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
-    """Returns the PSNR of the updates at the same frame and its deficit, or an empty row if not measured."""
+    """Returns the PSNR of the updates at the same frame and its difference from the fit; empty if not measured."""
     wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])

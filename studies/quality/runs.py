@@ -1,4 +1,4 @@
-"""Runs required by the targets, with the captures, preset and changes of each; see ``scripts/bench targets``."""
+"""The runs that the targets require, each with its captures, preset and changes; see ``scripts/bench targets``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from studies.quality.quality import OBJECT_CAPTURES, run_jobs
 from studies.quality.settings import settings_of
 
 CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
-"""Captures of the targets, by the names of their folders."""
+"""Folder names of the captures for which there are targets."""
 
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
-"""Settings that a scene needs in every run (Gaussian budget, floor); none of them tunes a method."""
+"""Maps a capture to settings that it needs in every run, such as a Gaussian budget or a floor.
+
+These settings must not tune a method.
+"""
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
 """The non-default cluster map."""
@@ -73,7 +76,7 @@ RUNS: Mapping[str, Run] = {
     "other-map": Run(CAPTURES, changes=(f"update.cluster_map={OTHER_MAP}",)),
     "dynamic3dgs-2000": Run(OBJECT_CAPTURES, "dynamic3dgs", 2000),
 }
-"""Runs by name, in the order in which they are measured: the most expensive last."""
+"""Runs by name, in the order in which they are measured, with the most expensive last."""
 
 
 def measure_runs(
@@ -86,7 +89,7 @@ def measure_runs(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Measures runs on the available captures; existing rows are not measured again.
+    """Measures runs on the available captures. Existing rows are not measured again.
 
     Args:
         captures: folder that contains the captures.
@@ -94,8 +97,11 @@ def measure_runs(
         names: names from ``RUNS``; all runs if empty.
         only: names of captures; all captures of each run if empty.
         frames: number of frames per capture; all if None.
-        again: whether to measure rows again that are already on disk.
+        again: whether to repeat rows that are already on disk.
         report: callback that prints progress messages.
+
+    Returns:
+        One row per run and available capture.
 
     Raises:
         ValueError: a run or capture is unknown, or the folder contains no capture of any run.
@@ -128,10 +134,10 @@ FIRST_FRAME = "scas4d_core.first_frame."
 
 
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
-    """Returns the stored row of each run and capture that has the run's settings; of several rows, the longest.
+    """Returns the stored row of each run and capture; of several rows, the one with the most frames.
 
     A row belongs to a run if its settings equal the run's current settings exactly. If only frame 0 is needed, update
-    settings are ignored.
+    settings are ignored. Pairs of a run and a capture without such a row are missing from the result.
     """
     rows = [row for row in store.rows() if "error" not in row]
     by_run: dict[tuple[str, str], Row] = {}

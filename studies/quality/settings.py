@@ -16,7 +16,7 @@ def settings_of(
     seed: int = 0,
     changes: Sequence[str] = (),
 ) -> Settings:
-    """Returns a preset with changes, without a time limit for frame 0, so that results do not depend on machine load.
+    """Returns a preset with changes. Frame 0 has no time limit, so results do not depend on the load of the machine.
 
     Args:
         name: preset name.

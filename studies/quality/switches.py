@@ -1,6 +1,6 @@
 """``scripts/bench switches``: the effects that a stream activates, and how often each is switched on or off.
 
-A capture is played back and forth, so that a stream can be longer than the capture.
+Captures are played back and forth, so a stream can be longer than its capture.
 """
 
 from __future__ import annotations
@@ -50,10 +50,13 @@ def run(
         out: study folder, which stores each finished run; a second call continues.
         updates: updates per capture.
         preset: settings preset.
-        seeds: seeds of frame 0 and the updates, each of which is measured.
+        seeds: seeds of frame 0 and the updates; every seed is measured.
         changes: changes to the settings.
         again: whether to repeat finished runs.
         report: callback that prints progress messages.
+
+    Returns:
+        One row per capture and seed.
     """
     rows = []
     for folder in captures:

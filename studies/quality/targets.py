@@ -17,12 +17,12 @@ from studies.quality.quality import OBJECT_CAPTURES
 from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
 
 KERNELS = "kernels"
-"""Name that a target uses in place of a run for the study of ``studies.kernels``."""
+"""Value of ``Target.run`` for figures of the kernel study (``studies.kernels``), which has no run."""
 MAPS = f"{preset('scas4d').update.cluster_map} − {OTHER_MAP} cluster map"
 K1 = ("clusters-64", "clusters-320", "clusters-1280")
 
 Rows = Mapping[tuple[str, str], Row]
-"""Rows by run and capture."""
+"""Maps a run and a capture to their measured row."""
 
 
 @dataclass(frozen=True)
@@ -120,13 +120,13 @@ TARGETS: tuple[Target, ...] = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line of the table.
+    """Evaluation of a target on one capture or on a mean; one line of the table.
 
     Attributes:
         target: target that was evaluated.
         capture: capture name, or "mean of …".
         value: the figure; None if a part of it is not measured.
-        parts: figures of the run and of the run it is compared with, if the target is a difference.
+        parts: figures of the run and of the run it is compared with; None if the target is not a difference.
         updates: number of updates that the figure covers, as text; "frame 0" if there are none.
         reached: whether the target is reached; None without a figure or threshold.
     """
@@ -140,7 +140,7 @@ class Verdict:
 
     @property
     def word(self) -> str:
-        """Text of the verdict."""
+        """Verdict as text for the table: "reached", "**missed**", "not measured", or empty without a threshold."""
         if self.value is None:
             return "not measured"
         return "" if self.reached is None else "reached" if self.reached else "**missed**"
@@ -211,7 +211,7 @@ def target_table(verdicts: Sequence[Verdict]) -> str:
 
 
 def count_words(verdicts: Sequence[Verdict]) -> str:
-    """Describes how many targets are reached, missed, and not measured."""
+    """Returns a sentence with the numbers of targets that are reached, missed and not measured."""
     compared = [verdict for verdict in verdicts if verdict.target.threshold is not None]
     reached, missed = (sum(verdict.reached is answer for verdict in compared) for answer in (True, False))
     unknown = len(compared) - reached - missed
@@ -235,7 +235,7 @@ def left_out(folder: Path, rows: Rows) -> int:
 
 
 def page(rows: Rows) -> str:
-    """Returns the page with commands, machine, date, the table of the targets, and the underlying rows."""
+    """Returns the Markdown page with commands, machine, date, the table of the targets, and the underlying rows."""
     verdicts = compare(rows)
     known = list(rows.values())
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
@@ -291,7 +291,7 @@ def _value(row: Row, metric: str, updates: int) -> float | None:
 
 
 def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
-    """Returns the updates that a figure covers, as text; those of each row if values do not use the shared ones."""
+    """Returns, as text, which updates a figure covers: the shared ones for PSNR, otherwise those of each row."""
     if metric == "psnr_first":
         return "frame 0"
     if "capture_frames" not in rows[0]:

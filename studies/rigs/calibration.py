@@ -1,6 +1,6 @@
 """``scripts/bench calibration``: what frame 0 reports about faulty rigs, and the benefit of refining them.
 
-Faults are added to the calibration; the images do not change. Test cameras keep their calibration.
+Faults are added to the calibration, but the images do not change. Test cameras keep their calibration.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FAULTS = (
     ("across", 1.0), ("down", 1.0), ("across", 2.0), ("down", 2.0), ("across", 4.0), ("down", 4.0), ("centre", 2.0),
     ("focal", 0.01),
 )  # fmt: skip
-"""Faults of one camera at a time: rotations by pixels across and down, the principal point, the focal length."""
+"""Faults of one camera at a time, as pairs of kind and size; see ``faulty``."""
 MEASURED = (
     Column("capture", "capture"),
     Column("fault", "fault"),
@@ -100,6 +100,9 @@ def run(
         changes: changes to the settings.
         again: whether to repeat finished runs.
         report: callback that prints progress messages.
+
+    Returns:
+        The rows of both tables.
     """
     measured_rows, fitted = [], []
     for folder in captures:
@@ -131,7 +134,7 @@ def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
 
 
 def _measured(name: str, matches: Matches) -> list[Row]:
-    """Returns the residuals of the given rig, and of each camera in turn with each of the faults."""
+    """Returns a row with the residuals of the given rig, and one for each fault, added to each camera in turn."""
     given, off = measure_residuals(matches)
     known = np.array([fit.pixels for fit in given.values()])
     rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]

@@ -26,7 +26,7 @@ def rigs(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Reconstructs captures of other rigs with default settings: seconds of frame 0, and scores of a held-out camera.
+    """Reconstructs captures of other rigs with default settings, and measures frame 0 and a held-out camera.
 
     Writes rigs.md and a JSON file per row to the study's folder.
 
@@ -48,7 +48,7 @@ def drift(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Updates captures in which two cameras drift, or none, with and without the effect pose_drift.
+    """Updates captures in which two cameras or none drift, with and without the effect pose_drift.
 
     Writes drift.md to the study's folder. Runs that were already measured are not repeated.
     """

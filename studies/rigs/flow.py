@@ -1,8 +1,8 @@
 """Comparison of tracks with optical flow, for captures without ground truth.
 
-Corners of frame 0 are followed in each camera independently (Lucas-Kanade, kept if following them back returns to the
-start), and as tracks of the scene. A correct track stays on its corner. If a second camera sees the same point, its own
-corner stays on the epipolar line of the first camera's corner.
+Corners of frame 0 are followed in each camera independently, and as tracks of the scene. The optical flow is that of
+Lucas and Kanade, and a corner is kept only if following it back returns to the start. A correct track stays on its
+corner. If a second camera sees the same point, its own corner stays on the epipolar line of the first camera's corner.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ Grey = Sequence[NDArray[np.uint8]]
 CORNERS, APART = 400, 4
 """Maximum number of corners per image, and minimum distance between them in pixels."""
 MOVING = 2.0
-"""Minimum motion of a corner from frame 0 to the last frame, in pixels; static corners reveal nothing about tracks."""
+"""Minimum motion of a corner from frame 0 to the last frame, in pixels. Static corners reveal nothing about tracks."""
 BACK = 0.5
 """Largest error in pixels when a corner is followed back to the previous frame."""
 SAME = 0.01
-"""Largest distance, as a fraction of the depth, between the points that two cameras see if they are the same."""
+"""Points seen by two cameras count as the same if their distance is below this fraction of the depth."""
 FEWEST = 20
 """Minimum number of positions, over points and frames, for computing a median."""
 
 
 def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row:
-    """Returns the median errors of tracks at moving corners and of epipolar lines, and the number of corners.
+    """Compares the tracks of a scene with optical flow at moving corners, within each camera and between cameras.
 
     Args:
         scene: scene with ``count`` committed frames.
@@ -75,7 +75,7 @@ def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row
 
 
 def followed(film: Grey, start: Float) -> Float:
-    """Tracks points through the images of a camera; returns [T, Q, 2] pixels, NaN after a point is lost.
+    """Tracks points through the images of a camera and returns [T, Q, 2] pixels, NaN after a point is lost.
 
     Args:
         film: T grey images [H, W].

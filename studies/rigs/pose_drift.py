@@ -43,9 +43,9 @@ COLUMNS = (
     Column("found", "found"),
 )
 WAYS = ("stand", "drift")
-"""Whether the cameras are fixed or drift."""
+"""Behaviour of the cameras: they are fixed, or two of them drift."""
 MODES = ("off", "auto")
-"""Modes of the effect."""
+"""Modes of the effect ``pose_drift`` that are compared."""
 
 
 def run(
@@ -59,7 +59,7 @@ def run(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Updates each capture in four ways, prints the table and writes it to ``out/drift.md``.
+    """Updates each capture with and without drift and tracking, prints the table and writes it to ``out/drift.md``.
 
     Args:
         captures: capture folders.
@@ -70,6 +70,9 @@ def run(
         changes: changes to the settings.
         again: whether to repeat finished runs.
         report: callback that prints progress messages.
+
+    Returns:
+        Four rows per capture.
     """
     rows = []
     for folder in captures:

@@ -1,10 +1,9 @@
 """``scripts/bench rigs``: captures of third-party rigs, read from their folders, with default settings.
 
-Frame 0 keeps its time limit, because its duration is measured; run the study on an otherwise idle machine. With five or
-more cameras, one is held out. Its image is also compared with the nearest training image shown in its place. In all
-captures, tracks are compared with optical flow (``flow.py``).
-If a folder has a ``joints.npz`` (``points3d`` [T, J, 3], in the calibration's world), tracks follow its points from
-frame 0.
+Frame 0 keeps its time limit, because its duration is measured. The study should run on an otherwise idle machine. With
+five or more cameras, one is held out. Its image is also compared with the nearest training image shown in its place. In
+all captures, tracks are compared with optical flow (``flow.py``). If a folder has a ``joints.npz`` (``points3d``
+[T, J, 3], in the calibration's world), its points are also tracked from frame 0.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
 
 ENOUGH_TO_HOLD_OUT = 5
-"""Minimum number of cameras for holding one out; with fewer, each camera sees content that no other camera sees."""
+"""Minimum number of cameras for holding one out. With fewer, each camera sees content that no other camera sees."""
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -71,7 +70,7 @@ def run(
     options: CaptureOptions,
     report: Report = print,
 ) -> list[Row]:
-    """Reconstructs captures; prints the table and writes it to ``out/rigs.md``.
+    """Reconstructs captures, prints the table and writes it to ``out/rigs.md``.
 
     Args:
         captures: capture folders.
@@ -83,6 +82,9 @@ def run(
         options: options for reading the captures; ``options.test`` names the cameras to hold out instead of the middle
             one.
         report: callback that prints progress messages.
+
+    Returns:
+        One row per capture.
     """
     store, rows = Store(out), list[Row]()
     compile_in_processes()
@@ -102,7 +104,10 @@ def run(
 def measured(
     folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str], pictures: Path
 ) -> Row:
-    """Returns one capture's row; arguments as in ``run``, except ``pictures``: folder for comparison images."""
+    """Reconstructs one capture and returns its row.
+
+    The arguments are as in ``run``, except for ``pictures``, the folder for comparison images.
+    """
     names = options.open(folder).full_rig.names
     if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
         options = replace(options, test=(names[len(names) // 2],))

@@ -8,7 +8,14 @@ from dataclasses import dataclass, field
 
 @dataclass
 class ScenarioResult:
-    """A fault, its target and the outcome; the target is missed if there are `faults`."""
+    """Result of one fault scenario.
+
+    Attributes:
+        name: name of the fault.
+        target: required behaviour, in words.
+        found: observed behaviour, in words.
+        faults: reasons why the target is missed; empty if it is reached.
+    """
 
     name: str
     target: str
@@ -17,12 +24,12 @@ class ScenarioResult:
 
     @property
     def reached(self) -> bool:
-        """Whether there are no faults."""
+        """Whether the target is reached, that is, ``faults`` is empty."""
         return not self.faults
 
 
 def table(outcomes: Sequence[ScenarioResult]) -> str:
-    """Formats the outcomes as Markdown."""
+    """Formats the outcomes as a Markdown table, with one row per fault."""
     rows = ["| fault | target | found | |", "|---|---|---|---|"]
     for outcome in outcomes:
         summary = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])

@@ -1,4 +1,4 @@
-"""A service in a separate process, which can be killed, and the requests that studies need."""
+"""Runs a service in a separate process that can be killed, and sends it the requests that studies need."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def wait_until(done: Callable[[], bool], fault: str, seconds: float = PATIENCE_S
 
 
 class Service:
-    """A service on one data folder; `start` and `kill` may be called repeatedly.
+    """A service process on one data folder. It can be killed and started again.
 
     Args:
         data: the service's data folder.
@@ -69,7 +69,11 @@ class Service:
         return self._process.pid
 
     def start(self) -> None:
-        """Starts the service and waits until it is ready."""
+        """Starts the service and waits until it is ready.
+
+        Raises:
+            StudyError: the service ended, or was not ready in time.
+        """
         program = [sys.executable, "-m", "client.cli.main", "serve"]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self._process = subprocess.Popen(
@@ -85,14 +89,14 @@ class Service:
             time.sleep(EVERY_S)
 
     def kill(self) -> None:
-        """Kills the service with `kill -9`."""
+        """Kills the service with `kill -9` if it is running."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
             self._process = None
 
     def stop(self) -> None:
-        """Stops the service permanently, as Ctrl-C would."""
+        """Closes the connection, stops the service with SIGTERM and waits until it has ended."""
         self.http.close()
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
@@ -100,7 +104,7 @@ class Service:
             self._process = None
 
     def worker_pid(self, scene: str) -> int | None:
-        """Returns the process id of a scene's worker, or None if it has none."""
+        """Returns the process id of a scene's worker, or None if no worker is running."""
         try:
             pid = int(DataFolder(self.data).scene(scene).worker_lock.read_text())
             os.kill(pid, 0)
@@ -109,7 +113,16 @@ class Service:
         return pid
 
     def create(self, rig: Rig, settings: Mapping[str, Any], **more: Any) -> str:
-        """Creates a scene and returns its id."""
+        """Creates a scene and returns its id.
+
+        Args:
+            rig: cameras of the scene.
+            settings: scene settings.
+            more: additional fields of the request, such as ``ingest``.
+
+        Raises:
+            StudyError: the service refused the request.
+        """
         body = {"rig": RigModel.of(rig).model_dump(mode="json"), "settings": settings, **more}
         answer = self.http.post("/v1/scenes", json=body)
         if answer.status_code != 201:
@@ -117,14 +130,18 @@ class Service:
         return str(answer.json()["id"])
 
     def put_points(self, scene: str, points: InitialPoints) -> None:
-        """Sends the initial points of a scene."""
+        """Sends the initial points of a scene.
+
+        Raises:
+            StudyError: the service refused the points.
+        """
         call = put_points(scene, points)
         answer = self.http.request(call.method, call.path, **call.arguments)
         if not answer.is_success:
             raise StudyError(answer.text)
 
     def put(self, scene: str, index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes]) -> httpx.Response:
-        """Sends one frame without retries."""
+        """Sends one frame without retries and returns the response."""
         body = b"".join(frame_chunks(index, images, masks))
         return self.http.put(
             f"/v1/scenes/{scene}/frames/{index}", content=body, headers={"Content-Type": FRAME_MEDIA_TYPE}
@@ -143,7 +160,16 @@ class Service:
         return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"type":"worker_died"')
 
     def finish(self, scene: str, frames: int, every: float = EVERY_S) -> SceneStatus:
-        """Waits until a number of frames are finished, polling every ``every`` seconds."""
+        """Waits until ``frames`` frames are finished and returns the status of the scene.
+
+        Args:
+            scene: scene id.
+            frames: number of frames to wait for.
+            every: polling interval in seconds.
+
+        Raises:
+            StudyError: the scene failed, or the frames were not finished in time.
+        """
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             status = self.status(scene)

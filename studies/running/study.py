@@ -1,4 +1,4 @@
-"""Frames of a service study, their sender, and the comparison of states."""
+"""Inputs of a service study, classes that send its frames, and the comparison of committed states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Files = tuple[dict[str, bytes], dict[str, bytes]]
 
 @dataclass(frozen=True)
 class Study:
-    """Frames to send, and the service that receives them.
+    """Inputs of a service study: the frames to send, the scene settings and the environment of the service.
 
     Attributes:
         folder: folder for data folders and logs.
@@ -45,20 +45,26 @@ class Study:
     environment: Mapping[str, str]
 
     def service(self, name: str, environment: Mapping[str, str] | None = None) -> Service:
-        """Creates a service on an empty folder; `environment` is added to its environment."""
+        """Returns a service on the emptied data folder ``name``, not yet started.
+
+        ``environment`` adds to the study's environment variables or overrides them.
+        """
         data = self.folder / name
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
         return Service(data, {**self.environment, **(environment or {})})
 
     def create(self, service: Service, **more: Any) -> str:
-        """Creates a scene that keeps all its images."""
+        """Creates a scene that keeps all its images, and returns its id.
+
+        ``more`` adds to the scene's ingest rules or overrides them.
+        """
         rules = {"keep_frames": {}, "queue_frames": 100, **more}
         return service.create(self.capture.full_rig, self.settings, ingest=rules)
 
 
 def encoded_frames(capture: Capture, count: int) -> list[Files]:
-    """Returns a number of frames of a capture, which is played back and forth if it is too short."""
+    """Returns the encoded images and masks of ``count`` frames. A shorter capture is played back and forth."""
     indices = [ping_pong(number, capture.frame_count) for number in range(count)]
     read = {index: _files(capture, index) for index in dict.fromkeys(indices)}
     return [read[index] for index in indices]
@@ -72,7 +78,7 @@ def _files(capture: Capture, index: int) -> Files:
 
 
 def digests(states: Path) -> dict[int, str]:
-    """Returns, for each committed state, a SHA-256 over its arrays and the decisions in its report."""
+    """Returns a text for each committed state: a SHA-256 of its arrays, followed by the decisions in its report."""
     history = History.load(states)
     by_frame = {}
     for index in history.indices:
@@ -87,7 +93,7 @@ def digests(states: Path) -> dict[int, str]:
 
 
 def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence[int] = ()) -> list[str]:
-    """Returns the differences between a run's states and the undisturbed run; frames in `but` may be missing."""
+    """Describes how a run's states differ from those of the undisturbed run. Frames in `but` are not compared."""
     wrong = [index for index in expected if index not in but and found.get(index) != expected[index]]
     missing = [index for index in wrong if index not in found]
     faults = [f"frames {missing} are not committed"] if missing else []
@@ -99,7 +105,7 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
 
 
 class Updates:
-    """Sends frames of a capture to a scene in batches, in the order of `encoded_frames`.
+    """Sends frames to a scene in batches, playing them back and forth.
 
     Attributes:
         next: index of the next frame to send.
@@ -110,7 +116,11 @@ class Updates:
         self.next = 0
 
     def run(self, count: int) -> list[float]:
-        """Sends a number of frames at once and waits for their commits; returns the seconds of each update."""
+        """Sends ``count`` frames at once, waits for their commits, and returns the seconds of each update.
+
+        Raises:
+            StudyError: a frame was refused or not committed.
+        """
         first = self.next
         for index in range(first, first + count):
             answer = self._service.put(self._scene, index, *self._frames[ping_pong(index, len(self._frames))])
@@ -126,7 +136,12 @@ class Updates:
 
 
 class FrameSender:
-    """Sends frames like a rig that never gives up, and records the acknowledgements."""
+    """Sends frames, retrying until each is acknowledged, and records the acknowledgements.
+
+    Attributes:
+        receipts: acknowledgement of each frame, by index.
+        faults: descriptions of frames that were refused or never acknowledged.
+    """
 
     def __init__(self, study: Study, service: Service, scene: str) -> None:
         self.study, self.service, self.scene = study, service, scene
@@ -134,7 +149,7 @@ class FrameSender:
         self.faults: list[str] = []
 
     def send(self, index: int) -> None:
-        """Sends a frame repeatedly until it is acknowledged."""
+        """Sends a frame repeatedly until it is acknowledged. Records a fault if it is refused or times out."""
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             try:
@@ -152,7 +167,10 @@ class FrameSender:
         self.faults.append(f"frame {index} was never acknowledged")
 
     def check(self) -> list[str]:
-        """Checks that every acknowledged frame is committed with the acknowledged identity; returns the faults."""
+        """Checks that every acknowledged frame is committed with the acknowledged identity, and returns the faults.
+
+        Each frame is also sent again, which must give the same acknowledgement.
+        """
         faults = list(self.faults)
         for index, receipt in self.receipts.items():
             report = self.service.frame(self.scene, index)
@@ -170,13 +188,13 @@ class FrameSender:
 def running(
     study: Study, name: str, environment: Mapping[str, str] | None = None, **rules: Any
 ) -> Iterator[tuple[Service, str, FrameSender]]:
-    """Yields a service on an empty folder, a scene, and its sender; stops the service at the end.
+    """Starts a service on an empty folder and yields it with a new scene and a sender. Stops it at the end.
 
     Args:
         study: the study.
         name: name of the service's folder.
         environment: additional environment variables of the service.
-        rules: rules of the scene, as in `Study.create`.
+        rules: ingest rules of the scene, as in `Study.create`.
     """
     service = study.service(name, environment)
     service.start()
@@ -188,7 +206,11 @@ def running(
 
 
 def undisturbed(study: Study) -> tuple[dict[int, str], float]:
-    """Returns the digests of the states of an undisturbed run, and the seconds per update."""
+    """Returns the digests of the states of an undisturbed run, and the mean seconds per update.
+
+    Raises:
+        StudyError: a frame was not acknowledged or not committed.
+    """
     with running(study, "undisturbed") as (service, scene, sender):
         sender.send(0)
         service.finish(scene, 1)

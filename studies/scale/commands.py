@@ -24,7 +24,9 @@ def scale(
     picture: Annotated[Path | None, typer.Option(help="File of the plot, such as scale.png.")] = None,
     out: Page = None,
 ) -> None:
-    """Measures how time and memory grow with pixels, Gaussians, cameras, the share that moves and frames: exponents.
+    """Measures how time and memory grow with pixels, Gaussians, cameras, the share that moves and frames.
+
+    Growth is reported as an exponent.
 
     Example: NUMBA_NUM_THREADS=1 scripts/bench scale --sweep cameras
     """

@@ -1,4 +1,4 @@
-"""``scripts/bench scale``: seconds and memory against one size at a time, each measured in a separate process."""
+"""``scripts/bench scale``: time and memory while one size at a time grows. Each size runs in a separate process."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ SWEEPS: Mapping[str, Sequence[Size]] = {
     "cameras": [Size(cameras=count) for count in (4, 8, 16, 32, 64, 100)],
     "share that moves": [Size(moving=share) for share in (0.05, 0.1, 0.2, 0.4, 0.8)],
 }
-"""Sizes, keyed by the quantity that grows; everything else is as in ``Size()``."""
+"""Sizes of each sweep, keyed by the quantity that grows. Everything else is as in ``Size()``."""
 FRAMES = (100, 1_000, 10_000)
-"""Numbers of frames of one process after which its memory is measured."""
+"""Numbers of frames after which the memory of one process is measured."""
 TURN = 16
-"""Number of frames after which the footage of this measurement reverses."""
+"""Number of frames after which the footage of the memory measurement reverses."""
 KEPT = {"a folder": True, "the process": False}
-"""Where the states of this measurement are kept."""
+"""Maps each place where the memory measurement stores its states to whether it is a folder."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Cost:
 
 
 def amount(name: str, size: Size) -> float:
-    """Returns the quantity that varies in a sweep."""
+    """Returns the quantity that varies in the sweep ``name``, for one of its sizes."""
     if name.startswith("pixels"):
         return float(size.width * size.height)
     return float({"Gaussians": size.gaussians, "cameras": size.cameras, "share that moves": size.moving}[name])
@@ -82,7 +82,7 @@ def slope(amounts: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def cost(size: Size) -> Cost:
-    """Measures one size in this process."""
+    """Measures one size in this process and returns its cost."""
     settings = Settings.model_validate(
         {
             "scene": SCENE,
@@ -109,7 +109,7 @@ def cost(size: Size) -> Cost:
 
 
 def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
-    """Returns the peak memory in MB of a process after a number of frames of a small scene.
+    """Runs a small scene in this process and returns its peak memory in MB, keyed by number of frames.
 
     Args:
         frames: numbers of frames after which the memory is measured.
@@ -134,7 +134,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
 
 
 def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) -> dict[str, Any]:
-    """Measures the sizes that are missing in ``work``; an interrupted run is resumed."""
+    """Measures the figures that are missing in ``work`` and returns all of them, under "sweeps" and "frames"."""
     work.mkdir(parents=True, exist_ok=True)
     for name in sweeps:
         for size in SWEEPS[name]:
@@ -147,7 +147,7 @@ def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) ->
 
 
 def summarize(found: Mapping[str, Any]) -> str:
-    """Formats tables of costs and slopes as Markdown."""
+    """Formats the costs and their exponents as Markdown tables."""
     lines = []
     for name, costs in found["sweeps"].items():
         amounts = [amount(name, size) for size in SWEEPS[name]]
@@ -191,7 +191,7 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
 
 
 def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
-    """Returns the stored figures of a size or frame count, or measures them in a new process."""
+    """Returns the figures of a size or of several frame counts, measured in a new process unless they are stored."""
     name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
     ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # distinguishes other settings
     file = work / f"{name}-{ways:08x}.json"

@@ -1,7 +1,7 @@
-"""Connections of a client without a token, held open by one lightweight process: `python -m studies.service.attack`.
+"""Attacks a service with connections that a client without a token keeps open: `python -m studies.service.attack`.
 
-They comprise one endless header, half-sent headers and stalled uploads, all at once. The process writes one line of
-JSON when the service has closed the last connection, or when its patience has run out.
+One lightweight process sends an endless header, half-sent headers and stalled uploads, all at once. It writes one line
+of JSON when the service has closed the last connection, or when its patience has run out.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ EVERY_S = 0.2
 
 @dataclass
 class Hold:
-    """One connection: its first bytes, and the number of header bytes that follow."""
+    """One connection that is kept open.
+
+    Attributes:
+        connection: the socket.
+        first: remaining bytes to send first.
+        more: number of header bytes to send after these.
+    """
 
     connection: socket.socket
     first: bytes

@@ -1,4 +1,4 @@
-"""Repeated restarts of a scene's reconstruction while the service is killed: the states must be bit-identical."""
+"""Restarts a scene's reconstruction repeatedly while the service is killed. The states must be bit-identical."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from studies.running.process import PATIENCE_S, Service, StudyError
 from studies.running.study import AGAIN_S, Study, compare, digests, running
 
 SPREADS_S = (0.1, 1.0)
-"""Longest delays from a request to the kill: before its event, after it, or during the first frame."""
+"""Longest delays, in seconds, from a restart request to the kill.
+
+The kill thus happens before or after the restart is recorded, or during the first frame.
+"""
 
 
 def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int, echo: Echo) -> ScenarioResult:

@@ -45,9 +45,10 @@ def faults(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Kills the service and its workers, damages its files and fills its disk; compares with an undisturbed run.
+    """Kills the service and its workers, damages its files, fills its disk, and compares with an undisturbed run.
 
-    Then clients without a token attack it during updates: an endless header, half-sent headers and stalled uploads.
+    Then clients without a token attack it during updates, with an endless header, half-sent headers and stalled
+    uploads.
 
     Example: scripts/bench faults samples/robot --set static.iterations=300 --set update.iterations=20
     """
@@ -109,7 +110,7 @@ def ingest(
     work: Annotated[Path, typer.Option(help="Folder on the disk to measure.")] = Path("out/ingest"),
     out: Page = None,
 ) -> None:
-    """Measures ingest over the loopback interface against plain fsynced writes of the same records, in alternation."""
+    """Measures ingest over the loopback interface, alternating with plain fsynced writes of the same records."""
     from client.cli.extras import need_server
     from studies.service import ingest as of_ingest
 
@@ -169,7 +170,10 @@ def crossing(
         Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with points and test cameras.")
     ] = Path("samples/robot"),
 ) -> None:
-    """Lists the source files that a frame runs through from PUT to commit, and a render; fails if too many."""
+    """Lists the source files that a frame runs through from PUT to commit, and those of a render.
+
+    Fails if there are too many.
+    """
     from client.cli.extras import need_server
     from studies.service.crossing import run
 
@@ -185,7 +189,7 @@ def memory(
     scale: Annotated[float, typer.Option(help="Value of the setting scene.image_scale.")] = 1.0,
     masks: Annotated[bool, typer.Option("--masks", help="Send frames with masks.")] = False,
 ) -> None:
-    """Measures the peak memory of a worker against the service's estimate; prints JSON."""
+    """Compares the peak memory of a worker with the service's estimate, and prints the result as JSON."""
     import json
 
     from client.cli.extras import need_server
@@ -203,7 +207,10 @@ def sleeping(
         "out/sleeping"
     ),
 ) -> None:
-    """Measures memory, listing and first views of sleeping scenes, which are copies of one scene; prints JSON."""
+    """Measures memory, listing and first views of sleeping scenes, and prints the result as JSON.
+
+    The scenes are copies of one scene.
+    """
     import json
 
     from client.cli.extras import need_server

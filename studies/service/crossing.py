@@ -1,9 +1,9 @@
-"""Source files that a frame passes through from PUT to commit, and a render from request to response.
+"""Source files that a frame runs through from PUT to commit, and a render from request to response.
 
-Their number is how many files a reader must open to follow a frame or a render. A file counts if one of its functions
-runs, in any process, for each of two frames or of two renders, so that unrelated work is ignored. Also ignored are
-`__init__` files, the kernels, the groups of effects (of which a scene has only a few) and `server/repair` (which checks
-the disk every few seconds in any case). The service runs as usual, with a profiler in each process.
+These are the files that a reader must open to follow a frame or a render. A file counts if one of its functions runs,
+in any process, for each of two frames or of two renders, so that unrelated work is ignored. Also ignored are `__init__`
+files, the kernels, the groups of effects (of which a scene has only a few) and `server/repair` (which checks the disk
+every few seconds in any case). The service runs as usual, with a profiler in each process.
 """
 
 from __future__ import annotations
@@ -23,9 +23,12 @@ from studies.running.process import Service, wait_until
 
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26
-"""Limits; the current numbers are 62 and 26. Unfinished work from before a frame would add files of its own."""
+"""Largest allowed numbers of files; the current numbers are 62 and 26.
+
+Unfinished work from before a frame would add files of its own.
+"""
 LATER = (3, 4)
-"""Frames that are traced; frame 0 and the first updates do additional work."""
+"""Frames that are traced. Frame 0 and the first updates do additional work."""
 SETTINGS = {
     "scene": {"image_scale": 0.25},
     "static": {"iterations": 300, "max_gaussians": 2500},
@@ -65,7 +68,7 @@ sys.setprofile(profile)
 
 
 def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
-    """Returns the sorted files that a later "frame" and a "render" pass through, relative to the checkout.
+    """Returns the sorted files that a later "frame" and a "render" run through, relative to the checkout.
 
     Args:
         folder: folder for the service's data, created if missing.
@@ -142,7 +145,7 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
 
 
 def run(sample: Path, echo: Callable[[str], None] = print) -> bool:
-    """Prints both lists; returns whether both are within their limits."""
+    """Prints the files of a frame and of a render, and returns whether their numbers are within the limits."""
     with tempfile.TemporaryDirectory(prefix="scas4d-crossing-") as folder:
         files = crossed(Path(folder), open_measured(sample))
     for phase, most in (("frame", MOST_OF_A_FRAME), ("render", MOST_OF_A_RENDER)):

@@ -31,11 +31,11 @@ KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6
 """Number of frames committed before the first bit is flipped."""
 NOTICED_S = 60.0
-"""Time within which a flip must be noticed; here the scrub runs almost continuously."""
+"""Seconds within which a flip must be noticed. In this study, the scrub runs almost continuously."""
 KEPT = 100
-"""Number of frames whose images are kept; older states cannot be recomputed and are reported as lost."""
+"""Number of frames whose images are kept. Older states cannot be recomputed and are reported as lost."""
 CLOSE_DB = 3.0
-"""Largest PSNR loss of a recomputed state against the lost one, on the images of its frame."""
+"""Largest PSNR loss of a recomputed state compared with the lost one, on the images of its frame."""
 SCRUB = {"SCAS4D_SCRUB_MB_PER_SECOND": "1000", "SCAS4D_SCRUB_PAUSE_SECONDS": "0.2"}
 
 Pictures = dict[int, bytes]
@@ -66,7 +66,7 @@ def frames_for(count: int) -> int:
 
 
 def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
-    """Returns the states and views of an undisturbed run."""
+    """Returns the digests of the states of an undisturbed run, and a view of each frame as PNG."""
     with running(study, "undisturbed_views") as (service, scene, sender):
         for index in range(len(study.frames)):
             sender.send(index)
@@ -76,7 +76,10 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
 
 
 def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> Flips:
-    """Flips `count` bits, equally many of each kind, and half of them while the service is down."""
+    """Flips `count` bits and returns the outcome.
+
+    The kinds of files take turns, and half of the bits are flipped while the service is down.
+    """
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
     counts = Flips()
@@ -138,7 +141,16 @@ class _Flip:
                 return newest, random_.choice(sorted(self.folder.frames.glob("*.frame")))
 
     def run(self, down: bool, found: Flips, views: Pictures) -> str:
-        """Flips the bit, requests everything, and repairs the file if the service has not."""
+        """Flips the bit, checks the service's responses, and repairs the file if the service has not.
+
+        Args:
+            down: whether the service is down during the flip.
+            found: outcome to which the flip is added.
+            views: views of the undisturbed run.
+
+        Returns:
+            "noticed" or "harmless".
+        """
         service = self.service
         if down:
             service.kill()

@@ -1,6 +1,6 @@
 """Kills, truncation, bit flips, a full disk and attackers: no acknowledged frame may be lost, and no bit may differ.
 
-Each scenario runs the whole service in a separate process. The undisturbed run comes first; the others are compared
+Each scenario runs the whole service in a separate process. The undisturbed run comes first. The other runs are compared
 with it, state by state and bit by bit.
 """
 
@@ -34,7 +34,7 @@ from studies.service.strangers import Attack, strangers
 TURN_S = 15.0
 """Duration of updates without strangers. With strangers, updates continue until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
-"""Maximum number of worker kills per frame. A sixth kill would rightly fail the frame, so it waits for the next one."""
+"""Maximum number of worker kills per frame. At the sixth kill, the service would rightly fail the frame."""
 
 PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
 """Names of the scenarios."""
@@ -82,7 +82,11 @@ def kills(
 
 
 def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
-    """Kills the scene's worker once it processes a frame that has not reached the maximum number of kills."""
+    """Kills the scene's worker once it processes a frame that has not reached the maximum number of kills.
+
+    Raises:
+        StudyError: there is no such worker within the time limit.
+    """
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         status = service.status(scene)
@@ -100,7 +104,7 @@ def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
 def damaged_log(
     study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Truncates log files or flips a bit while the service is down; it must then start, report this and continue.
+    """Truncates log files or flips a bit while the service is down. It must then start, report this and continue.
 
     Half of the frames are committed and the other half are waiting, as after a kill.
     """
@@ -154,7 +158,11 @@ def damaged_log(
 
 
 def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
-    """Damages the journal or the record of a waiting frame; returns a description and the affected frame."""
+    """Damages the journal or the record of a waiting frame.
+
+    Returns:
+        A description of the damage, and the index of the affected frame; None for the journal.
+    """
     journal = folder.journal
     taken = {event.index: event for event in read_journal(journal).events if isinstance(event, FrameAccepted)}
     waiting = [index for index in taken if index >= half]
@@ -184,10 +192,10 @@ def _check_damaged(service: Service, scene: str, sender: FrameSender, hit: int |
 
 
 def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> ScenarioResult:
-    """Prevents files from growing, first for the service and then for the worker; then lifts the limit again.
+    """Prevents files from growing, first for the service and then for the worker, and lifts the limit each time.
 
-    The file size limit is set on the running processes (RLIMIT_FSIZE), so that every write fails where a full disk
-    would make it fail.
+    The file size limit is set on the running processes (RLIMIT_FSIZE). Every write then fails where it would fail on a
+    full disk.
     """
     faults: list[str] = []
     with running(study, "full") as (service, scene, sender):
@@ -265,7 +273,7 @@ def run(
     parts: Sequence[str] = PARTS,
     echo: Echo = print,
 ) -> list[ScenarioResult]:
-    """Runs the scenarios named in `parts`.
+    """Runs the scenarios named in `parts` and returns their results.
 
     Args:
         study: study that defines the frames and the service.

@@ -1,6 +1,6 @@
-"""Frame cases on a running service: no HTTP status above 499, no dead worker, failures explained and recovered.
+"""Runs the frame cases on a service, which must accept all frames, keep its workers alive, and report what is wrong.
 
-All cases go into one scene, one after the other, with good frames between them. Another scene gets only the good
+All cases are sent to one scene, one after the other, with good frames between them. Another scene gets only the good
 frames. The committed states are read from the folders of the scenes and compared.
 """
 
@@ -36,7 +36,7 @@ from studies.options import Echo
 from studies.running.process import PATIENCE_S, Service
 
 FARTHEST = 1.0
-"""Largest jump of the object, in multiples of its size; a jump of twice its size would leave the images."""
+"""Largest jump of the object, in multiples of its size. A jump of twice its size would leave the images."""
 BETWEEN = 2
 """Number of good frames between the last frame that counts for one case and the first frame of the next."""
 AGAIN_S = 0.05
@@ -49,15 +49,15 @@ class BackAndForth:
         self._footage = footage
 
     def frame(self, index: int) -> Frame:
-        """See ``frames.Footage``."""
+        """Returns a frame with the training images."""
         return self._footage.frame(self._inside(index))
 
     def truth(self, index: int) -> Pictures:
-        """See ``frames.Footage``."""
+        """Returns the true images of the held-out cameras."""
         return self._footage.truth(self._inside(index))
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
-        """See ``frames.Footage``."""
+        """Returns the images with the object moved by a multiple of its size, or None if unavailable."""
         return self._footage.jumped(self._inside(index), sizes)
 
     def _inside(self, index: int) -> int:
@@ -68,7 +68,15 @@ class BackAndForth:
 
 @dataclass
 class ServiceCaseResult:
-    """Result of a case at one size, on the service."""
+    """Result of a case at one size, on the service.
+
+    Attributes:
+        case: the case.
+        size: size at which the case was run.
+        said: summaries of the reports on the faulty frames.
+        last: PSNR of the last frame minus that of the undisturbed run, in dB.
+        violations: violated checks.
+    """
 
     case: FrameCase
     size: Any
@@ -79,7 +87,14 @@ class ServiceCaseResult:
 
 @dataclass(frozen=True)
 class SentCase:
-    """Frames sent for one case, starting at an index of the scene."""
+    """Frames that are sent for one case.
+
+    Attributes:
+        case: the case.
+        size: size at which the case is run.
+        first: index of the first of these frames in the scene.
+        sent: the frames.
+    """
 
     case: FrameCase
     size: Any
@@ -88,7 +103,7 @@ class SentCase:
 
 
 def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent], list[SentCase]]:
-    """Returns all frames to send and the cases among them; a permanent jump is followed by a jump back."""
+    """Returns all frames to send, and the frames of each case. A permanent jump is followed by a jump back."""
     sent = [good(footage, index) for index in range(AT)]
     parts: list[SentCase] = []
     for case in cases:
@@ -143,7 +158,12 @@ def study(
 
 @dataclass(frozen=True)
 class Pushed:
-    """A scene of the service, read from its folder."""
+    """A scene of the service, read from its folder.
+
+    Attributes:
+        committed: committed states of the scene.
+        count: number of frames that were to be sent.
+    """
 
     committed: CommittedScene
     count: int
@@ -160,7 +180,7 @@ class Pushed:
         return FrameReport(**{**known, "outcome": FrameOutcome(record["outcome"]), "alarms": alarms})
 
     def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:
-        """Returns the PSNR in dB of the held-out cameras."""
+        """Returns the PSNR in dB of a frame on the held-out cameras, whose true images are ``truth``."""
         return float(
             np.mean(
                 [psnr(self.committed.render(camera, index).colour, truth[camera.name]) for camera in footage.held_out]
@@ -169,7 +189,7 @@ class Pushed:
 
 
 def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Echo) -> tuple[Pushed, list[str]]:
-    """Sends frames to a new scene one after the other; returns the scene and any errors."""
+    """Sends frames to a new scene one after the other, and returns the scene and the faults of the service."""
     faults: list[str] = []
     scene = service.create(
         footage.rig,
@@ -208,7 +228,11 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
 def _send(
     service: Service, scene: str, index: int, whole: bool, images: dict[str, bytes], masks: dict[str, bytes]
 ) -> httpx.Response:
-    """Sends a frame as a whole or camera by camera; returns the first unsuccessful response, or the last response."""
+    """Sends a frame as a whole or camera by camera.
+
+    Returns:
+        The first unsuccessful response, or the last response if all are successful.
+    """
     if whole:
         return service.put(scene, index, images, masks)
     address = f"/v1/scenes/{scene}/frames/{index}"
@@ -262,7 +286,7 @@ def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -
 
 
 def table(lines: Sequence[ServiceCaseResult]) -> str:
-    """Formats the results as Markdown."""
+    """Formats the results as a Markdown table, with one row per case and size."""
     rows = ["| case | size | reports | dB, last frame | passes |", "|" + "---|" * 5]
     for line in lines:
         verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"

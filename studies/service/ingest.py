@@ -1,8 +1,8 @@
 """Ingest rate over the loopback interface, compared with plain fsynced writes of the same records.
 
 Everything is measured alternately in one run, because a disk's speed drifts and heavy writing slows later writes. A
-record contains the encoded images of one frame. The scene is paused, so that only ingest is measured: receive, check
-the structure of each image, hash, write, sync, acknowledge.
+record contains the encoded images of one frame. The scene is paused, so only ingest is measured, that is, receiving,
+checking the structure of each image, hashing, writing, syncing and acknowledging.
 """
 
 from __future__ import annotations
@@ -32,19 +32,29 @@ UNANSWERED = 2
 
 @dataclass(frozen=True)
 class IngestTimes:
-    """Megabytes per second of plain writes, over HTTP and over a WebSocket, with one value per round."""
+    """Rates in megabytes per second, with one value per round.
+
+    Attributes:
+        plain: rates of plain writes.
+        ingest: rates over HTTP.
+        socket: rates over a WebSocket.
+    """
 
     plain: list[float]
     ingest: list[float]
     socket: list[float]
 
     def share(self, ingest: Sequence[float]) -> float:
-        """Returns the median over all rounds of the ratio to plain writes."""
+        """Returns the median over all rounds of the ratio of ``ingest`` to plain writes."""
         return statistics.median(took / plain for took, plain in zip(ingest, self.plain, strict=True))
 
 
 def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
-    """Creates a JPEG of noise, with the highest quality that fits into a given size."""
+    """Creates a JPEG of noise with the highest quality that fits into ``size_bytes``.
+
+    Raises:
+        StudyError: even the lowest quality does not fit.
+    """
     rng = np.random.default_rng(seed)
     picture = Image.fromarray(rng.integers(0, 256, (side, side, 3), dtype=np.uint8))
     best = b""
@@ -63,7 +73,7 @@ def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
 
 
 def noise_rig(cameras: int, side: int = 1024) -> Rig:
-    """Creates placeholder cameras in a row."""
+    """Creates a rig of placeholder cameras in a row, with square images of ``side`` pixels."""
     k = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
     placed_cameras = []
     for number in range(cameras):
@@ -74,7 +84,19 @@ def noise_rig(cameras: int, side: int = 1024) -> Rig:
 
 
 def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> IngestTimes:
-    """Sends `frames` frames per round and alternately writes the same bytes to plain files."""
+    """Measures the rates of plain writes, of HTTP and of a WebSocket, alternating between them in each round.
+
+    Args:
+        folder: folder on the disk to measure.
+        frames: number of frames per round.
+        cameras: number of cameras of the rig.
+        size_bytes: size of one JPEG in bytes.
+        rounds: number of rounds; a further round warms up.
+        senders: number of HTTP connections.
+
+    Raises:
+        StudyError: the service refused a frame.
+    """
     rig = noise_rig(cameras)
     pictures = [jpeg(size_bytes, seed) for seed in range(cameras)]
     records = [{name: pictures[(k + turn) % cameras] for k, name in enumerate(rig.names)} for turn in range(2)]
@@ -110,7 +132,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
 
 
 def _plain(folder: Path, bodies: Sequence[bytes], frames: int, first: int) -> float:
-    """Returns the seconds to write and sync each record to a new file; files are kept, because reuse is faster."""
+    """Returns the seconds to write and sync each record to a new file. Files are kept, because reuse is faster."""
     folder.mkdir(exist_ok=True)
     began = time.perf_counter()
     for number in range(first, first + frames):
@@ -160,7 +182,10 @@ def _ingest(
 
 
 def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], first: int, frames: int) -> float:
-    """Returns the seconds over one WebSocket, with at most `UNANSWERED` messages in flight."""
+    """Returns the seconds until all frames are acknowledged over one WebSocket.
+
+    At most `UNANSWERED` messages are in flight.
+    """
     faults: list[str] = []
     room = threading.Semaphore(UNANSWERED)
 
@@ -187,7 +212,7 @@ def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], f
 
 
 def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
-    """Formats the rates as Markdown."""
+    """Formats the rates as a Markdown table, with a description of the frames and the verdict."""
     shares = [f"{100 * measured.share(took):.0f} %" for took in (measured.ingest, measured.socket)]
     rows = "\n".join(
         f"| {number + 1} | {plain:.0f} | {ingest:.0f} | {100 * ingest / plain:.0f} % "

@@ -30,7 +30,7 @@ from studies.running.process import Service
 
 
 def ring(count: int, size: int) -> Rig:
-    """Creates a ring of cameras around the origin, at a distance of 2 m."""
+    """Creates a ring of cameras with square images, 2 m from the origin."""
     lens = np.array([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
     cameras = []
     for k in range(count):
@@ -43,7 +43,7 @@ def ring(count: int, size: int) -> Rig:
 
 
 def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
-    """Creates a frame of a ball that moves by one pixel per frame."""
+    """Creates a frame that shows a ball, which moves by one pixel per frame."""
     rows, columns = np.mgrid[:size, :size]
     ball = np.hypot(rows - size / 2, columns - size / 2 - index) < 0.24 * size
     picture = np.zeros((size, size, 3), np.uint8)

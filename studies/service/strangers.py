@@ -1,4 +1,4 @@
-"""Cost of clients without a token: `/health/live`, memory and updates, alternately with and without an attack.
+"""Measures `/health/live`, memory and updates, alternately with and without an attack by clients without a token.
 
 The attack is `studies.service.attack`, in a separate process. One service runs with a token and one without. The scene
 is updated continuously. A turn with the attack lasts until its last connection is closed.
@@ -30,12 +30,18 @@ EVERY_S = 0.05
 PATIENCE_S = 120.0
 AT_ONCE = 4
 WARM_UP = 3
-"""Updates before the measurement: the first ones compile or load kernels and start cold."""
+"""Number of updates before the measurement. The first ones compile or load kernels and start cold."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """Size of an attack: bytes of an endless header, half-sent headers, stalled uploads."""
+    """Size of an attack.
+
+    Attributes:
+        header: bytes of the endless header.
+        halves: number of half-sent headers.
+        uploads: number of stalled uploads.
+    """
 
     header: int = 300_000_000
     halves: int = 300
@@ -97,7 +103,7 @@ class Watch:
 
 
 def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, echo: Echo) -> ScenarioResult:
-    """Measures one service with and without the attack.
+    """Measures one service with and without the attack and returns the result.
 
     Args:
         study: frames and settings of the scene.

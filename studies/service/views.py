@@ -31,9 +31,9 @@ from studies.running.study import Updates, encoded_frames
 
 TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0
-"""Duration of views per turn while nothing is updated."""
+"""Seconds per turn during which views are requested while nothing is updated."""
 WARM_UP = 3
-"""Updates before the measurement: the first ones compile or load kernels and start cold."""
+"""Number of updates before the measurement. The first ones compile or load kernels and start cold."""
 
 
 @dataclass
@@ -58,17 +58,28 @@ class ViewTimes:
 
     @property
     def latency(self) -> float:
-        """Ratio of the median latency during updates to the median without."""
+        """Ratio of the median latency during updates to the median latency without updates."""
         return statistics.median(self.loaded) / statistics.median(self.idle)
 
     @property
     def slower(self) -> float:
-        """Fraction by which the median update is slower under load."""
+        """Fraction by which the median update is slower with views than without."""
         return statistics.median(self.together) / statistics.median(self.alone) - 1
 
 
 class Load:
-    """Requests views at a fixed rate in a thread until it is stopped."""
+    """Context manager that requests views at a fixed rate in a thread.
+
+    Args:
+        url: URL of the scene.
+        cameras: names of the cameras, which are rendered in turn.
+        rate: views per second.
+        width: width of a view in pixels.
+
+    Attributes:
+        latencies: latency of each view in ms, from the time at which it was due.
+        refused: number of views without a response of 200.
+    """
 
     def __init__(self, url: str, cameras: Sequence[str], rate: float, width: int) -> None:
         self.latencies: list[float] = []
@@ -123,7 +134,7 @@ def measure(
     environment: Mapping[str, str],
     echo: Echo,
 ) -> list[ViewTimes]:
-    """Measures views and updates, alone and together, at each rate.
+    """Measures views and updates, alone and together, and returns the times at each rate.
 
     Args:
         capture: capture whose frames are sent.
@@ -175,7 +186,7 @@ def measure(
 
 
 def line(row: ViewTimes) -> str:
-    """Formats one row of the table."""
+    """Formats the times at one rate as a row of the Markdown table."""
     cells = [
         f"{row.rate:g}",
         *(f"{statistics.median(times):.0f} ({np.percentile(times, 95):.0f})" for times in (row.idle, row.loaded)),
@@ -189,7 +200,7 @@ def line(row: ViewTimes) -> str:
 
 
 def table(rows: Sequence[ViewTimes]) -> str:
-    """Formats the results as Markdown, with the target."""
+    """Formats the results as a Markdown table, followed by a sentence on the target."""
     head = [
         "| views per second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
         "slower | no response |",
@@ -208,7 +219,7 @@ def table(rows: Sequence[ViewTimes]) -> str:
 
 
 def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turns: int) -> str:
-    """Returns the table with the date and the machine of the measurement."""
+    """Returns the table as Markdown, preceded by the date, the machine and the conditions of the measurement."""
     day = datetime.now(UTC).date().isoformat()
     return (
         f"Measured {day} on {in_words(machine())}: `{capture}`, views {width} pixels wide as JPEG, every camera of the "

@@ -1,4 +1,4 @@
-"""Virtual clock: an event loop whose time jumps to the next timer, and that runs blocking functions immediately."""
+"""Virtual clock: an event loop that jumps to the next timer and runs blocking functions immediately."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _Jump(selectors.SelectSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """An event loop that runs ready tasks, then jumps to the next timer; deterministic, without threads.
+    """An event loop that runs ready tasks, then jumps to the next timer. It is deterministic and uses no threads.
 
     Example:
         >>> async def hour() -> float:
@@ -49,7 +49,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return self._jump.now
 
     def run_in_executor(self, executor: Any, func: Callable[[*Arguments], T], *args: *Arguments) -> asyncio.Future[T]:
-        """Runs the function immediately in this thread; it takes no virtual time."""
+        """Runs the function immediately in this thread, which takes no virtual time."""
         future: asyncio.Future[T] = self.create_future()
         try:
             future.set_result(func(*args))
@@ -59,6 +59,6 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtual(main: Coroutine[Any, Any, T]) -> T:
-    """Runs a coroutine on its own virtual clock, starting at 0 s."""
+    """Runs a coroutine on its own virtual clock, starting at 0 s, and returns its result."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(main)

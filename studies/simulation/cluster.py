@@ -13,7 +13,9 @@ from studies.simulation.nodes import Capacity, Node, NodeState, Placed
 
 
 class SimulatedCluster:
-    """Places processes on nodes with room; of the processes that fit, the one that has waited longest is next.
+    """Model of a Ray cluster, which places processes on nodes with room.
+
+    Of the processes that fit on a node, the one that has waited longest is placed first.
 
     Args:
         count: number of nodes.
@@ -43,17 +45,17 @@ class SimulatedCluster:
             self.join()
 
     def later(self, delay: Range | float, call: Callable[[], None]) -> asyncio.TimerHandle:
-        """Calls a function after a delay in seconds."""
+        """Calls a function after a delay in seconds, which is drawn at random if a range is given."""
         return self.loop.call_later(self.random.uniform(*delay) if isinstance(delay, tuple) else delay, call)
 
     def running(self) -> list[Node]:
-        """Returns the running nodes that Ray knows."""
+        """Returns the running nodes that Ray considers alive."""
         return [node for node in self.nodes if node.listed and node.state is NodeState.RUNNING]
 
     # Placement.
 
     def queue(self, process: Placed) -> None:
-        """Requests a place for a process."""
+        """Adds a process to the queue for a place on a node."""
         self._queued += 1
         self._queues[self.capacity.kind(process.needs)].append((self._queued, process))
         self._wake()
@@ -110,26 +112,26 @@ class SimulatedCluster:
         self._changed(node)
 
     def kill(self, node: Node) -> None:
-        """Kills a node with all its processes; a new node joins after a delay."""
+        """Kills a node with all its processes. A new node joins after a delay."""
         self._fails(node, NodeState.DEAD)
         for process in tuple(node.processes):
             process.kill()
         self.later(REPLACED_S, self.join)
 
     def stop(self, node: Node, seconds: float) -> None:
-        """Stops a node and its workers for a while."""
+        """Stops a node and its workers for a number of seconds."""
         self._fails(node, NodeState.STOPPED)
         for process in tuple(node.processes):
             process.pause()
         self.later(seconds, lambda: self._back(node))
 
     def cut(self, node: Node, seconds: float) -> None:
-        """Disconnects a node for a while; its workers continue."""
+        """Disconnects a node for a number of seconds. Its workers continue."""
         self._fails(node, NodeState.CUT)
         self.later(seconds, lambda: self._back(node))
 
     def head_down(self, seconds: float) -> None:
-        """Suspends placement and failure detection by the head for a while."""
+        """Suspends placement and failure detection by the head for a number of seconds."""
         self.answers = False
         self.capacity.head(False)
         self.later(seconds, self._head_back)
@@ -140,7 +142,7 @@ class SimulatedCluster:
         self._check(node)
 
     def _check(self, node: Node) -> None:
-        """Runs the health checks of a node that does not respond."""
+        """Starts the health checks of a node that does not respond."""
         failed_at = node.failed_at
         self.later(NOTICED_S, lambda: self._notice(node, failed_at))
 

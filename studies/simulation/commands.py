@@ -24,9 +24,10 @@ def simulate(
     ] = HEAD_S,
     out: Page = None,
 ) -> None:
-    """Simulates a large cluster on a virtual clock: are frames lost or run twice, and how soon do scenes get a place?
+    """Simulates a large cluster on a virtual clock, to check for lost or repeated frames and to time placement.
 
-    The supervision of workers and the epochs of their folders are the service's; Ray, nodes and workers are models.
+    The supervision of workers and the epochs of their folders are the service's own code. Ray, nodes and workers are
+    models.
 
     Example: scripts/bench simulate --scenes 400 --nodes 16 --failures 200
     """

@@ -1,4 +1,4 @@
-"""Delays and sizes of the model, with sources; a pair of seconds is the range of a uniform distribution."""
+"""Delays and sizes of the model, with sources. A pair of seconds is the range of a uniform distribution."""
 
 from __future__ import annotations
 
@@ -11,32 +11,38 @@ START_S: Range = (2.0, 4.0)
 NOTICED_S: Range = (3.0, 9.0)
 """Delay from a node's silence until Ray declares it lost, with checks every 1 s, a 2 s timeout and 3 failures."""
 TOLD_S: Range = (3.0, 6.0)
-"""Delay from then until the service is notified, which is the rest of the 14 to 18 s until a scene continues."""
+"""Delay from Ray's declaration until the service is notified.
+
+It is chosen so that a scene continues 14 to 18 s after the failure, as measured.
+"""
 
 HEAD_S: Range = (3.0, 5.5)
-"""How long the head does not respond after its end: `scripts/bench head`, with Redis and a supervisor."""
+"""How long the head does not respond after its end, measured by `scripts/bench head` with Redis and a supervisor."""
 
 # From Ray.
 
 PLACED_PER_S = 550.0
-"""Actors that the head places, one after the other: `many_actors` of Ray's release tests, 10,000 on 64 nodes."""
+"""Number of actors that the head places per second, one after the other.
+
+The source is `many_actors` of Ray's release tests, with 10,000 actors on 64 nodes.
+"""
 TOP_SHARE, SPREAD_ABOVE = 0.2, 0.5
-"""Ray's scheduler draws from the emptiest fifth of the nodes; nodes that are less than half full count as empty."""
+"""Ray's scheduler draws from the emptiest fifth of the nodes. Nodes that are less than half full count as empty."""
 WAIT_S = 3.0
 """`WAIT_S` of server/cluster/ray_placement.py, which cannot be imported without Ray."""
 MESSAGE_S: Range = (0.001, 0.02)
-"""Latency of a message between the service and a worker; docs/cluster.md measures 3.9 ms more per view."""
+"""Latency of a message between the service and a worker. According to docs/cluster.md, it adds 3.9 ms to a view."""
 
 # Assumed, not measured.
 
 STOPPING_S: Range = (0.1, 1.0)
-"""How long a worker takes to stop when asked."""
+"""How long a worker takes to stop on request."""
 LATE_S: Range = (0.5, 10.0)
 """How long actors keep running after their service has ended."""
 ADRIFT_S: Range = (1.0, 120.0)
-"""How long an abandoned worker keeps running; a real one ends within 0.5 s of its parent's end."""
+"""How long an abandoned worker keeps running. A real worker ends within 0.5 s of its parent's end."""
 ADRIFT_UPDATE_S: Range = (0.5, 5.0)
-"""Seconds per update of an abandoned worker; short, so that it writes many files that must not be read."""
+"""Seconds per update of an abandoned worker. Its updates are fast, so it writes many files that must not be read."""
 PAUSE_S: Range = (1.0, 240.0)
 """How long a node is stopped or cut off, sometimes for less than Ray takes to notice."""
 REPLACED_S: Range = (30.0, 120.0)
@@ -44,8 +50,11 @@ REPLACED_S: Range = (30.0, 120.0)
 DOWN_S: Range = (1.0, 20.0)
 """Delay from the service's end to its next start."""
 RECOVER_S = 5.0
-"""Time within which the service recovers all its scenes after its start."""
+"""Seconds within which the service recovers all its scenes after its start."""
 JOURNAL_S: Range = (0.001, 0.01)
 """How long the service takes to write a worker's death to the journal."""
 QUICKEST_S, LONGEST_SHARE = 2.0, 0.6
-"""Bounds of an update's duration, which is drawn log-uniformly: seconds, and a share of the time between frames."""
+"""Bounds of an update's duration, which is drawn log-uniformly.
+
+The minimum is in seconds, and the maximum is a fraction of the time between frames.
+"""

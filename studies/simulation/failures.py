@@ -39,7 +39,7 @@ LEAST = 2
 
 
 def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[float, Failure]]:
-    """Draws failures by their shares at uniformly distributed times; node kills make up the rest of the total.
+    """Draws failures at uniformly distributed times, by their shares. Node kills make up the rest of the total.
 
     >>> found = drawn(60, 0, 10, Random(0))
     >>> len(found), sum(failure is Failure.SERVICE for _, failure in found)
@@ -69,7 +69,7 @@ class Failures:
         self._restart: asyncio.Task[None] | None = None
 
     def plan(self, moments: list[tuple[float, Failure]]) -> None:
-        """Schedules the failures."""
+        """Schedules failures, given as pairs of time in seconds and kind."""
         for when, failure in moments:
             self._cluster.loop.call_at(when, self._happen, failure)
 

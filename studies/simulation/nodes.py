@@ -1,4 +1,4 @@
-"""Nodes of the modelled cluster, and the time during which at least one of them had room."""
+"""Nodes of the modelled cluster, and the time during which at least one node had room."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class NodeState(Enum):
     STOPPED = auto()
     """Stopped by SIGSTOP, together with its workers."""
     CUT = auto()
-    """Disconnected: its workers continue, but no message passes."""
+    """Disconnected. Its workers continue, but no messages get through."""
     DEAD = auto()
 
 
 class Placed(Protocol):
-    """A process as its node sees it."""
+    """Protocol of a process that can be placed on a node."""
 
     needs: ResourceNeeds
 
@@ -58,7 +58,7 @@ class Node:
         listed: whether Ray considers the node alive.
         failed_at: time at which it last fell silent, in seconds.
         processes: processes on the node.
-        held: calls deferred until the node can be reached again; dropped if Ray declares the node lost before that.
+        held: calls that are deferred until the node can be reached again, and dropped if Ray declares it lost.
     """
 
     number: int
@@ -78,7 +78,7 @@ class Node:
         return self.free_cpus >= needs.cpus and self.free_memory >= needs.memory
 
     def load(self) -> float:
-        """Returns the used share of the node's scarcest resource."""
+        """Returns the used fraction of the node's scarcest resource."""
         return max(1 - self.free_cpus / self.cpus, 1 - self.free_memory / self.memory)
 
     def take(self, process: Placed) -> None:
@@ -88,7 +88,7 @@ class Node:
         self.free_memory -= process.needs.memory
 
     def give(self, process: Placed) -> bool:
-        """Releases the resources of a process; returns False if it was not on this node."""
+        """Releases the resources of a process and returns whether it was on this node."""
         if process not in self.processes:
             return False
         del self.processes[process]
@@ -105,7 +105,7 @@ class Capacity:
         now: function that returns the current time.
 
     Attributes:
-        listed: number of nodes with room per kind, as known to Ray, including silent nodes that are not yet lost.
+        listed: number of nodes with room per kind that Ray considers alive, including silent ones not yet lost.
     """
 
     def __init__(self, kinds: Sequence[ResourceNeeds], now: Callable[[], float]) -> None:

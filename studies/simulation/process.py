@@ -19,7 +19,9 @@ from studies.simulation.work import Work
 
 
 class SimulatedProcess:
-    """A worker process that behaves like `RayProcess`: after its end was reported, nothing from it reaches the service.
+    """A simulated worker process that behaves like `RayProcess`.
+
+    Once its end has been reported, the service receives no more messages from it.
 
     Attributes:
         over: whether the service has given up this process, or the service itself has ended.
@@ -52,7 +54,7 @@ class SimulatedProcess:
 
     @property
     def pid(self) -> int | None:
-        """See `ProcessHandle`."""
+        """Number of the worker, or None before it has a place and after it has ended."""
         return None if self.work is None else self._number
 
     @property
@@ -63,20 +65,20 @@ class SimulatedProcess:
     # Called by the service.
 
     def send(self, message: Any) -> None:
-        """See `ProcessHandle`."""
+        """Sends a message to the worker; see `ProcessHandle`. Without a running worker, the message is dropped."""
         if not self.over and self.work is not None:
             work = self.work
             self._last_order = self._pass(lambda: work.order(message), self._last_order)
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """See `ProcessHandle`."""
+        """Gives up the process and stops its worker, within ``seconds``; see `ProcessHandle`."""
         self._let_go()
         if self.node is not None:
             await asyncio.sleep(min(seconds, self._cluster.random.uniform(*STOPPING_S)))
             self._finish()
 
     def abandon(self) -> None:
-        """Handles the end of the service: the actor ends later; on a stopped node, after the node resumes."""
+        """Handles the end of the service. The actor ends later, on a stopped node only after the node resumes."""
         self._let_go()
         if self.work is not None:
             self.work.drift()
@@ -90,22 +92,22 @@ class SimulatedProcess:
     # Called by the node.
 
     def place(self, node: Node) -> None:
-        """Starts on the node that Ray has chosen, as soon as the node can be reached."""
+        """Starts the worker on the node that Ray has chosen, as soon as the node can be reached."""
         self.node = node
         self._reach(self._begin)
 
     def pause(self) -> None:
-        """Pauses with its stopped node."""
+        """Pauses the work, because the node is stopped."""
         if self.work is not None:
             self.work.pause()
 
     def resume(self) -> None:
-        """Resumes with its node."""
+        """Resumes the work, because the node has resumed."""
         if self.work is not None:
             self.work.resume()
 
     def kill(self) -> None:
-        """Ends together with its node, before Ray notices."""
+        """Ends the work together with the node, before Ray notices."""
         if self.work is not None:
             self.work.end()
 
@@ -121,7 +123,7 @@ class SimulatedProcess:
             self._cluster.later(TOLD_S, lambda: self._tell_end(ProcessExit(None, why, lost=began)))
 
     def die(self) -> None:
-        """Kills the worker; its node continues."""
+        """Kills the worker. Its node continues."""
         assert self.work is not None
         self.work.end()
         self._times.hit(self.needs.scene, "worker", self._cluster.loop.time(), self._kind)
@@ -165,7 +167,7 @@ class SimulatedProcess:
             self._on_message(message)
 
     def _pass(self, call: Callable[[], None], after: float) -> float:
-        """Makes a call over the network, after all earlier messages; returns its time."""
+        """Schedules a call over the network, not before the time ``after``, and returns its time."""
         loop = self._cluster.loop
         due = max(after, loop.time() + self._cluster.random.uniform(*MESSAGE_S))
         loop.call_at(due, self._reach, call)
@@ -222,7 +224,7 @@ class SimulatedPlacement(Placement):
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
     ) -> ProcessHandle:
-        """See `Placement`."""
+        """Creates the worker process of a scene, which waits for a place; see `Placement`."""
         assert isinstance(spec, SceneSpec)
         needs = replace(self._needs(spec), scene=spec.folder.name)
         process = SimulatedProcess(self, needs, spec, on_message, on_end)
@@ -236,7 +238,7 @@ class SimulatedPlacement(Placement):
         task.add_done_callback(self._endings.discard)
 
     def drop(self, process: SimulatedProcess) -> None:
-        """Forgets a process that has ended."""
+        """Removes a process that has ended or was given up."""
         self.processes.get(process.needs.scene, {}).pop(process, None)
 
     def working(self) -> list[SimulatedProcess]:
@@ -249,7 +251,7 @@ class SimulatedPlacement(Placement):
         ]
 
     def abandon(self) -> None:
-        """Ends all processes with the service."""
+        """Abandons all processes, because the service has ended."""
         for processes in tuple(self.processes.values()):
             for process in tuple(processes):
                 process.abandon()

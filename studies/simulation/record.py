@@ -1,13 +1,13 @@
 """Record of a simulation: acknowledged, committed and reported frames, and times of placement and recovery.
 
-A frame is **run twice** if the service knew of one worker's commit of it, and later another worker's commit was
-reported, or none was left. The service knows of a commit from `FrameCommitted` or `Ready` of the scene's worker, or
-because a new service finds it; from then on clients see it. Two processes of one scene that run at the same time,
-neither given up, count as well. A worker is **given up** for the folder of states once the service has started the
-next one. Until then, its commits are taken over and kept.
+A frame is **run twice** if one worker's commit was reported to the service, and later another worker's commit was
+reported, or no commit was left. A commit is reported by `FrameCommitted` or `Ready` of the scene's worker, or when a
+new service finds it. From then on, clients see it. Two processes of one scene that run at the same time, neither given
+up, are counted as well. A worker is **given up** for the folder of states once the service has started the next worker.
+Until then, its commits are taken over and kept.
 
 Frames that a worker commits after the states were linked for the next worker, but before the link moves, are updated
-again by design (docs/cluster.md, Fencing). They were not reported, so they do not count as run twice; they are counted
+again by design (docs/cluster.md, Fencing). They were not reported, so they do not count as run twice. They are counted
 separately.
 """
 
@@ -24,7 +24,7 @@ from studies.simulation.nodes import Capacity
 
 
 class Hurried(Protocol):
-    """The work of a running worker."""
+    """Protocol of the work of a running worker."""
 
     def hurry(self) -> None:
         """Commits the next frame immediately."""
@@ -32,7 +32,13 @@ class Hurried(Protocol):
 
 @dataclass(frozen=True)
 class FoundFrame:
-    """File of a frame: its content, the worker that wrote it, and the number of that write."""
+    """Contents of a frame's file.
+
+    Attributes:
+        state: state of the frame.
+        worker: number of the worker that wrote the file.
+        write: number of the write.
+    """
 
     state: str
     worker: int
@@ -41,7 +47,7 @@ class FoundFrame:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Counts of frames at the end; all except `read` and `again` must be 0.
+    """Counts of frames at the end. All except `read` and `again` must be 0.
 
     Attributes:
         read: frames read through the links.
@@ -63,7 +69,7 @@ class FrameCounts:
 
 
 class FrameRecord:
-    """Frames of each scene.
+    """Record of the frames of all scenes.
 
     Attributes:
         acknowledged: number of acknowledged frames on the service's disk, keyed by scene.
@@ -84,7 +90,12 @@ class FrameRecord:
         self._twice: dict[str, set[int]] = {}
 
     def start(self, scene: str, beside: bool) -> int:
-        """Registers a started worker; returns its number. `beside`: whether another process of the scene is active."""
+        """Registers a started worker and returns its number.
+
+        Args:
+            scene: scene id.
+            beside: whether another process of the scene is active.
+        """
         self.workers += 1
         self._newest[scene] = self.workers
         self._beside += beside
@@ -96,7 +107,7 @@ class FrameRecord:
         return len(self._adrift)
 
     def write(self, scene: str, worker: int) -> int:
-        """Registers a write by a worker; returns the number of the write, which is stored in the file."""
+        """Registers a write by a worker and returns the number of the write, which is stored in the file."""
         self._writes += 1
         if worker != self._newest[scene]:
             self._adrift.add(self._writes)
@@ -113,14 +124,17 @@ class FrameRecord:
             self._twice.setdefault(scene, set()).add(index)
 
     def untold(self, scene: str, count: int) -> list[int]:
-        """Returns which of the first `count` frames are committed but were unknown to the service."""
+        """Returns which of the first `count` frames, all of which are committed, have not been reported.
+
+        Reported frames from `count` on have disappeared, and count as run twice.
+        """
         reported = self._reported.setdefault(scene, {})
         if gone := {index for index in reported if index >= count}:
             self._twice.setdefault(scene, set()).update(gone)
         return [index for index in range(count) if index not in reported]
 
     def check(self, scene: str, found: dict[int, FoundFrame], chain: Sequence[str]) -> FrameCounts:
-        """Checks the frames of a scene that are read at the end.
+        """Checks the frames of a scene that are read at the end, and returns their counts.
 
         Args:
             scene: scene id.
@@ -144,7 +158,7 @@ class FrameRecord:
         )
 
     def total(self, counts: Sequence[FrameCounts]) -> FrameCounts:
-        """Sums the counts of all scenes."""
+        """Returns the sums of the counts of all scenes."""
         names = [name for name in FrameCounts.__dataclass_fields__ if name != "beside"]
         return FrameCounts(beside=self._beside, **{name: sum(getattr(one, name) for one in counts) for name in names})
 
@@ -160,7 +174,7 @@ class TimeRecord:
             the reason for the request.
         resumed: seconds from a failure until the scene continued, and the part of them without room, keyed by failure.
         waited: seconds that processes waited for a place, if longer than `WAIT_S`.
-        unexplained: number of these processes whose scene was given no reason.
+        unexplained: number of these processes whose scene did not receive a reason.
     """
 
     capacity: Capacity
@@ -215,7 +229,7 @@ class TimeRecord:
         self._hit.pop(scene, None)
 
     def hit(self, scene: str, failure: str, at: float, kind: int) -> None:
-        """Records a scene's failure at a time that may be in the past; an earlier unresolved failure has priority."""
+        """Records a scene's failure at a time that may be in the past. An earlier unresolved failure has priority."""
         without = self.now() - self.capacity.seconds(kind)[0]
         self._hit.setdefault(scene, (failure, at, without))
 

@@ -91,7 +91,7 @@ class SimulatedScene:
             self._learn(len(listed(states)))
 
     def _learn(self, count: int) -> None:
-        """Registers committed frames; their writer is read through the link, as clients would."""
+        """Reports the first `count` frames. The worker that wrote them is read through the link, as by a client."""
         for index in self._frames.untold(self.plan.name, count):
             try:
                 worker = read_frame(frame_file(self.plan.spec.folder.states, index)).worker

@@ -20,7 +20,7 @@ INTERRUPTED = 20
 
 
 class SimulatedService:
-    """Runs one instance of the service at a time.
+    """The simulated service, of which one instance runs at a time.
 
     Args:
         cluster: the modelled cluster.
@@ -59,14 +59,14 @@ class SimulatedService:
         return self.up and all(name in self.scenes and self.scenes[name].done for name in self.plans)
 
     def create(self, plan: ScenePlan) -> None:
-        """Creates a scene; if the service is down, the scene is opened after the restart."""
+        """Creates a scene. If the service is down, the scene is opened after the restart."""
         self.plans[plan.name] = plan
         plan.spec.folder.path.mkdir(parents=True)
         if self.up:
             self._open(plan, "new")
 
     async def restart(self) -> None:
-        """Ends the service and restarts it later; scenes are recovered one by one."""
+        """Ends the service and restarts it later. Its scenes are then recovered one by one."""
         self.up = False
         now = self._cluster.loop.time()
         living = [scene for scene in self.scenes.values() if not scene.ended]

@@ -34,23 +34,23 @@ RIGS = (
     (0.35, Size(width=640, height=480)),
     (0.15, Size(width=1280, height=720, cameras=24)),
 )
-"""Rigs, each with the share of the scenes that have it."""
+"""Each entry pairs a share of the scenes with the size of their rig."""
 FULL = 0.85
 """Share of the CPUs that the scenes use."""
 CPU_BYTES = 1.6e9
-"""Memory of a node per CPU; a scene's worker takes 1.3 GB on average."""
+"""Memory of a node per CPU. A scene's worker takes 1.3 GB on average."""
 APART_S = 1440.0
 """Mean seconds between the failures of one node."""
 CREATED_S = 60.0
-"""Time within which the scenes are created."""
+"""Seconds within which the scenes are created."""
 MORE = 0.25
-"""Scenes beyond the capacity, as a share of the CPUs; with them, demand exceeds supply."""
+"""Scenes beyond the capacity, as a share of the CPUs. With these scenes, demand exceeds supply."""
 MORE_AT, LEAVE_AT = 0.5, 0.6
 """When these scenes are requested, and when as many others end, as fractions of the duration."""
 PATIENCE_S = 3600.0
-"""Frames that are not committed this long after the last failure are lost."""
+"""Seconds after the last failure within which all frames must be committed."""
 CALM_S = 420.0
-"""Time in which everything that was stopped resumes and ends, and folders are cleaned up."""
+"""Seconds at the end during which stopped nodes resume, abandoned workers end, and folders are cleaned up."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,11 @@ class Outcome:
 
 
 def simulate(sizes: Sizes) -> Outcome:
-    """Runs the simulation, which is deterministic for given sizes and seed."""
+    """Runs the simulation, which is deterministic for given sizes and seed, and returns its results.
+
+    Raises:
+        RuntimeError: the code of the service or of the simulation raised an exception.
+    """
     level, memory = logging.getLogger("scas4d.server").level, Path("/dev/shm")
     logging.getLogger("scas4d.server").setLevel(logging.ERROR)
     try:
@@ -185,7 +189,7 @@ def _needs(spec: SceneSpec) -> ResourceNeeds:
 
 
 def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: Random) -> list[tuple[ScenePlan, float]]:
-    """Returns all scenes and their creation times; the first ones end in time for those beyond the capacity."""
+    """Returns all scenes and their creation times. The first ones end in time for those beyond the capacity."""
     end, plans = sizes.seconds, []
     shares = [share for share, _ in RIGS]
     for number in range(sizes.scenes + sizes.more):
@@ -203,7 +207,7 @@ def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: R
 
 
 def _checked(frames: FrameRecord, plan: ScenePlan) -> FrameCounts:
-    """Checks the states of a scene, which are read through the link, as by clients."""
+    """Checks the states of a scene, read through the link as by a client, and returns their counts."""
     states, name = plan.spec.folder.states, plan.name
     counts_by_frame = {index: read_frame(frame_file(states, index)) for index in listed(states)}
     chain, state = [], name

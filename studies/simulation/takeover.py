@@ -14,11 +14,11 @@ from server.storage.layout import SceneFolder
 from studies.simulation.record import FrameRecord
 
 HURRIED = 0.5
-"""Probability that a worker of the scene commits at such a moment, far higher than without intervention."""
+"""Probability that a worker of the scene commits between two steps. It would be far lower without intervention."""
 
 
 class _Interrupted(Exception):
-    """Raised to end the service at this point."""
+    """Raised to end the service during the start of an epoch."""
 
 
 class Takeovers:
@@ -34,7 +34,7 @@ class Takeovers:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Enables these actions within the context."""
+        """Enables the actions within the context."""
         with mock.patch.object(fencing, "sync_folder", self._sync):
             yield
 

@@ -10,14 +10,14 @@ from studies.simulation.delays import WAIT_S
 from studies.simulation.simulate import Outcome
 
 SOON_S, SHARE = 10.0, 0.99
-"""Target: this share of the workers gets a place within this time, counted only while a node has room."""
+"""Target: a fraction `SHARE` of the workers is placed within `SOON_S` seconds, counted only while a node has room."""
 REASONS = {"new": "of a new scene", "loss": "after a loss", "restart": "after a restart of the service"}
 AFTER = {"node": "a node's failure", "worker": "a worker's end", "service": "the service's end"}
 
 
 @dataclass(frozen=True)
 class Row:
-    """A figure and its target, if it has one."""
+    """A row of the table: a figure, and its target if it has one."""
 
     what: str
     found: str
@@ -26,7 +26,7 @@ class Row:
 
 
 def rows(outcome: Outcome) -> list[Row]:
-    """Compares an outcome with the targets."""
+    """Compares an outcome with the targets and returns the rows of the table."""
     frames = outcome.frames
     seconds = [times for table_rows in outcome.placed.values() for times in table_rows]
     share = _share([room for room, _ in seconds])
@@ -76,7 +76,7 @@ def rows(outcome: Outcome) -> list[Row]:
 
 
 def summarize(outcome: Outcome) -> str:
-    """Formats the failures as a sentence and the table as Markdown."""
+    """Formats an outcome as a sentence on the failures and a Markdown table."""
     sizes = outcome.sizes
     kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(outcome.happened.items()))
     lines = [

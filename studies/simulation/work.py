@@ -19,7 +19,7 @@ SUFFIX = ".frame"
 
 
 def content(before: str, index: int) -> str:
-    """Returns the state of a frame, which depends only on the previous one; before frame 0, on the scene's name.
+    """Returns the state of a frame, which depends only on the previous state, or on the scene's name for frame 0.
 
     >>> content("a", 0) == content("a", 0) != content("b", 0)
     True
@@ -33,13 +33,13 @@ def frame_file(folder: Path, index: int) -> Path:
 
 
 def read_frame(path: Path) -> FoundFrame:
-    """Reads the file of a frame."""
+    """Reads the file of a frame and returns its contents."""
     state, worker, write = path.read_text().split()
     return FoundFrame(state, int(worker), int(write))
 
 
 def listed(folder: Path) -> list[int]:
-    """Returns the frames in a folder, in order."""
+    """Returns the sorted indices of the frames in a folder."""
     names = (
         name
         for name in (os.listdir(folder) if folder.is_dir() else ())
@@ -59,7 +59,7 @@ class _Timer:
         self._paused = False
 
     def set(self, delay: Range | float, call: Callable[[], None]) -> None:
-        """Schedules a call after a running time in seconds; replaces the previous call."""
+        """Schedules a call after a running time in seconds, replacing the previous call."""
         self.cancel()
         self._call = call
         self._left = self._cluster.random.uniform(*delay) if isinstance(delay, tuple) else delay
@@ -90,9 +90,9 @@ class _Timer:
 
 
 class Work:
-    """Work of a worker process.
+    """Work of a modelled worker process.
 
-    A worker that was given up but still runs is harder to deal with than a real one: without any orders, it commits all
+    A worker that was given up but still runs is harder to deal with than a real one. Without any orders, it commits all
     acknowledged frames and repeatedly rewrites its own newest frame.
 
     Args:
@@ -130,7 +130,11 @@ class Work:
         self._step.set(START_S, self._open)
 
     def order(self, message: FrameReady) -> None:
-        """Accepts a frame to process."""
+        """Accepts a frame to process.
+
+        Raises:
+            RuntimeError: the frame is not the next one.
+        """
         if self._ended or self._adrift or self._at is not None:
             return
         if message.index != self._frames:
@@ -141,13 +145,13 @@ class Work:
         self._begin(math.exp(self._cluster.random.uniform(low, high)))
 
     def pause(self) -> None:
-        """Pauses with its stopped node."""
+        """Pauses, because the node is stopped."""
         self._stopped = True
         self._step.pause()
         self._end.pause()
 
     def resume(self) -> None:
-        """Resumes with its node."""
+        """Resumes, because the node has resumed."""
         self._stopped = False
         self._step.resume()
         self._end.resume()
@@ -161,7 +165,7 @@ class Work:
                 self._go_on()
 
     def hurry(self) -> None:
-        """Commits the next frame immediately; the caller chooses the worst moment for it."""
+        """Commits the next frame immediately. The caller chooses the worst moment for this."""
         if not self._opened or self._stopped or self._ended:
             return
         if self._at is not None or (self._adrift and self._frames < self._record.acknowledged[self._scene]):
@@ -218,7 +222,7 @@ class Work:
             self._go_on()
 
     def _write(self, index: int, state: str) -> bool:
-        """Writes a frame atomically; a worker whose folder was deleted ends."""
+        """Writes a frame atomically and returns True. If the folder was deleted, ends the worker and returns False."""
         path, number = frame_file(self._folder, index), self._record.write(self._scene, self._worker)
         beside = path.with_name(f".{path.name}.{self._worker}.part")
         try:

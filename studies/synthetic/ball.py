@@ -1,4 +1,4 @@
-"""Synthetic scene for comparisons: a coloured ball over a floor, seen by six surrounding cameras."""
+"""A synthetic scene for comparisons: a coloured ball above a floor, seen by a ring of cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
 
 
 def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> Rig:
-    """Returns square cameras of ``size`` pixels that look at the origin, alternately from above and below; y is down.
+    """Returns a ring of cameras with square images that look at the origin, alternately from below and above.
+
+    The y axis points down.
 
     Args:
         size: width and height of the images in pixels.
@@ -38,7 +40,7 @@ def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> 
 
 
 def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
-    """Creates a ball of radius 0.25 m with ``count`` moving Gaussians, and a floor of a quarter as many static ones."""
+    """Creates a ball of radius 0.25 m with ``count`` moving Gaussians, and a floor with ``count // 4`` static ones."""
     standing, total = count // 4, count + count // 4
     normals = rng.normal(size=(count, 3))
     ball = 0.25 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -59,7 +61,7 @@ def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
 
 
 def moved(before: Gaussians) -> Gaussians:
-    """Rotates the moving Gaussians about the vertical axis and shifts them."""
+    """Returns a copy in which the moving Gaussians are rotated about the vertical axis and then shifted."""
     c, s = np.cos(TURN), np.sin(TURN)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     means, factors, rows = before.means.copy(), before.factors.copy(), before.moving
@@ -69,7 +71,10 @@ def moved(before: Gaussians) -> Gaussians:
 
 
 def photograph(gaussians: Gaussians, cameras: Rig) -> Frame:
-    """Renders images and masks of a rig in the internal world on the CPU; returns them as frame 1 at 1 s."""
+    """Renders the images and masks of all cameras on the CPU and returns them as frame 1, at 1 s.
+
+    The Gaussians and the cameras must use the same coordinates.
+    """
     images, masks = {}, {}
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
     for camera in cameras.cameras:

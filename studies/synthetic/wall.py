@@ -1,4 +1,4 @@
-"""A textured wall with any number of Gaussians and cameras, whose middle part slides."""
+"""A synthetic scene: a textured wall with a sliding middle part, for any number of Gaussians and cameras."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ RATE = 30.0
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a scene.
+    """Size of the wall scene.
 
     Attributes:
         gaussians: approximate number of Gaussians, which form a square grid.
         width: image width in pixels.
         height: image height in pixels.
         cameras: number of cameras.
-        moving: share of the wall that moves.
+        moving: fraction of the wall's area that moves.
     """
 
     gaussians: int = 20_000
@@ -38,7 +38,7 @@ class Size:
 
 
 def wall(size: Size) -> Gaussians:
-    """Creates the N Gaussians of the wall, with its middle labelled as moving; in metres, centred at the origin."""
+    """Creates the wall's Gaussians in metres, centred at the origin, with the middle part labelled as moving."""
     side = round(size.gaussians**0.5)
     lines = np.linspace(-WIDTH_M / 2, WIDTH_M / 2, side)
     x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
@@ -52,7 +52,7 @@ def wall(size: Size) -> Gaussians:
 
 
 def rig(size: Size) -> Rig:
-    """Creates a row of cameras in front of the wall, which fills their images vertically."""
+    """Creates a row of cameras that look at the centre of the wall. The wall fills the height of their images."""
     focal = size.height * AWAY_M / WIDTH_M
     lens = np.array([[focal, 0, size.width / 2], [0, focal, size.height / 2], [0, 0, 1]])
     cameras = []
@@ -66,13 +66,13 @@ def rig(size: Size) -> Rig:
 
 
 def shown(state: Gaussians, index: int, cameras: Rig) -> Frame:
-    """Renders frame ``index``, in which the middle part has slid ``index`` times."""
+    """Renders frame ``index``, with the middle part shifted by ``index * SLIDE_M`` along x and half as far along y."""
     way = np.array([SLIDE_M * index, 0.5 * SLIDE_M * index, 0], np.float32)
     means = state.means + np.where(state.moving[:, None], way, np.float32(0))
     return replace(photograph(state.replace(means=means.astype(np.float32)), cameras), index=index, time=index / RATE)
 
 
 def known(state: Gaussians, cameras: Rig) -> StaticResult:
-    """Returns the true frame 0, in the world of the cameras."""
+    """Returns the true frame 0 as the result of a perfect fit, in the internal coordinates of the rig."""
     world = cameras.world_frame(1.0)
     return StaticResult(state.replace(means=world.to_inside(state.means).astype(np.float32)), {}, [])

@@ -1,5 +1,5 @@
 """Studies that compare settings on variants of captures: reversed, fewer cameras, fewer pixels.
 
-A setting that was chosen on some captures wins on them. Whether it is better is decided by captures that were not used
-for the choice.
+A setting that was chosen on some captures performs best on these. Only captures that were not used for the choice show
+whether it is better.
 """

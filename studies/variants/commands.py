@@ -1,4 +1,4 @@
-"""The study of variants as a command of `scripts/bench`."""
+"""The command `scripts/bench variants`."""
 
 from __future__ import annotations
 

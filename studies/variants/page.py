@@ -9,12 +9,12 @@ import numpy as np
 from client.cli.scores import Row
 
 BEHIND_DB = -0.05
-"""Differences down to this do not count as behind, because they are within the spread over seeds."""
+"""Gain up to which a contender counts as behind. Smaller losses are within the spread over seeds."""
 
 Place = tuple[str, str]
 """A capture and one of its variants."""
 Figures = dict[tuple[Place, str], list[Row]]
-"""Rows of all seeds by place and contender."""
+"""Maps a place and a contender to the rows of all seeds."""
 
 
 def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
@@ -59,7 +59,10 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
 
 
 def left_out(figures: Figures, places: Sequence[Place], contenders: Sequence[str]) -> list[str]:
-    """Returns a table of each capture with the contender that wins on all others, and its gain on this capture."""
+    """Returns the lines of a Markdown table for cross-validation, with one row per capture.
+
+    Each row contains the contender that wins on all other captures, and its gain on this one.
+    """
     lines = ["| left out | chosen without it | gains on it dB |", "|---|---|---|"]
     first = contenders[0]
     for capture in dict.fromkeys(place[0] for place in places):

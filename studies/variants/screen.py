@@ -25,7 +25,7 @@ from studies.variants.variants import VARIANTS
 QUICK = ("half the pixels", "backwards", "every second", "half the cameras")
 """Variants of the quick screening, all at half the pixels."""
 QUICK_FRAMES = 7
-"""Number of frames in the quick screening: the first updates, which decide most."""
+"""Number of frames in the quick screening. The first updates are the most decisive."""
 QUICK_CHANGES = ("scene.image_scale=0.5",)
 CONSTANTS = "scas4d_core."
 """Prefix of the changes that set a constant of the method."""
@@ -54,7 +54,9 @@ class Contender:
 
     @classmethod
     def read(cls, text: str) -> Contender:
-        """Parses the ``NAME`` of a preset, or ``NAME: CHANGE CHANGE …``; ``preset=NAME`` is one of the changes.
+        """Parses the name of a preset, or text of the form ``NAME: CHANGE CHANGE …``.
+
+        The changes may include ``preset=NAME``.
 
         Raises:
             ValueError: the text cannot be parsed.
@@ -92,7 +94,7 @@ class VariantJob(Job):
 
     @property
     def variant(self) -> str:
-        """Name of the row without its capture; it includes the variant."""
+        """Name of the row without the capture, including the name of the variant."""
         return f"{super().variant}-{self.of.replace(' ', '-')}"
 
 
@@ -109,7 +111,7 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> str:
-    """Measures every contender on every variant of every capture; returns the page and writes ``out/variants.md``.
+    """Measures every contender on every variant of every capture, writes ``out/variants.md`` and returns its text.
 
     Args:
         captures: capture folders.
@@ -119,7 +121,7 @@ def run(
         seeds: seeds of the updates; frame 0 always uses the first one.
         frames: maximum number of frames per variant.
         quick: whether to run only the quick screening; see ``QUICK``.
-        again: whether to measure rows again that are already on disk.
+        again: whether to repeat rows that are already on disk.
         options: options for reading the captures.
         report: callback that prints progress messages.
 

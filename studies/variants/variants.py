@@ -1,6 +1,7 @@
-"""Variants of a capture; test cameras, masks, truth and points are restricted to the selected frames.
+"""Variants of a capture, for example reversed or with fewer cameras.
 
-A point cloud belongs to the capture's first frame, so a variant that starts at another frame has none.
+Test images, masks and ground truth are restricted to the selected frames. A point cloud belongs to the capture's first
+frame, so a variant that starts at another frame has none.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ class Variant:
     """A transformation of one capture into another.
 
     Attributes:
-        made: creates the other capture.
+        made: function that creates the other capture.
         changes: settings of the variant, such as ``"scene.image_scale=0.5"``.
     """
 
@@ -31,7 +32,7 @@ class Variant:
 
 
 class ChosenFrames:
-    """Selected frames of a reader in a given order, with times that increase from 0.
+    """Reader of selected frames of another reader in a given order, with times that increase from 0.
 
     Args:
         reader: reader of all frames.
@@ -52,28 +53,28 @@ class ChosenFrames:
         return None if first is None or now is None else abs(now - first)
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes an image, [H, W, 3]."""
+        """Returns the decoded image [H, W, 3] of a camera."""
         return self._reader.image(self._frames[index], camera)
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """Returns whether there is a mask."""
+        """Returns whether a camera has a mask in a frame."""
         return self._reader.has_mask(self._frames[index], camera)
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes a mask, [H, W]."""
+        """Returns the decoded mask [H, W] of a camera."""
         return self._reader.mask(self._frames[index], camera)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns the file of an image."""
+        """Returns the contents of an image file."""
         return self._reader.encoded_image(self._frames[index], camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns the file of a mask, or None if there is none."""
+        """Returns the contents of a mask file, or None if there is none."""
         return self._reader.encoded_mask(self._frames[index], camera)
 
 
 def of_frames(capture: Capture, frames: Sequence[int]) -> Capture:
-    """Returns the capture with only these frames, in this order, and a frame rate that matches their spacing.
+    """Returns the capture with only the given frames, in the given order, and a frame rate that matches their spacing.
 
     >>> from scas4d_core.captures import open_capture
     >>> slow = of_frames(open_capture("samples/robot"), [0, 2, 4])
@@ -102,22 +103,22 @@ def _truth(truth: GroundTruth, frames: Sequence[int]) -> GroundTruth:
 
 
 def backwards(capture: Capture) -> Capture:
-    """Reverses the order of the frames."""
+    """Returns the capture with the frames in reverse order."""
     return of_frames(capture, range(capture.frame_count)[::-1])
 
 
 def every_second(capture: Capture) -> Capture:
-    """Selects every second frame, which doubles all motion."""
+    """Returns the capture with every second frame, which doubles all motion."""
     return of_frames(capture, range(0, capture.frame_count, 2))
 
 
 def later(capture: Capture) -> Capture:
-    """Removes the first third of the frames, so that frame 0 is a different one."""
+    """Returns the capture without the first third of its frames."""
     return of_frames(capture, range(capture.frame_count // 3, capture.frame_count))
 
 
 def half_cameras(capture: Capture) -> Capture:
-    """Selects every second training camera."""
+    """Returns the capture with every second training camera."""
     return replace(capture, full_rig=Rig(capture.full_rig.cameras[::2]))
 
 

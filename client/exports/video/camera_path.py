@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 CameraPath = Callable[[float], Camera]
-"""Maps a time in seconds since the start of the video to a camera in the user's world, with the video's image size."""
+"""Function that maps a video time in seconds to a camera in the user's world, with the image size of the video."""
 
 MAX_ELEVATION = np.radians(88)
-"""Maximum elevation of an orbit in radians; at 90 degrees the up direction would be undefined."""
+"""Maximum elevation of an orbit in radians. At 90 degrees, the up direction would be undefined."""
 
 
 def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
@@ -42,7 +42,7 @@ def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def centre_axis(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Like ``fit_to_size``, but returns a camera with square pixels and the principal point at the image centre."""
+    """Returns the result of ``fit_to_size`` with square pixels and the principal point at the image centre."""
     fitted_camera = fit_to_size(camera, size)
     scale = min(fitted_camera.fx, fitted_camera.fy)
     lens = np.array([[scale, 0, size[0] / 2], [0, scale, size[1] / 2], [0, 0, 1]])
@@ -65,7 +65,7 @@ def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> C
 
     Args:
         rig: rig that defines the orbit's centre and up direction.
-        start: camera at which the orbit starts; its image is scaled to fit the video.
+        start: camera from which the orbit starts. Its image is scaled to fit the video.
         size: (width, height) of the video.
         turn: angular speed in degrees per second, towards the camera's right.
 
@@ -100,10 +100,11 @@ def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> C
 def key_pose_path(
     file: Path, rig: Rig, size: tuple[int, int], seconds_of_frame: Mapping[int, float], start: Camera
 ) -> CameraPath:
-    """Returns the path through the key poses in a file; the camera is static before the first and after the last key.
+    """Returns the path through the key poses in a file.
 
-    Positions follow a natural cubic spline. If every key has a `look_at` point, these points follow a spline as
-    well. Otherwise, rotations are interpolated with ``scipy.spatial.transform.RotationSpline``.
+    The camera is static before the first and after the last key. Positions follow a natural cubic spline. If every key
+    has a `look_at` point, these points also follow a spline. Otherwise, rotations are interpolated with
+    ``scipy.spatial.transform.RotationSpline``.
 
     Args:
         file: JSON file of key poses.
@@ -113,7 +114,7 @@ def key_pose_path(
         start: camera that defines the field of view if no key does.
 
     Raises:
-        InputError: the file is invalid; the message names the field.
+        InputError: if the file is invalid. The message names the field.
     """
     given = read_key_poses(file)
     lens = centre_axis(start, size)
@@ -170,7 +171,7 @@ def _camera(key: KeyPose, place: int, lens: Camera, up: Float, file: Path) -> Ca
 
 
 def _focal_lengths(given: KeyPoses, times: Float, lens: Camera) -> Float:
-    """Returns the focal length [K] of each key in pixels; interpolated for keys without a field of view."""
+    """Returns the focal lengths [K] of the keys in pixels, interpolated for keys without a field of view."""
     said = [
         (time, lens.height / 2 / np.tan(np.radians(key.field_of_view) / 2))
         for time, key in zip(times.tolist(), given.keys, strict=True)

@@ -16,8 +16,8 @@ class KeyPose(Model):
     """Camera pose at a point in time, in the user's world and units with OpenCV axes.
 
     Attributes:
-        time: seconds since the start of the video.
-        frame: scene frame at whose time the pose applies, as an alternative to `time`.
+        time: time of the pose, in seconds since the start of the video.
+        frame: scene frame that sets the time of the pose, as an alternative to `time`.
         position: camera centre.
         look_at: point that appears at the image centre.
         world_to_camera: 4×4 pose matrix, as an alternative to `position` and `look_at`.
@@ -67,7 +67,7 @@ def read_key_poses(path: Path) -> KeyPoses:
     """Reads key poses from a JSON file.
 
     Raises:
-        InputError: the file does not exist or is invalid; the message names the field.
+        InputError: if the file does not exist or is invalid. The message names the field.
 
     >>> out.mkdir()
     >>> file = out / "keys.json"

@@ -12,7 +12,12 @@ from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
 
 
 class Moment(NamedTuple):
-    """State at a point in time; ``frame`` is the index of the nearest frame."""
+    """State at a point in time.
+
+    Attributes:
+        frame: index of the nearest frame.
+        state: state of this frame, or interpolated between two frames.
+    """
 
     frame: int
     state: Gaussians
@@ -21,12 +26,12 @@ class Moment(NamedTuple):
 def moments(
     states: Iterable[tuple[int, float, Gaussians]], wanted: Iterable[float], *, between: bool = False
 ) -> Iterator[Moment]:
-    """Yields the states at the given times, holding two states in memory at a time.
+    """Yields the states at the given times, with only two input states in memory at a time.
 
     Args:
         states: (index, time in seconds, state) of each frame, in order.
-        wanted: times in seconds in ascending order; times outside the sequence yield the first or last state.
-        between: whether to interpolate states; otherwise, the nearest state is used, or the earlier one on a tie.
+        wanted: times in seconds in ascending order. Times outside the sequence yield the first or last state.
+        between: whether to interpolate states. Otherwise, the nearest state is used, or the earlier one on a tie.
 
     >>> at = [(k, float(k), Gaussians.of_points([[k, 0, 2]], radius=0.1)) for k in range(3)]
     >>> [moment.frame for moment in moments(at, [0, 0.4, 0.6, 1.5, 9])]
@@ -49,11 +54,16 @@ def moments(
 
 
 def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
-    """Interpolates between two states of a scene, at the fraction ``share`` (0…1) of the way from ``a`` to ``b``.
+    """Returns the state at the fraction ``share`` (0…1) of the way from ``a`` to ``b``, two states of one scene.
 
     Centres and colours are interpolated linearly. Covariance factors are interpolated in the rotating frame of each
-    Gaussian, so that rotating Gaussians keep their size. Gaussians that are present in only one of the states
-    keep their position and fade in or out.
+    Gaussian, so rotating Gaussians keep their size. Gaussians that are present in only one of the states keep their
+    position and fade in or out.
+
+    Args:
+        a: earlier state.
+        b: later state, whose additional rows are Gaussians born after ``a``.
+        share: fraction of the way from ``a`` to ``b``.
 
     >>> a = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> b = a.concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1))

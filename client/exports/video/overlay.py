@@ -22,7 +22,7 @@ WIDTH = 1 / 200
 OPAQUE = 0.5
 """Minimum opacity of a Gaussian that counts as part of a surface rather than haze."""
 CANDIDATES_PER_ROW = 0.5
-"""Fraction of the moving Gaussians from which tracks are selected; those with the largest motion are considered."""
+"""Fraction of the moving Gaussians, those with the largest motion, from which tracks are selected."""
 
 
 def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
@@ -31,8 +31,8 @@ def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
     The result is empty if no Gaussian moves.
 
     Args:
-        states: states of a few frames, in order; motion is measured relative to the first one. Only Gaussians that are
-            moving in all of these states are considered.
+        states: states of a few frames, in order. Motion is measured relative to the first state, for Gaussians that are
+            moving in all of these states.
         count: maximum number of rows.
 
     >>> a = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [2, 0, 2]], radius=0.1)
@@ -58,7 +58,7 @@ def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
 
 
 class Trails:
-    """Trails of the most recent positions of selected Gaussians, which can be drawn in any view.
+    """Trails of the most recent positions of selected Gaussians, which can be drawn on any view.
 
     Args:
         rows: row indices of the Gaussians.
@@ -80,7 +80,7 @@ class Trails:
         self._colours = [part_colour(number) for number in range(len(rows))]
 
     def add(self, state: Gaussians) -> None:
-        """Appends the positions of the newest state."""
+        """Appends the positions of the Gaussians in the next state."""
         places = self._world.to_user(state.means[self._rows])
         places[~state.present[self._rows]] = np.nan
         self._places.append(places)

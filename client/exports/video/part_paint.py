@@ -13,7 +13,7 @@ from scas4d_core.gaussians import Gaussians
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Luminance weights of RGB according to BT.709."""
 DARKEST = 0.35
-"""Brightness factor of a part colour for a black Gaussian; for a white one it is 1."""
+"""Brightness factor of a part colour for a black Gaussian. The factor for a white Gaussian is 1."""
 
 
 def part_colours(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
@@ -21,7 +21,7 @@ def part_colours(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
 
     Args:
         state: state of N Gaussians.
-        labels: [M] part label of each Gaussian, −1 for none; Gaussians beyond the M-th belong to no part.
+        labels: [M] part label of each Gaussian, −1 for none. Gaussians beyond the M-th belong to no part.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=1.0)
     >>> part_colours(state, np.array([0])).round(2)

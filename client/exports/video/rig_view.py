@@ -25,8 +25,8 @@ class RigView:
     """Target, up direction and radius derived from a rig, in the user's world and units.
 
     Attributes:
-        target: point [3] closest to all optical axes; if they are parallel, a point in front of the cameras.
-        up: unit vector [3] opposite to the mean image-down direction of the cameras.
+        target: point [3] closest to all optical axes or, if they are parallel, a point in front of the cameras.
+        up: unit vector [3] opposite to the mean image-down direction of the cameras, or −y if the mean is near zero.
         radius: median distance of the cameras from the target.
 
     >>> poses = np.stack([np.eye(4)] * 2)
@@ -44,7 +44,7 @@ class RigView:
 
     @classmethod
     def of(cls, rig: Rig) -> RigView:
-        """Returns target, up direction and radius of a rig."""
+        """Returns the target, up direction and radius of a rig."""
         centres = np.stack([camera.centre for camera in rig.cameras])
         ahead = np.stack([camera.rotation[2] for camera in rig.cameras])
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -80,9 +80,9 @@ def _unit(vector: Float) -> Float:
 
 
 def look_at(camera: Camera, eye: Float, target: Float, up: Float) -> Camera:
-    """Returns the camera moved to ``eye`` [3] and oriented towards ``target`` [3], with ``up`` [3] as up direction.
+    """Returns the camera moved to ``eye`` [3] and oriented towards ``target`` [3], with up direction ``up`` [3].
 
-    If the viewing direction is parallel to ``up``, an arbitrary perpendicular direction is used.
+    If the viewing direction is parallel to ``up``, the roll of the camera is arbitrary.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> moved = look_at(camera, np.array([5.0, 0, 0]), np.zeros(3), np.array([0.0, -1, 0]))

@@ -20,7 +20,7 @@ from scas4d_core.captures.images import resize_area
 from scas4d_core.errors import InputError
 
 MOST_PICTURES = 1_000_000
-"""Maximum number of images in a video; a larger number indicates a wrong frame rate or speed."""
+"""Maximum number of images in a video. A larger number indicates a wrong frame rate or speed."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class VideoOptions:
 
     Attributes:
         path: `orbit`, `camera`, or a JSON file of key poses (docs/videos.md).
-        camera: name of a camera in the rig or the compared capture, used as viewpoint or start of the orbit; None for
-            the first one.
+        camera: name of a camera in the rig or the compared capture, used as the viewpoint or the start of the orbit;
+            None for the first camera.
         orbit_speed: angular speed of the orbit in degrees per second, towards the camera's right.
         fps: video frame rate; None for the source's frame rate.
         speed: seconds of scene time per second of video.
@@ -69,7 +69,7 @@ class Shot:
         count: number of images in the video.
         size: (width, height) of the rendered image.
         path: camera path.
-        truth: function that returns the ground truth image of a frame at this size; None if there is no comparison.
+        truth: function that returns the ground-truth image of a frame at this size; None if there is no comparison.
     """
 
     given: Source
@@ -87,7 +87,11 @@ class Shot:
         return self.size[0] * (1 if self.truth is None else 2), self.size[1]
 
     def pictures(self) -> Iterator[Picture]:
-        """Yields the images [H, W, 3] of the video, holding two states in memory at a time."""
+        """Yields the images [H, W, 3] of the video, with only two states in memory at a time.
+
+        Raises:
+            InputError: if parts or tracks are requested, but there are no parts or nothing moves.
+        """
         from scas4d_core.engines.limits import DEFAULT, rig_limits
         from scas4d_core.query.view import ViewRenderer
 
@@ -136,12 +140,12 @@ def plan_shot(
         low: first frame.
         high: last frame.
         options: requested options.
-        compared: capture whose ground truth images are shown on the right, or None.
-        even: whether width and height must be even. An odd camera size is rounded down; an odd requested size
-            is an error.
+        compared: capture whose ground-truth images are shown on the right, or None.
+        even: whether width and height must be even. An odd camera size is rounded down, but an odd requested size is an
+            error.
 
     Raises:
-        InputError: frames, a camera or images do not exist, or options are incompatible.
+        InputError: if frames, a camera or images do not exist, or options are incompatible.
     """
     _check(options, compared)
     times = given.within(low, high)
@@ -181,7 +185,7 @@ def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera
     The scene's refined cameras take precedence over the capture's cameras.
 
     Raises:
-        InputError: there are no cameras, or none with this name.
+        InputError: if there are no cameras, or none with this name.
     """
     cameras = {}
     if compared is not None:
@@ -228,7 +232,11 @@ def _path(
 
 
 def _truth(compared: Capture, camera: Camera, size: tuple[int, int], last: int) -> Callable[[int], Picture]:
-    """Returns a function that maps a frame index to the ground truth image, placed as in ``fit_to_size``."""
+    """Returns a function that maps a frame index to the ground-truth image, scaled and centred to fit the size.
+
+    Raises:
+        InputError: if the capture lacks the camera, or the frame `last`.
+    """
     training = camera.name in compared.full_rig.names
     if not training and (compared.full_test_rig is None or camera.name not in compared.full_test_rig.names):
         raise InputError(f"compare: capture {compared.name} has no camera {camera.name!r}", "choose another --camera")

@@ -14,7 +14,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.errors import InputError
 
 SMALLEST, LARGEST = 16, 7680
-"""Minimum and maximum width and height of the rendered image in pixels, limited by encoders and memory."""
+"""Minimum and maximum width and height of the rendered image in pixels. Encoders and memory limit the size."""
 
 
 def make_video(
@@ -27,20 +27,20 @@ def make_video(
     url: str,
     token: str | None,
 ) -> Path:
-    """Renders a video and returns its path, holding two states and one image in memory at a time.
+    """Renders a video and returns its path, with only two states and one image in memory at a time.
 
     Args:
         source: source of the states; see `opened`.
         out: path that ends in `.mp4` or `.webp`; None for an MP4 next to the source, named after it.
         options: video options.
         frames: inclusive range `A:B`; None for all frames.
-        compared: capture whose ground truth images from the same camera are shown to the right of the rendered images.
+        compared: capture whose ground-truth images from the same camera are shown to the right of the rendered images.
         url: service URL.
         token: access token for the service.
 
     Raises:
-        InputError: an option is invalid, or frames, a camera or parts do not exist.
-        MissingExtraError: PyAV is not installed.
+        InputError: if an option is invalid, or frames, a camera or parts do not exist.
+        MissingExtraError: if PyAV is not installed.
     """
     low, high = frame_range(frames)
     if out is not None:
@@ -66,6 +66,9 @@ def make_video(
 def picture_size(text: str) -> tuple[int, int]:
     """Parses an image size and returns (width, height).
 
+    Raises:
+        InputError: if the text is not a size, or the size is not supported.
+
     >>> picture_size("1280x720")
     (1280, 720)
     """
@@ -81,6 +84,9 @@ def picture_size(text: str) -> tuple[int, int]:
 
 def background_colour(text: str) -> tuple[float, float, float]:
     """Parses a colour name or hex code and returns RGB in 0…1.
+
+    Raises:
+        InputError: if the text is not a colour.
 
     >>> background_colour("#ff8000"), background_colour("white")
     ((1.0, 0.5019607843137255, 0.0), (1.0, 1.0, 1.0))

@@ -26,7 +26,7 @@ def check_suffix(path: Path) -> str:
     """Returns the suffix of a video file in lowercase.
 
     Raises:
-        InputError: the suffix is not supported.
+        InputError: if the suffix is not supported.
 
     >>> check_suffix(Path("a.MP4"))
     '.mp4'
@@ -44,10 +44,11 @@ def check_suffix(path: Path) -> str:
 
 @contextmanager
 def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
-    """Writes images of equal size to a video, creating missing folders; the file appears only once it is complete.
+    """Opens a video file to which images of equal size can be added.
 
-    An MP4 uses 8-bit 4:2:0 for compatibility, with BT.709 colours in limited range, tagged as such. A WebP loops
-    endlessly. Images are encoded as they are added and are not kept.
+    Missing folders are created, and the file appears only once it is complete. Images are encoded as they are added and
+    are not kept. An MP4 uses 8-bit 4:2:0 for compatibility, with BT.709 colours in limited range, tagged as such. A
+    WebP loops endlessly.
 
     Args:
         path: path that ends in `.mp4` or `.webp`.
@@ -58,8 +59,8 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
         because the encoding requires even sizes.
 
     Raises:
-        InputError: the suffix is not supported, no image was added, or the file cannot be written.
-        MissingExtraError: PyAV is not installed.
+        InputError: if the suffix is not supported, no image was added, or the file cannot be written.
+        MissingExtraError: if PyAV is not installed.
 
     >>> with video_file(out / "grey.mp4", 25) as add:
     ...     for level in range(3):
@@ -86,7 +87,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
 
 
 class _Encoder:
-    """Encoder of one video file.
+    """Encoder for one video file.
 
     Attributes:
         count: number of images added so far.

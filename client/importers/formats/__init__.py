@@ -1,1 +1,1 @@
-"""Calibration readers, one module per tool; each returns a `Calibration`."""
+"""Calibration readers, one module per tool. Each returns a `Calibration`."""

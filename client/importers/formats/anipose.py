@@ -1,9 +1,10 @@
 """Reads anipose's `calibration.toml` (aniposelib), and the files of Pose2Sim and FreeMoCap, which have the same fields.
 
-Each camera has a table with `name`, `size` (width, height), `matrix` [3][3], `distortions` [5] or [4], `rotation` [3]
-(Rodrigues vector) and `translation` [3], world to camera; `fisheye = true` marks coefficients of `cv2.fisheye`.
-`[metadata]` does not describe the rig. Anipose initializes the principal point to (width − 1)/2, which implies OpenCV's
-pixel coordinates. (github.com/lambdaloop/aniposelib, `aniposelib/cameras.py`; github.com/perfanalytics/pose2sim,
+Each camera has a table with `name`, `size` (width, height), `matrix` [3][3], `distortions` [5] or [4], and the
+world-to-camera `rotation` [3] (Rodrigues vector) and `translation` [3]. `fisheye = true` marks coefficients of
+`cv2.fisheye`. `[metadata]` does not describe the rig. Anipose initializes the principal point to (width − 1)/2, which
+implies OpenCV's pixel coordinates.
+(github.com/lambdaloop/aniposelib, `aniposelib/cameras.py`; github.com/perfanalytics/pose2sim,
 `Pose2Sim/calibration.py`.)
 """
 
@@ -19,7 +20,7 @@ from client.importers.formats.opencv_camera import opencv_camera, picture_size
 from scas4d_core.captures import CaptureError
 
 INTRINSICS_FOLDER = re.compile(r"int_(.+)_img")
-"""Folder name that Pose2Sim uses as a camera name; the group is the name of the camera's videos."""
+"""Folder name that Pose2Sim uses as a camera name. The group is the name of the camera's videos."""
 
 
 def is_anipose(document: Mapping[str, Any]) -> bool:
@@ -31,7 +32,7 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
     """Reads the rig from a parsed file.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names the file, camera, field and remedy.
+        CaptureError: if a field is missing or invalid. The message names the file, camera, field and remedy.
     """
     cameras = []
     for key, table in document.items():

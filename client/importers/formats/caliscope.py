@@ -1,10 +1,10 @@
 """Reads caliscope's `camera_array.toml`.
 
 Each camera has a table `[cameras.<id>]` with `size` (width, height), `matrix` and `distortions` (5, or 4 if `fisheye`).
-Its `rotation`, a matrix [3][3] or Rodrigues vector [3], and its `translation` are world to camera. Cameras are named
-after their videos, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of `cam_id`.
-`rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is ignored. Cameras that
-are marked as ignored or have no pose are left out, with a remark.
+`rotation`, a matrix [3][3] or Rodrigues vector [3], and `translation` transform the world to the camera. Cameras are
+named after their videos, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of
+`cam_id`. `rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is ignored.
+Cameras that are marked as ignored or have no pose are left out, with a remark.
 (github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
 """
 
@@ -28,7 +28,7 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
     """Reads the rig from a parsed file.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names the file, camera, field and remedy.
+        CaptureError: if a field is missing or invalid. The message names the file, camera, field and remedy.
     """
     cameras, left_out = [], []
     for key, table in document["cameras"].items():
@@ -56,5 +56,5 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
 
 
 def _calibrated(table: Mapping[str, Any]) -> bool:
-    """Returns whether the camera has intrinsics and a pose; rtoml writes missing values as the text "null"."""
+    """Returns whether the camera has intrinsics and a pose. rtoml writes missing values as "null"."""
     return all(isinstance(table.get(field), list) for field in ("matrix", "rotation", "translation"))

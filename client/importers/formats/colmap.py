@@ -1,7 +1,7 @@
-"""Reads COLMAP models, text or binary: `cameras`, `images` and, if present, `points3D`. Requires only numpy.
+"""Reads COLMAP models in text or binary format: `cameras`, `images` and, if present, `points3D`. Requires only numpy.
 
-Poses are world to camera with OpenCV axes, as a quaternion (w, x, y, z) and a translation. Principal points are
-relative to the upper left corner of the image. Both conventions match this project's.
+Poses are world-to-camera transforms with OpenCV axes, stored as a quaternion (w, x, y, z) and a translation. Principal
+points are relative to the upper left corner of the image. This project uses the same conventions.
 (colmap.github.io/format.html; `src/colmap/scene/reconstruction_io.cc`.)
 """
 
@@ -64,7 +64,7 @@ def read_colmap(folder: Path) -> Calibration:
     """Reads the rig and the point cloud from a model.
 
     Raises:
-        CaptureError: a file is missing or malformed, or a camera is invalid; the message names the file and the
+        CaptureError: if a file is missing or malformed, or a camera is invalid. The message names the file and the
             problem.
     """
     end = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
@@ -194,7 +194,7 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 
 class _Bytes:
-    """Sequential reader for a binary file, whose errors state where a truncated file ends."""
+    """Sequential reader for a binary file. Its errors state where a truncated file ends."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

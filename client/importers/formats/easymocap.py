@@ -1,9 +1,9 @@
 """Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files. Requires OpenCV.
 
-`names` lists the cameras. Per camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in some
-versions, `H_<name>` and `W_<name>`; if they are missing, the size is read from the images. `extri.yml` has `Rot_<name>`
-[3, 3], or only `R_<name>` [3] (Rodrigues vector), and `T_<name>` [3], world to camera. A camera without a pose is left
-out, with a remark.
+`names` lists the cameras. For each camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in
+some versions, `H_<name>` and `W_<name>`. If the size is missing, it is read from the images. `extri.yml` has the
+world-to-camera rotation `Rot_<name>` [3, 3], or only `R_<name>` [3] (Rodrigues vector), and translation `T_<name>` [3].
+A camera without a pose is left out, with a remark.
 (github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)
 """
 
@@ -22,7 +22,7 @@ from scas4d_core.captures import CaptureError
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 APART = 1e-3
-"""Maximum entrywise difference between a rotation matrix and that of its Rodrigues vector; files have six digits."""
+"""Maximum entrywise difference between a rotation matrix and that of its Rodrigues vector. Files have six digits."""
 
 
 def is_easymocap(folder: Path) -> bool:
@@ -38,8 +38,8 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
         capture: folder with `images/` or `videos/`, from which missing image sizes are read.
 
     Raises:
-        CaptureError: a file or field is missing or invalid; the message names it and the remedy.
-        MissingExtraError: OpenCV is not installed.
+        CaptureError: if a file or field is missing or invalid. The message names it and the remedy.
+        MissingExtraError: if OpenCV is not installed.
     """
     for name in (INTRINSICS, EXTRINSICS):
         if not (folder / name).is_file():

@@ -1,6 +1,6 @@
 """Reads OpenCV's FileStorage format (YAML or XML), and image sizes, which such files often omit.
 
-This requires OpenCV, because no other library parses its `%YAML:1.0` header and `!!opencv-matrix` tags.
+Reading this format requires OpenCV, because no other library parses its `%YAML:1.0` header and `!!opencv-matrix` tags.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ DEEPEST = 32
 def read_storage(path: Path) -> dict[str, Any]:
     """Returns the top-level fields of a file, keyed by name.
 
-    Values are matrices as arrays [rows, cols], lists, numbers and strings; anything else is None.
+    Values are lists, numbers, strings and matrices, which become arrays [rows, cols]. Anything else becomes None.
 
     Raises:
-        CaptureError: the file cannot be read.
-        MissingExtraError: OpenCV is not installed.
+        CaptureError: if the file cannot be read.
+        MissingExtraError: if OpenCV is not installed.
     """
     cv2 = load("cv2", needed="reading OpenCV's YAML and XML files")
     try:
@@ -86,11 +86,11 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
     Args:
         folder: capture folder.
         camera: camera name.
-        where: position in the calibration at which the size is missing, for error messages.
+        where: file and camera without a size, for error messages.
 
     Raises:
-        CaptureError: there is neither an image nor a video, or it cannot be read.
-        MissingExtraError: a video must be read and PyAV is not installed.
+        CaptureError: if there is neither an image nor a video, or the file cannot be read.
+        MissingExtraError: if a video must be read and PyAV is not installed.
     """
     images = folder / "images" / camera
     if images.is_dir():

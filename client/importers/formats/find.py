@@ -25,7 +25,7 @@ READ = (
 
 
 def find_calibrations(capture: Path) -> list[Path]:
-    """Returns the calibrations in a capture's folder: files, or folders whose files form one calibration."""
+    """Returns the paths of the calibrations in a capture folder: files, or folders whose files form one calibration."""
     return [path for name in FOLDERS for path in _calibrations_in(capture / name)]
 
 
@@ -49,7 +49,7 @@ def _is_toml(path: Path) -> bool:
 
 
 def is_calibration(path: Path) -> bool:
-    """Returns whether `read_calibration_file` supports a file or folder, judging by its name."""
+    """Returns whether a path could be a calibration that `read_calibration_file` can read."""
     if path.is_dir():
         return bool(_calibrations_in(path))
     return path.is_file() and (path.suffix.lower() in (".toml", *ENDS) or path.name.lower().endswith(QUALISYS))
@@ -63,8 +63,8 @@ def read_calibration_file(path: Path, capture: Path) -> Calibration:
         capture: capture folder, whose images provide any image sizes that the file omits.
 
     Raises:
-        CaptureError: the format is unknown, the folder has several calibrations, or the file cannot be read.
-        MissingExtraError: the format needs a package from the extra `importers`.
+        CaptureError: if the format is unknown, the folder has several calibrations, or the file cannot be read.
+        MissingExtraError: if the format needs a package from the extra `importers`.
     """
     if path.is_dir():
         here = _calibrations_in(path)
@@ -84,7 +84,7 @@ def single_calibration(found: list[Path], folder: Path) -> Path:
     """Returns the only calibration found.
 
     Raises:
-        CaptureError: there are several, or none.
+        CaptureError: if there are no calibrations, or several.
     """
     if len(found) == 1:
         return found[0]

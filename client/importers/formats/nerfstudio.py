@@ -35,7 +35,7 @@ def read_transforms(path: Path) -> Calibration:
     """Reads the rig from a `transforms.json`.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names the file, image, field and remedy.
+        CaptureError: if a field is missing or invalid. The message names the file, image, field and remedy.
     """
     meta = read_json(path)
     frames = meta.get("frames")

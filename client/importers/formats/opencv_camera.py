@@ -1,8 +1,9 @@
 """Cameras in OpenCV's conventions, which most lab tools store in their own file formats. Requires only numpy.
 
 `matrix` is [3, 3] with the centre of the first pixel at (0, 0), so half a pixel is added to principal points here.
-`distortions` are in OpenCV's order. World to camera is a rotation (matrix or Rodrigues vector) and a translation:
-`X_cam = R X_world + t` with x right, y down, z forward. (docs.opencv.org, "Camera Calibration and 3D Reconstruction".)
+`distortions` are in OpenCV's order. The world-to-camera transform consists of a rotation (matrix or Rodrigues vector)
+and a translation: `X_cam = R X_world + t` with x right, y down, z forward.
+(docs.opencv.org, "Camera Calibration and 3D Reconstruction".)
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scas4d_core.captures import CaptureError
 Float = NDArray[np.float64]
 
 HALF = 0.5
-"""Pixel grid offset: OpenCV's first pixel centre is at (0, 0), that of this project at (0.5, 0.5)."""
+"""Offset of the first pixel's centre, which is at (0, 0) in OpenCV and at (0.5, 0.5) in this project."""
 COUNTS = (0, 4, 5, 8, 12, 14)
 """Valid numbers of OpenCV coefficients. Coefficients beyond the eighth (thin prism, tilted sensor) must be 0."""
 SKEW = 1e-6
@@ -51,7 +52,7 @@ def opencv_camera(
         fisheye: whether the coefficients are those of `cv2.fisheye`.
 
     Raises:
-        CaptureError: a field is invalid; the message names it and the remedy.
+        CaptureError: if a field is invalid. The message names the field and the remedy.
 
     >>> lens = [[100, 0, 31.5], [0, 100, 23.5], [0, 0, 1]]
     >>> camera = opencv_camera("rig.toml", "front", matrix=lens, distortions=[0, 0, 0, 0, 0], rotation=[0, 0, np.pi],
@@ -114,10 +115,10 @@ def rodrigues(vector: Float) -> Float:
 
 
 def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
-    """Flattens a nested list of numbers to a float64 array.
+    """Returns the numbers in a nested list as a flat float64 array.
 
     Raises:
-        CaptureError: a value is not a finite number, or the number of values is not in `counts`.
+        CaptureError: if a value is not a finite number, or the number of values is not in `counts`.
     """
     try:
         values = np.array(given, dtype=np.float64).ravel()
@@ -131,10 +132,10 @@ def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
 
 
 def picture_size(where: str, given: Any) -> tuple[int, int]:
-    """Returns (width, height) as integers; some tools write them as floats, such as 1088.0.
+    """Returns (width, height) as integers. Some tools write them as floats, such as 1088.0.
 
     Raises:
-        CaptureError: the size is invalid.
+        CaptureError: if the size is invalid.
     """
     values = numbers(where, "size", given, (2,))
     if (values != np.round(values)).any() or values.min() < 1 or values.max() > LARGEST_SIDE:

@@ -1,9 +1,9 @@
 """Reads a folder with one OpenCV FileStorage file per camera, `<camera>.yml`, `.yaml` or `.xml`.
 
-OpenCV defines no rig layout; this one follows the field names in its samples. As in the calibration sample, each
+OpenCV defines no rig layout, so this layout uses the field names of its samples. As in the calibration sample, each
 file has `camera_matrix` [3, 3], `distortion_coefficients`, `image_width`, `image_height` and, if true, `fisheye_model`.
-As in the stereo sample, `R` ([3, 3] or a Rodrigues vector) and `T` [3] are world to camera. Other common names are
-accepted too. The sample's `extrinsic_parameters` are board poses, so they are not used.
+As in the stereo sample, `R` ([3, 3] or a Rodrigues vector) and `T` [3] transform the world to the camera. Other common
+names are accepted too. The sample's `extrinsic_parameters` are board poses, so they are not used.
 (docs.opencv.org, "Camera calibration With OpenCV"; `samples/cpp/.../camera_calibration.cpp`.)
 """
 
@@ -29,7 +29,7 @@ MATRIX_FIELD = re.compile(rb"^\s*<?(" + "|".join(MATRIX).encode() + rb")\s*[ :>]
 
 
 def camera_files(folder: Path) -> list[Path]:
-    """Returns the files in the folder that contain a single camera matrix, which excludes EasyMocap's files."""
+    """Returns the files in a folder that contain the matrix of a single camera. EasyMocap's files are excluded."""
     if not folder.is_dir():
         return []
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS and path.is_file())
@@ -54,8 +54,8 @@ def read_opencv_files(folder: Path, capture: Path) -> Calibration:
         capture: folder with `images/` or `videos/`, from which missing image sizes are read.
 
     Raises:
-        CaptureError: a field is missing or invalid; the message names the file, field and remedy.
-        MissingExtraError: OpenCV is not installed.
+        CaptureError: if a field is missing or invalid. The message names the file, field and remedy.
+        MissingExtraError: if OpenCV is not installed.
     """
     return calibration_of_cameras(folder, [_camera(path, capture) for path in camera_files(folder)])
 

@@ -1,17 +1,17 @@
 """Reads Qualisys calibrations, exported from QTM as `*.qca.txt`: XML files that store all data in attributes.
 
-Per camera (`active`, `serial`, `model`):
+Each camera has the attributes `active`, `serial` and `model`, and the following elements:
 
-- `transform`: x, y, z, the camera's position in millimetres, and r11 … r33, rows of world to camera with OpenGL axes
+- `transform`: the camera's position x, y, z in millimetres, and its world-to-camera rotation r11 … r33 with OpenGL axes
   (x right, y up, z back). The position is converted to metres.
 - `intrinsic`: focalLengthU, centerPointU, … in subpixels of the sensor, 64 per pixel. The number of subpixels per
   pixel is `sensorMaxU` divided by the width of `fov_video_max`. `radialDistortion1` … and `tangentalDistortion1`, `2`
   are OpenCV's k1, k2, k3, p1, p2. Pose2Sim divides them by 64 as well, but on its demo rig they match a checkerboard
   calibration only if undivided (k1 −0.046 to −0.048 here; −0.031, −0.047, −0.052, −0.053 there).
-- `fov_video`: the recorded region of the sensor; the principal point is relative to its corner.
+- `fov_video`: the recorded region of the sensor. Principal points are made relative to its corner.
 
-The centre of the first pixel is assumed to be (0, 0), as in Pose2Sim; Qualisys does not specify it. Cameras that
-record markers but no video are left out, with a remark.
+The centre of the first pixel is assumed to be (0, 0), as in Pose2Sim, because Qualisys does not specify it. Cameras
+that record markers but no video are left out, with a remark.
 (github.com/perfanalytics/pose2sim, `read_qca` and `calib_qca_fun` in `Pose2Sim/calibration.py`.)
 """
 
@@ -40,7 +40,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """Converts OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
 WHOLE = 0.1
-"""Tolerance when rounding the subpixels per pixel; real files have ratios such as 69568/1087 or 122879/1919."""
+"""Tolerance when rounding the subpixels per pixel. Real files have ratios such as 69568/1087 or 122879/1919."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ def read_qualisys(path: Path) -> Calibration:
     """Reads the rig from a `*.qca.txt`.
 
     Raises:
-        CaptureError: the file is not XML, or a field is missing or invalid; the message names the file, camera,
+        CaptureError: if the file is not XML, or a field is missing or invalid. The message names the file, camera,
             field and remedy.
     """
     cameras = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]

@@ -2,6 +2,6 @@
 
 ``engine`` runs the steps of each iteration in the order given by algorithm 1. Each stage has its own module.
 ``deformation`` implements the cascade, per-Gaussian deltas and neighbour terms. ``renderer`` renders and compares full
-images; ``changed_pixels`` processes only the changed pixels. The other modules are ``rasterizer``, ``gloss``,
+images, and ``changed_pixels`` processes only the changed pixels. The other modules are ``rasterizer``, ``gloss``,
 ``colours``, ``floor`` and ``adam``.
 """

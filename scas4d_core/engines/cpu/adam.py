@@ -56,11 +56,11 @@ class Adam:
 
 
 class AdamColumns:
-    """Adam optimizer for the columns of a table with a positive learning rate; other columns are not updated.
+    """Adam optimizer for the columns of a table that have a positive learning rate. Other columns are not updated.
 
     Args:
         table: [n, columns] parameters, updated in place. No other code may modify them.
-        columns: learning rate of each column; at least one must be positive.
+        columns: learning rate of each column. At least one must be positive.
         betas: see ``Adam``.
     """
 

@@ -6,7 +6,7 @@ therefore bit-identical to those of a full rendering. All other pixels show only
 only when the static Gaussians change.
 
 Candidate blocks and their static Gaussians are determined once per frame and view, around the current moving Gaussians.
-The blocks to render are determined in every iteration. The image loss is evaluated near all candidate blocks; the loss
+The blocks to render are determined in every iteration. The image loss is evaluated near all candidate blocks. The loss
 of the rest of the image is constant during a frame.
 """
 
@@ -44,14 +44,14 @@ class Region:
     """The part of one camera's image that may be rendered in a frame.
 
     Attributes:
-        blocks: [tiles] uint64 bitmask of the candidate blocks; each rendering only includes those that moving
+        blocks: [tiles] uint64 bitmask of the candidate blocks. Each rendering only includes those that moving
             Gaussians cover.
         rows: [R] int64 rows of the rendered Gaussians, in ascending order.
         learnt: [R] uint8 mask of the moving Gaussians in ``rows``.
         moving: [M] int64 indices of the moving Gaussians in ``rows``.
         box: image rows and columns that contain the blocks and a margin of ``REACH``.
-        near: [h, columns] uint8 flags of the losses in the box that can change; see ``image_loss.near``. All other
-            losses are included in ``outside_losses``.
+        near: [h, columns] uint8 flags of the losses in the box that can change, as in ``image_loss.near``. All
+            other losses are included in ``outside_losses``.
         view: view to which the following fields belong, or None if no view is loaded yet.
         target: [C, h, w] crop of the view's target.
         moments: crops of the target's two SSIM moments, each with the same shape as ``target``.
@@ -138,7 +138,7 @@ class ChangedPixels(CpuRenderer):
         return self._gradients
 
     def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """Same as ``forward_backward``, but without gradients."""
+        """Same as ``forward_backward``, but does not compute gradients."""
         region = self._render_region((means, factors, opacities, features), view)
         self._compare_box(region, view)
 
@@ -306,8 +306,8 @@ def _key(view: TrainingView) -> tuple[str, int, int]:
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Returns a box around the given pixels that contains the windows of all losses affected by these pixels.
 
-    If no pixels are marked, the box is a single pixel. The first column is a multiple of sixteen, so that the flags of
-    ``image_loss.near`` align with those of the full image.
+    If no pixels are marked, the box is a single pixel. The first column is a multiple of sixteen, which aligns
+    the flags of ``image_loss.near`` with those of the full image.
     """
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if len(rows) == 0:

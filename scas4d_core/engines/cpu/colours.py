@@ -57,7 +57,11 @@ class Colours:
         return float(self._weight * np.abs(self._change).sum(dtype=np.float64)) if curve else 0.0
 
     def gradient(self, g_features: Array) -> Array:
-        """Returns the gradient of the rendering losses (``g_features``) plus the soft-colour loss, [table rows, 3]."""
+        """Returns the gradient [table rows, 3] of the rendering losses and the soft-colour loss.
+
+        Args:
+            g_features: [N, 4] gradients of the rendering losses with respect to the features.
+        """
         pull: Array = self._weight * np.sign(self._change)
         chosen = g_features if self._whole else g_features[self._rows]
         total: Array = chosen[:, :3] + pull

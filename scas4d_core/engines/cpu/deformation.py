@@ -1,9 +1,9 @@
-"""Deformation D_t on the CPU: the parameters of one frame, with fused kernels for the forward and backward passes.
+"""Deformation D_t of one frame on the CPU, with fused kernels for the forward and backward passes.
 
 Reference implementation: ``engines.torch.deformation``. Buffers are allocated once per hierarchy.
 
-Gaussians with non-finite values at the start of an update are held back: they remain unchanged and do not contribute to
-cluster pivots or neighbour terms. Their number is recorded.
+Gaussians with non-finite values at the start of an update are held back. They remain unchanged and do not contribute to
+cluster pivots or neighbour terms. ``CpuDeformation.guards`` counts them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class CpuDeformation:
         turns: [M, 4] rotations since the previous frame, filled by ``forward``.
         held_back: [held] int64 rows with non-finite values in Θ_{t−1}, found by ``start``.
         guards: number of times each guard was triggered since the last ``reset``. ``forward`` counts the guards
-            in ``cascade.COUNTED_GUARDS``, excluding frozen layers; ``start`` counts all others.
+            in ``cascade.COUNTED_GUARDS``, excluding frozen layers. ``start`` counts all others.
     """
 
     def __init__(
@@ -219,10 +219,10 @@ def cache_lines(count: int) -> Array:
 
 
 class Blocks(NamedTuple):
-    """A hierarchy's Gaussians in B blocks of sixteen; in every layer, each block belongs to a single cluster.
+    """A hierarchy's Gaussians in B blocks of sixteen. In every layer, each block belongs to a single cluster.
 
     Attributes:
-        entries: [B, 16] int64 indices of the Gaussians in hierarchy order; partial blocks repeat their last index.
+        entries: [B, 16] int64 indices of the Gaussians in hierarchy order. Partial blocks repeat their last index.
         present: [B, 16] float32 mask: 0 for repeated entries, otherwise 1.
         clusters: [B, L] int64 cluster of each block in each layer, numbered across all layers.
         offsets: [L + 1] int64 index of the first cluster in each layer, followed by the total number of clusters.

@@ -160,7 +160,7 @@ class CpuEngine:
         return loss / len(views), total
 
     def _picture(self, index: int, step: StepScalars) -> tuple[float, Gradients]:
-        """Renders a view, computes and backpropagates its loss, and logs the result."""
+        """Renders a view, logs the result, and returns the sum of image and mask loss with its gradients."""
         view, deformation, renderer, lap = self._views[index], self._deformation, self.renderer, self._start.lap
         if self._gloss is not None:
             self._gloss.shade(deformation.means, deformation.turns, self._colours, view.camera, self._features)
@@ -180,7 +180,10 @@ class CpuEngine:
         return loss, gradients
 
     def _terms(self, gradients: Gradients, step: StepScalars) -> float:
-        """Returns the weighted sum of all other loss terms, and adds or stores their gradients."""
+        """Returns the weighted sum of neighbour, floor and soft-colour losses.
+
+        Their gradients are added to ``gradients`` or stored for the backward pass.
+        """
         plan, deformation, loss = self._plan, self._deformation, 0.0
         if plan.neighbour_terms:
             weights = (step.rigidity, plan.isometry, plan.rotation)
@@ -290,7 +293,7 @@ class CpuEngine:
             self._deformed = True
 
     def _with_looks(self, state: Gaussians) -> Gaussians:
-        """Returns a copy of a state with the colours, gloss and environment learned so far."""
+        """Returns a state with the colours, gloss and environment learned so far, without copying them."""
         if self._gloss is None:
             return state.replace(colours=self._colours)
         return state.replace(colours=self._colours, gloss=self._gloss.gloss, environment=self._gloss.environment)

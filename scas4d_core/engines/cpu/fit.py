@@ -1,4 +1,4 @@
-"""CPU engine for fits, which runs single iterations of 3D Gaussian Splatting."""
+"""CPU engine for fits, which runs one iteration of 3D Gaussian Splatting at a time."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class CpuFitEngine:
     """The CPU implementation of ``FitEngine``. It updates the arrays of the loaded table in place.
 
     Args:
-        renderer: renderer to use; it also defines the loss weights.
+        renderer: renderer to use, which also defines the loss weights.
     """
 
     def __init__(self, renderer: CpuRenderer) -> None:
@@ -109,7 +109,10 @@ class CpuFitEngine:
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 
     def _backward(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
-        """Returns the gradients of all rendered arrays (None if only colours are learned) and those of the features."""
+        """Returns the gradients of all rendered arrays, followed by the gradients of the features alone.
+
+        The former are None if only colours are learned.
+        """
         if rates[: COLOUR.start].any() or rates[COLOUR.stop :].any():
             gradients = self.renderer.forward_backward(*drawn, view)
             return gradients, gradients.features

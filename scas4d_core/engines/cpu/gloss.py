@@ -17,18 +17,18 @@ from scas4d_core.gaussians import Gaussians
 Array = NDArray[np.float32]
 
 GLOSS = np.float32(0.5)
-"""Initial gloss strength of a Gaussian. Only the product of strength and environment is visible, so the strengths of
-equally glossy Gaussians stay near this value and the environment absorbs the rest."""
+"""Initial gloss strength of a Gaussian. Only the product of strength and environment is visible. The strengths of
+equally glossy Gaussians therefore stay near this value, and the environment absorbs the rest."""
 RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 1e-3, 2e-2, 5e-3
 """Adam learning rates in frame 0. The gloss rate applies at a strength of ``GLOSS``; see ``gloss_rate``. With higher
 gloss rates, individual Gaussians overfit a single camera's highlight. On the `gloss` scene, rates of 5e-3 for strengths
 and 3e-3 for normals reduced the PSNR of test views by 0.6 dB."""
 UPDATE_RATE_GLOSS, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS = 2e-3, 1e-2, 1e-3
-"""Initial Adam learning rates of an update; they decay to a tenth of these values during the update."""
+"""Initial Adam learning rates of an update. They decay to a tenth of these values during the update."""
 NEARNESS = 0.3
 """Initial nearness (inverse distance) of the environment in 1/m, typical of lamps in a room."""
 NEIGHBOURS = 16
-"""Number of neighbours over which changes of normals and strengths are averaged, since surfaces curve gradually."""
+"""Number of neighbours over which changes of normals and strengths are averaged, because surfaces curve gradually."""
 SAME_SIDE = 0.5
 """Cosine between normals above which neighbours are considered part of the same surface."""
 
@@ -41,12 +41,12 @@ def without_turn(count: int) -> Array:
 
 
 def features_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """Returns the features [N, 4] of a state, RGB and label, as seen by a camera; see ``colours_seen``."""
+    """Returns the features [N, 4] of a state (RGB and label) as seen by a camera. See ``colours_seen``."""
     return gaussians.features(colours_seen(gaussians, camera, turns))
 
 
 def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """Returns the colours [N, 3] of a state as seen by a camera. If the state has no gloss, returns its colour array.
+    """Returns the colours [N, 3] of a state as seen by a camera. Without gloss, these are ``gaussians.colours`` itself.
 
     Args:
         gaussians: state to shade.
@@ -67,11 +67,11 @@ def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None
 
 
 def gloss_rate(rate: float, gloss: Array) -> float:
-    """Scales a gloss learning rate so that normals rotate as fast as they would at strength ``GLOSS`` with ``rate``.
+    """Returns the gloss learning rate at which normals rotate as fast as at strength ``GLOSS`` with the given rate.
 
-    Adam's step length does not depend on the strength, so at a fifth of the strength, normals rotate five times as
-    fast. On the `gloss` scene, this reduced the PSNR in frame 0 by 0.6 dB. The rate is scaled by the mean strength,
-    weighted by the strengths themselves, because Gaussians without gloss have no normal.
+    Adam's step length does not depend on the strength. At a fifth of the strength, normals would therefore rotate five
+    times as fast. This reduced the PSNR in frame 0 of the `gloss` scene by 0.6 dB. The rate is scaled by the mean
+    strength, weighted by the strengths themselves, because Gaussians without gloss have no normal.
 
     Args:
         rate: learning rate at strength ``GLOSS``.
@@ -89,7 +89,7 @@ class GlossShading:
     """Gloss and environment parameters, with their gradients and optimizer state.
 
     Args:
-        gloss: [M, 3] normal of each Gaussian, scaled by its gloss strength; updated in place.
+        gloss: [M, 3] normal of each Gaussian, scaled by its gloss strength. It is updated in place.
         environment: [ROWS, 3] environment, updated in place.
         rates: learning rates of the gloss, the environment and its nearness.
 
@@ -97,7 +97,7 @@ class GlossShading:
         gloss, environment, rates: same as the arguments.
         moments: Adam moments of gloss and environment, [2, …] each.
         steps: number of Adam steps so far.
-        changed_from: reference gloss; ``smooth`` averages the changes since this reference.
+        changed_from: [M, 3] reference gloss. ``smooth`` averages the changes since this reference.
         gradients: gradients of gloss and environment, accumulated since the last step.
     """
 
@@ -118,7 +118,13 @@ class GlossShading:
 
     @classmethod
     def fresh(cls, gloss: Array, means: Array, environment: Array | None = None) -> GlossShading:
-        """Creates the parameters. If ``environment`` is None, it starts at zero, centred on the median of ``means``."""
+        """Creates parameters with zero moments for frame 0.
+
+        Args:
+            gloss: [M, 3] normal of each Gaussian, scaled by its gloss strength.
+            means: [N, 3] means in metres, which determine the centre of a new environment.
+            environment: [ROWS, 3] environment, or None for a new environment without light.
+        """
         from scas4d_core.kernels.appearance import direction
 
         if environment is None:
@@ -134,7 +140,7 @@ class GlossShading:
     def shade_backward(
         self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array
     ) -> None:
-        """Converts feature gradients to colour gradients in place; accumulates gloss and environment gradients."""
+        """Converts feature gradients to colour gradients in place, and accumulates gloss and environment gradients."""
         g_environment = self._kernel.shade_backward(
             means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
         )
@@ -146,7 +152,10 @@ class GlossShading:
         self._seen += 1
 
     def step(self, factor: float = 1.0) -> None:
-        """Takes an Adam step with the mean gradient since the last step, then makes the environment sum to zero."""
+        """Takes an Adam step with the mean gradient since the last step.
+
+        Afterwards, shifts the environment to a mean of zero over the sphere, and clamps its nearness to at least 0.
+        """
         from scas4d_core.kernels.adam import EVERY_ROW, adam
 
         self.steps += 1
@@ -193,7 +202,7 @@ class GlossShading:
 
 
 def environment_rates(rates: tuple[float, float, float]) -> Array:
-    """Returns the learning rate of each row of an environment, [ROWS]; its middle is not learnt.
+    """Returns the learning rate [ROWS] of each row of an environment. The scene centre x₀ is not learned.
 
     Args:
         rates: learning rates of the gloss, the environment and its nearness.
@@ -206,7 +215,7 @@ def environment_rates(rates: tuple[float, float, float]) -> Array:
 
 
 def cell_areas(side: int) -> Array:
-    """Returns the fraction of the sphere covered by each cell of an octahedral map, [side²]. The fractions sum to 1."""
+    """Returns the fraction [side²] of the sphere covered by each cell of an octahedral map. The fractions sum to 1."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, side)] * 2)
     x, y, z = u, v, 1 - abs(u) - abs(v)
     # The solid angle of a map element is proportional to 1/|p|³; cells on the border are cut in half.
@@ -251,7 +260,7 @@ class LearntGloss:
         self._shading.shade(means, self._turns, colours, camera, features)
 
     def shade_backward(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
-        """Converts feature gradients to colour gradients in place; accumulates gloss and environment gradients."""
+        """Converts feature gradients to colour gradients in place, and accumulates gloss and environment gradients."""
         self._shading.shade_backward(means, self._turns, colours, camera, g_features)
 
     @property

@@ -1,7 +1,7 @@
 """CPU rasterizer: projection, depth sorting, tile lists and blending, with backward passes for all stages.
 
-Buffers are shared between the forward and backward passes of a view; they are reused and never shrink. Results do not
-depend on the number of threads. Reference implementation: ``engines.torch.rasterizer``.
+The forward and backward passes of a view share buffers, which are reused for later views and never shrink. Results do
+not depend on the number of threads. Reference implementation: ``engines.torch.rasterizer``.
 
 Gaussians with non-finite values or an overflowing footprint are not rendered and receive zero gradients. Overflowing
 gradients are also set to 0. ``CpuRasterizer.guards`` counts these events.
@@ -29,10 +29,10 @@ Array = NDArray[np.float32]
 
 
 class Drawing(NamedTuple):
-    """Selects the blocks of an image to render. All other blocks are neither read nor written.
+    """Selection of the blocks of an image to render. All other blocks are neither read nor written.
 
     Attributes:
-        blocks: [tiles] uint64 bitmask of the blocks in each tile; see ``tiles.cover`` for the bit order.
+        blocks: [tiles] uint64 bitmask of the selected blocks in each tile. See ``tiles.cover`` for the bit order.
         learnt: [N] uint8 mask of the Gaussians that receive gradients. If such a Gaussian extends beyond ``blocks``,
             ``CpuRasterizer.outside_region`` is set.
         mask_to_region: whether to render only the blocks covered by the ``learnt`` Gaussians; see
@@ -45,7 +45,7 @@ class Drawing(NamedTuple):
 
 
 class ForwardPass(NamedTuple):
-    """Inputs and buffers of a forward pass that the backward pass needs; valid until the next forward pass."""
+    """Inputs and buffers of a forward pass that the backward pass needs. They are valid until the next forward pass."""
 
     means: Array
     factors: Array
@@ -67,7 +67,7 @@ class ForwardPass(NamedTuple):
 
 
 class CpuRasterizer:
-    """Renders any number of feature channels in one pass and backpropagates their gradients.
+    """Rasterizer that renders any number of feature channels in one pass and backpropagates their gradients.
 
     Attributes:
         guards: number of times each guard was triggered since the last ``reset``.
@@ -104,7 +104,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """Returns a contiguous scratch array; allocates 25 % extra to avoid reallocation as sizes vary."""
+        """Returns a contiguous scratch array. Allocates 25 % more than required to avoid reallocation as sizes vary."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view
@@ -169,7 +169,7 @@ class CpuRasterizer:
             means: [N, 3] means, in metres.
             factors: [N, 3, 3] covariance factors.
             opacities: [N] opacities.
-            features: [N, C] features; C must be a multiple of 4.
+            features: [N, C] features. C must be a multiple of 4.
             camera: camera in internal world coordinates.
             background: [C] background features.
             depth_channel: channel of ``features`` to overwrite with the depth of each mean (in metres), or −1.
@@ -290,7 +290,7 @@ class CpuRasterizer:
         return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
-        """Returns only the feature gradients [N, 4] of ``backward``. The image must have four channels."""
+        """Returns the feature gradients [N, 4] without computing any others. The image must have four channels."""
         last, count = self._last, len(self._last.features)
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
         feature_gradients.blend_features(
@@ -306,7 +306,7 @@ class CpuRasterizer:
 
     @property
     def planes(self) -> Array:
-        """Image of the last forward pass [C, rows, stride], padded to whole tiles."""
+        """Image [C, rows, stride] of the last forward pass, padded to whole tiles."""
         return self._last.image
 
     @property
@@ -317,10 +317,10 @@ class CpuRasterizer:
 
     @property
     def splats(self) -> Array:
-        """Splats of the last forward pass [N, 16]; see ``kernels.projection`` for the columns."""
+        """Splats [N, 16] of the last forward pass. See ``kernels.projection`` for the columns."""
         return self._last.splats
 
     @property
     def counts(self) -> NDArray[np.int32]:
-        """Number of tiles covered by each Gaussian in the last forward pass [N]; 0 if culled."""
+        """Number [N] of tiles covered by each Gaussian in the last forward pass. It is 0 for culled Gaussians."""
         return self._last.counts

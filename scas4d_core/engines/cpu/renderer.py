@@ -21,8 +21,7 @@ Array = NDArray[np.float32]
 Moments = tuple[Array, Array]
 
 _moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
-"""SSIM moments of each view (windowed means of the target and of its square), computed once and shared by all
-renderers."""
+"""SSIM moments of each view (windowed means of the target and of its square). All renderers share them."""
 
 
 def no_lap(stage: str) -> None:
@@ -127,7 +126,7 @@ class CpuRenderer:
     # Losses of iterations, for arrays that are updated in place.
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame. The base class ignores the state; subclasses may use it."""
+        """Loads the initial state of a frame. This class ignores it, but subclasses may use it."""
 
     def forward_backward(
         self,
@@ -169,7 +168,7 @@ class CpuRenderer:
         self._compare(view, g_image)
 
     def shown(self, view: TrainingView) -> Picture:
-        """Returns the full image of the view last passed to ``forward_backward``; valid until the next rendering."""
+        """Returns the full image of the view last passed to ``forward_backward``, valid until the next rendering."""
         return self.rasterizer.picture
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
@@ -197,7 +196,7 @@ class CpuRenderer:
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
 
     def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
-        """Computes the sums of ``residuals`` for the last rendering."""
+        """Returns the sums of ``Renderer.residuals`` for the last rendering."""
         height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
@@ -226,7 +225,7 @@ class CpuRenderer:
 
 
 def forget_moments(view: TrainingView) -> None:
-    """Drops a view's cached moments; called once its renderer has copied the part that it needs."""
+    """Drops a view's cached moments. Call it once the renderer has copied the part that it needs."""
     _moments.pop(view, None)
 
 

@@ -20,7 +20,7 @@ LARGEST = EXPONENT / log2(e)
 """Bound on the magnitude of exponents."""
 
 ClusterMap = Literal["centred", "published"]
-"""Variant of equation (6): scaling about the cluster's pivot ("centred"), or about the world origin ("published")."""
+"""Variant of equation (6), which scales about the cluster's pivot ("centred") or the world origin ("published")."""
 
 Covariance = Literal["entangled", "separate"]
 """How a Gaussian's covariance is deformed, apart from its own ΔR and Δs.
@@ -176,7 +176,7 @@ def scaling_factor(z: Tensor) -> tuple[Tensor, Tensor]:
 def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
     """Returns the polar rotation of f·I + f(2−f)·y·cᵀ as unit quaternions [M, 4], in closed form.
 
-    Orthogonal to y and c, the matrix only scales by f, so its polar rotation is a 2D rotation in the plane of y and c.
+    Orthogonal to y and c, the matrix only scales by f. Its polar rotation is a 2D rotation in the plane of y and c.
     With C the trace and S the skew part in the plane, the quaternion is proportional to (|(C, S)| + C, S). The common
     factor f is omitted, so the result stays accurate for f near 0.
 
@@ -198,7 +198,7 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
 
 
 def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Returns the mean position [count, 3] of each cluster, detached from autograd; 0 for empty clusters.
+    """Returns the mean position [count, 3] of each cluster, detached from autograd. It is 0 for empty clusters.
 
     >>> cluster_pivots(torch.tensor([[0.0, 0, 0], [2, 0, 0], [5, 5, 5]]), torch.tensor([0, 0, 1]), 2)
     tensor([[1., 0., 0.],
@@ -215,10 +215,10 @@ def cluster_map(
 ) -> Transported:
     """Applies equation (6) to every point, and computes the map's Jacobian and its polar rotation.
 
-    With d = x − p, z = c·d + s, f = 2σ(2z), f' = f(2−f):
-    centred x' = p + t + f·R d; published x' = (R d + p + t)·f. Both have J = R (f·I + f'·y·cᵀ), with y = d when centred
-    and y = Rᵀ(R d + p + t) as published. The published map scales about the world origin and is therefore not
-    translation-equivariant. Both agree for c = s = 0. If all parameters are 0, points are preserved bit for bit.
+    Let d = x − p, z = c·d + s, f = 2σ(2z) and f' = f(2−f). The centred map is x' = p + t + f·R d, and the published map
+    is x' = (R d + p + t)·f. The Jacobian is J = R (f·I + f'·y·cᵀ), with y = d for the centred map and
+    y = Rᵀ(R d + p + t) for the published one. The published map scales about the world origin and is therefore not
+    translation-equivariant. The maps agree for c = s = 0. If all parameters are 0, points are preserved bit for bit.
 
     Args:
         points: [M, 3] points, in metres.
@@ -300,10 +300,11 @@ def deform(
     kind: ClusterMap = "centred",
     covariance: Covariance = "entangled",
 ) -> Deformed:
-    """Deforms Gaussians by equation (5), in terms of factors: the cascade, then each Gaussian's Δp, ΔR, Δs.
+    """Applies the cascade to Gaussians, followed by each Gaussian's Δp, ΔR and Δs.
 
-    mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. If the deltas are 0,
-    Σ = F Fᵀ is J Σ_previous Jᵀ. With separate covariance, J is omitted.
+    This is equation (5), expressed with factors: mean = x_K + Δp, F = R(Δr)·J·F_previous·diag(exp Δs), and
+    turn = q(Δr) ∘ Q, with its sign chosen to make w ≥ 0. If the deltas are 0, Σ = F Fᵀ equals J Σ_previous Jᵀ. With
+    separate covariance, J is omitted.
 
     Args:
         means: [M, 3] means in the previous frame, in metres.
@@ -311,7 +312,7 @@ def deform(
         layers: layers, coarse to fine.
         deltas: per-Gaussian deltas.
         kind: variant of the cluster map.
-        covariance: variant of the covariance; "separate" omits J from the factors.
+        covariance: variant of the covariance. "separate" omits J from the factors.
 
     Raises:
         ValueError: if a variant is unknown.
@@ -337,7 +338,7 @@ def deform(
 
 
 def material_rotations(turns: Tensor, previous: Tensor) -> Tensor:
-    """Returns the rotations since frame 0 [M, 4], i.e. previous rotations followed by the rotations of this frame.
+    """Returns the rotations [M, 4] since frame 0, i.e. the previous rotations followed by those of this frame.
 
     >>> quarter = torch.tensor([[0.5, 0, 0, 0.5]]) * 2**0.5
     >>> material_rotations(quarter, previous=quarter)

@@ -190,7 +190,7 @@ class TorchEngine:
             learnt.gloss.copy_(before + (weights[..., None] * (learnt.gloss - before)[index]).sum(dim=1))
 
     def _neighbours_on_surface(self, gloss: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the frame-0 neighbours [M, k] and their weights: equal on the same surface, 0 elsewhere."""
+        """Returns the frame-0 neighbours [M, k] and their weights, equal on the same surface and 0 elsewhere."""
         if self._smoothing is None:
             count = len(gloss)
             roots = self._structure.roots[:count]
@@ -276,7 +276,7 @@ class TorchEngine:
 
 
 def tables_of_gradients(named: Mapping[str, Array], scene: Scene, layers: int) -> dict[str, Array]:
-    """Groups parameter gradients into tables with the columns of ``Tables``, plus colours, gloss and environment."""
+    """Returns the parameter gradients as tables with the keys and columns of ``UpdateEngine.gradients``."""
     tables = {
         f"cluster {k}": np.concatenate(
             [named[f"{k}.{name}"].reshape(-1, 1 if name == "s" else 3) for name in "rtcs"], axis=1

@@ -33,7 +33,7 @@ def colours_seen(
 
 
 def cell_shares() -> Tensor:
-    """Returns the fraction of the sphere covered by each cell of the octahedral map, [CELLS]; the sum is 1."""
+    """Returns the fraction [CELLS] of the sphere covered by each cell of the octahedral map. The fractions sum to 1."""
     line = torch.linspace(-1, 1, SIDE, dtype=torch.float64)
     v, u = torch.meshgrid(line, line, indexing="ij")
     z = 1 - u.abs() - v.abs()
@@ -46,7 +46,10 @@ def cell_shares() -> Tensor:
 
 
 def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environment: Tensor, centre: Tensor) -> Tensor:
-    """Returns the shaded colours [N, 3]. Same arguments as the kernel, but ``gloss`` must include every Gaussian."""
+    """Returns the shaded colours [N, 3]. ``gloss`` [N, 3] must include every Gaussian.
+
+    See ``kernels.appearance.direction.shade`` for the other arguments.
+    """
     strength = gloss.norm(dim=1, keepdim=True)
     glossy = strength[:, 0] > float(DULL)
     strength = torch.where(glossy[:, None], strength, torch.ones_like(strength))

@@ -21,7 +21,7 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 """Standard deviation of the window in pixels."""
 SSIM_SHARE = 0.2
-"""Weight of 1 − SSIM in the image loss; the L1 term has the remaining weight (Kerbl et al. 2023)."""
+"""Weight of 1 − SSIM in the image loss. The L1 term has the remaining weight (Kerbl et al. 2023)."""
 
 
 @functools.cache
@@ -63,7 +63,7 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
     """Returns 0.8·mean|I − Î| + 0.2·(1 − mean SSIM), averaged over pixels and channels.
 
     Args:
-        image: [H, W, C] rendered image; a mask is an image with one channel.
+        image: [H, W, C] rendered image. A mask is an image with one channel.
         target: [H, W, C] target image, in 0…1.
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -167,7 +167,7 @@ def axis_lengths(factors: Tensor) -> Tensor:
 
 
 def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tensor:
-    """Returns the scale loss of equation (8) in metres, averaged over both Gaussians and axes.
+    """Returns the scale loss of equation (8), in metres.
 
     It is the mean of max(0, |column a of F| − max(max_scale, |column a of F in frame 0|)) over Gaussians and axes a.
     Unlike in the paper, an axis that keeps its frame-0 length is never penalized.
@@ -196,7 +196,7 @@ def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
 
 
 def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:
-    """Returns the mean absolute difference, over Gaussians and channels, from the previous colours; both are [N, 3].
+    """Returns the mean absolute difference between the current and the previous colours, [N, 3] each.
 
     >>> soft_colour_loss(torch.full((4, 3), 0.5), torch.full((4, 3), 0.25))
     tensor(0.2500)

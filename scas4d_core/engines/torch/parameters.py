@@ -30,7 +30,7 @@ class GlossParameters:
         gloss: [M, 3] normal of each Gaussian, scaled by its gloss strength.
         light: rows of the environment that contain light.
         nearness: [1, 3] row of the environment that contains the nearness in its first column.
-        middle: [1, 3] row of the environment that contains the scene centre, in metres; not learned.
+        middle: [1, 3] row of the environment that contains the scene centre, in metres. It is not learned.
         rates: Adam learning rates of gloss, light and nearness.
     """
 
@@ -115,7 +115,7 @@ class Parameters:
 
 
 class FreeParameter:
-    """A tensor with its Adam optimizer.
+    """Adam optimizer for one parameter tensor.
 
     Attributes:
         stage: name of the ``StepScalars`` factor that scales the learning rate: "layer k", "own", "colour" or "gloss".

@@ -58,12 +58,12 @@ class CameraParams(NamedTuple):
         return cls(pose[:, :3], pose[:, 3], fx, fy, cx, cy, camera.width, camera.height)
 
     def depths(self, means: Tensor) -> Tensor:
-        """Returns the depth [N] of points [N, 3] along the camera's z axis; used to render depth as a feature."""
+        """Returns the depth [N] of points [N, 3] along the camera's z axis, for rendering depth as a feature."""
         return means @ self.rotation[2] + self.translation[2]
 
 
 class Projected(NamedTuple):
-    """Projected Gaussians. Values are meaningless for Gaussians in front of the near plane.
+    """Projected Gaussians. Values are meaningless for Gaussians closer than the near plane.
 
     Attributes:
         means: [N, 2] projected means, in pixels.
@@ -82,7 +82,7 @@ class Rendered(NamedTuple):
     Attributes:
         features: [H, W, C] rendered features, including the background.
         alpha: [H, W] alpha in 0…1, one minus the remaining transmittance.
-        means: [N, 2] projected means, in pixels; adaptive density control uses their gradient.
+        means: [N, 2] projected means, in pixels. Adaptive density control uses their gradient.
         depths: [N] depths along z, in metres.
     """
 
@@ -130,7 +130,7 @@ def _composite(
     background: Tensor,
     limits: Limits,
 ) -> tuple[Tensor, Tensor]:
-    """Composites depth-sorted Gaussians at pixel centres [P, 2]; returns features [P, C] and alpha [P]."""
+    """Composites depth-sorted Gaussians at pixel centres [P, 2], and returns features [P, C] and alpha [P]."""
     d = pixels[:, None] - means
     a, b, c = conics.unbind(-1)
     power = -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
@@ -146,7 +146,7 @@ def _composite(
 
 
 def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
-    """Returns a mask [N] of Gaussians with finite values within ``guards.NOT_FINITE`` and ``FEATURE_CEILING``."""
+    """Returns a mask [N] of the Gaussians whose values are finite and within ``NOT_FINITE`` and ``FEATURE_CEILING``."""
     size = means.detach().abs().sum(-1) + factors.detach().abs().sum((-2, -1)) + opacities.detach().abs()
     return (size <= NOT_FINITE) & (features.detach().abs() <= FEATURE_CEILING).all(-1)
 

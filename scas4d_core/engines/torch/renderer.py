@@ -18,7 +18,7 @@ from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 TILE = 32
-"""``reached`` pads image sizes to a multiple of this number of pixels."""
+"""Tile size in pixels. ``reached`` pads images to whole tiles."""
 
 
 class TorchRenderer:
@@ -99,7 +99,7 @@ class TorchRenderer:
         return blocks
 
     def _seen(self, state: Gaussians, camera: CameraArrays) -> Tensor:
-        """Returns the features [N, 4]: RGB including gloss, and label."""
+        """Returns the features [N, 4] of a state as seen by a camera: RGB including gloss, and label."""
         gloss = None if state.gloss is None else leaf(state.gloss)
         environment = None if state.environment is None else leaf(state.environment)
         means, colours = leaf(state.means), leaf(state.colours)

@@ -34,7 +34,7 @@ class Moved:
 class Scene:
     """Θ_{t−1} in float64, with methods that derive Θ_t from it.
 
-    Moving Gaussians with non-finite values are held back: they remain unchanged and do not affect pivots or neighbours.
+    Moving Gaussians with non-finite values are held back. They remain unchanged and do not affect pivots or neighbours.
 
     Attributes:
         rows: [M] rows of the moving Gaussians.
@@ -83,7 +83,7 @@ class Scene:
     def seen(
         self, moved: Moved, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, camera: CameraArrays
     ) -> Tensor:
-        """Returns the features [N, 4] seen by a camera (RGB with gloss, label), detached from means and rotations."""
+        """Returns the features [N, 4] (RGB with gloss, label) seen by a camera, detached from means and rotations."""
         turns = no_turns(len(self.means)).index_copy(0, self.rows, moved.turns.detach())
         seen = colours_seen(moved.means.detach(), turns, colours, gloss, environment, leaf(camera.centre))
         return torch.cat([seen, self.labels[:, None]], dim=1)

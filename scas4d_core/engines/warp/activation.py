@@ -1,4 +1,4 @@
-"""Activation functions for a fit's parameters, with backward pass and Adam step; reference: ``kernels.activation``."""
+"""Activation functions for a fit's parameters, with backward pass and Adam step. Reference: ``kernels.activation``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def activate(
     Args:
         fixed: number of fixed Gaussians, which precede the fitted ones.
         parameters: [N, 15] parameters; see ``engines.fit`` for the columns.
-        means, factors, opacities, features: [fixed + N] outputs; the first ``fixed`` rows stay unchanged.
+        means, factors, opacities, features: [fixed + N] outputs. The first ``fixed`` rows stay unchanged.
     """
     i = wp.tid()
     row = fixed + i

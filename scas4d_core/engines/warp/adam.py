@@ -1,7 +1,7 @@
-"""Adam (Kingma and Ba 2015) for tables on the device; reference: ``torch.optim.Adam``, guards: ``kernels.adam``.
+"""Adam (Kingma and Ba 2015) for tables on the device, with the guards of ``kernels.adam``.
 
 The kernel that computes an element's gradient also updates the element, by calling ``step_element``. This saves a
-kernel launch and another read of the gradient.
+kernel launch and another read of the gradient. Reference: ``torch.optim.Adam``.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def step_table(adam: Adam, gradients: wp.array2d[wp.float32], table: wp.array2d[
 
 
 class Optimizer:
-    """Host side of an optimizer, which allocates its arrays and counts its steps.
+    """Host-side part of an optimizer, which allocates the device arrays and counts the steps.
 
     Args:
         shape: shape of the table.

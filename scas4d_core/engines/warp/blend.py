@@ -49,7 +49,7 @@ class Spot:
 
 @wp.func
 def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot:
-    """Returns the k-th pixel of a tile; 32 consecutive pixels form an 8×4 block."""
+    """Returns the k-th pixel of a tile. Each 8×4 block consists of 32 consecutive pixels."""
     group = k // 32
     within = k - group * 32
     x0 = (tile % raster.tiles_x) * TILE + (group % 2) * 8
@@ -116,7 +116,9 @@ def draw_entries(
     All lanes of a warp must call this function.
 
     Args:
+        raster, splats, features, items: see ``blend_segments``.
         begin, end: first entry, and last entry plus 1.
+        spot: pixel of the lane.
         open: 1 if the lane's pixel must be rendered, otherwise 0.
         passed: transmittance before the first entry.
         exact: selects the transmittance returned for a pixel that is finished here: a value below the stop (0), or the
@@ -190,6 +192,7 @@ def blend_segments(
     """Blends each segment independently. Each warp processes one 8×4 block of one segment after another.
 
     Args:
+        raster, cameras, view: see ``projection.project``.
         splats: [2 N] splats; see ``supports``.
         features: [N] features of the Gaussians.
         items, starts, segment_starts, segment_tiles: tile lists; see ``tiles``.
@@ -234,6 +237,7 @@ def join_segments(
     """Combines the segments of each list, with one thread per pixel of each tile.
 
     Args:
+        raster, cameras, view, splats, features, items, starts, segment_starts: see ``blend_segments``.
         background: [1] background features.
         segment_light, segment_features: outputs of ``blend_segments``. While a pixel is unfinished, they are replaced
             by the pixel's state at the start of each segment.
@@ -354,6 +358,8 @@ def blend_backward(
     """Backpropagates the gradient of the planes to the splats. Work is distributed as in the forward pass.
 
     Args:
+        raster, cameras, view, splats, features, items, starts: see ``blend_segments``.
+        segment_starts, segment_tiles, warps: see ``blend_segments``.
         segment_light, segment_features, begun, planes: outputs of ``join_segments``.
         g_planes: [4, rows, columns] dL/dplanes for the features.
         records: [4 N] gradient records, accumulated; see ``projection``.

@@ -1,4 +1,4 @@
-"""Cluster map of equation (6) for an entire layer, and its backward pass; reference: ``engines.torch.deformation``.
+"""Cluster map of equation (6) for an entire layer, and its backward pass. Reference: ``engines.torch.deformation``.
 
 Each warp processes one cluster, whose Gaussians are contiguous in hierarchy order. Pivots and parameter gradients are
 therefore sums over lanes, and no atomics are needed.
@@ -62,7 +62,7 @@ def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterPa
 def pivot_of(
     start: wp.int32, end: wp.int32, sound: wp.array[wp.int32], points: wp.array[wp.vec3]
 ) -> wp.vec3:  # fmt: skip
-    """Returns the mean of a cluster's points, in all lanes."""
+    """Returns the mean of a cluster's points with finite values, in all lanes."""
     total = wp.vec3(0.0, 0.0, 0.0)
     count = wp.float32(0.0)
     for entry in range(start + lane(), end, lane_count()):

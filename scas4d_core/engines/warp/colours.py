@@ -29,12 +29,13 @@ def step_colours(
     """Adds the soft-colour loss and takes an Adam step for the colours, with one thread per element of [N, 3].
 
     Args:
+        adam: optimizer for the colours.
         weight: weight of each element's absolute change.
-        reported: 1 to add the term to the losses, which only the report needs.
+        reported: 1 to add the soft-colour loss to ``losses``, which only the report needs, otherwise 0.
         learned: [N] flags, 1 for Gaussians whose colours are learned, otherwise 0.
         before: [N, 4] features of Θ_{t−1}.
         g_features: [N, 4] gradients of the rendering losses.
-        features: [N, 4] features; the first three columns are updated.
+        features: [N, 4] features. The first three columns are updated.
         gradients: [N, 3] output, gradients of the colours.
         iteration: [1] row of ``losses`` for this iteration.
         losses: weighted losses of each iteration, to which the soft-colour loss is added.

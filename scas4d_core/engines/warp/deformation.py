@@ -26,7 +26,7 @@ class WarpDeformation:
         device: Warp device, such as "cpu" or "cuda:0".
         plan: plan of the scene's updates.
         structure: clusters and neighbour graph of the moving Gaussians.
-        records: values that change between iterations; the optimizers of the layers and of the deltas come first.
+        records: values that change between iterations. The optimizers of the layers and of the deltas come first.
 
     Attributes:
         clusters: [K, 10] parameters of each layer, with columns r, t, c, s of equation (6).
@@ -107,7 +107,7 @@ class WarpDeformation:
             table.assign(values)
 
     def begin(self, start: AttemptStart) -> bool:
-        """Starts an attempt from the current parameters; ``restart`` must be called next.
+        """Starts an attempt from the current parameters. ``restart`` must be called next.
 
         Returns:
             Whether buffers were reallocated, which invalidates captured graphs.
@@ -167,8 +167,8 @@ class WarpDeformation:
             g_means: [N] vec3 gradients of the rendering losses with respect to the means.
             g_factors: [N] mat33 gradients of the rendering losses with respect to the factors.
             frozen: number of frozen layers, counted from the coarsest.
-            losses: weighted losses of each iteration, excluding rendering losses; the deformation losses are added to
-                them.
+            losses: weighted losses of each iteration without rendering losses, to which the deformation losses are
+                added.
         """
         device, iteration = self._device, self._records.iteration
         if self._plan.neighbour_terms and self._graph is not None:

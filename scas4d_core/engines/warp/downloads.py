@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Downloads:
-    """Copies arrays to the host through page-locked buffers, which calls with equal shapes reuse.
+    """Helper that copies arrays to the host through page-locked buffers, which are reused while shapes stay the same.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".

@@ -53,7 +53,7 @@ LOG_ROWS = 1024
 ITERATIONS = "iterations"
 """Name of the update stage in which the host enqueues iterations."""
 AHEAD = 2
-"""Maximum number of pending iterations; bounds how far the host's clock runs ahead of the device."""
+"""Maximum number of pending iterations, which bounds how far host timings run ahead of the device."""
 
 
 class Variant(NamedTuple):
@@ -83,6 +83,7 @@ class WarpEngine:
         device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
+        name: name of the engine, used in messages.
         renderer: renderer for states, with the plan's background and limits.
         downloads: helper that copies device arrays to the host.
     """
@@ -152,7 +153,7 @@ class WarpEngine:
 
     @property
     def _learnt_gloss(self) -> WarpGloss | None:
-        """Gloss if the plan learns it; otherwise None, in which case iterations render without gloss."""
+        """Gloss if the plan learns it. Otherwise None, and iterations render without gloss."""
         return self._gloss if self._plan.gloss else None
 
     def set_tables(self, tables: Tables) -> None:

@@ -1,4 +1,4 @@
-"""GPU engine for fits, which runs single iterations of 3D Gaussian Splatting in Warp."""
+"""GPU engine for fits, which runs one iteration of 3D Gaussian Splatting at a time in Warp."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 
 @wp.kernel
 def skip_incomplete(capacity: wp.int32, log: wp.array2d[wp.float32], scalars: wp.array[wp.float32]) -> None:
-    """Sets each optimizer's factor to 0 if the tile lists were too small, with one thread per optimizer."""
+    """Disables the step of each optimizer if the tile lists were too small, with one thread per optimizer."""
     if log[0, PAIRS] > wp.float32(capacity):
         scalars[SCALARS * wp.tid()] = 0.0
 
@@ -77,7 +77,7 @@ class WarpFitEngine:
     """The ``FitEngine`` implementation in NVIDIA Warp. The host waits once per iteration, to read its loss.
 
     Args:
-        renderer: renderer to use; it also determines the device.
+        renderer: renderer to use, which also determines the device.
         mask_weight: weight of the mask loss.
     """
 
@@ -128,7 +128,7 @@ class WarpFitEngine:
         self._load_gloss(table.gloss, most)
 
     def _load_gloss(self, shading: GlossShading | None, most: int) -> None:
-        """Loads gloss and environment with their moments; ``most`` is the largest number of rendered Gaussians."""
+        """Loads gloss and environment with their moments. ``most`` is the largest number of rendered Gaussians."""
         self._gloss: GlossTables | None = None
         if shading is not None:
             self._seen = wp.zeros(most, dtype=wp.vec4, device=self._device)
@@ -199,7 +199,7 @@ class WarpFitEngine:
         return row
 
     def table(self) -> FitTable:
-        """See ``FitEngine.table``; downloads only if iterations have run since the last download."""
+        """See ``FitEngine.table``. Downloads the table only if iterations have run since the last download."""
         if not self._stepped:  # the host may have edited the table
             return self._table
         self._stepped = False

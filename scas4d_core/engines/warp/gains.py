@@ -1,4 +1,4 @@
-"""Estimation of camera gains on the device; reference: ``engines.gains``."""
+"""Estimation of camera gains on the device. Reference: ``engines.gains``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FOOT_, DARK_, SATURATED_, SHARE_, ENOUGH_, LOG_LARGEST = (
 BLOCK = 256
 """Number of threads in the block that measures one channel."""
 MOST_SAMPLED = 4 * LOOKED_AT
-"""Upper bound on the number of pixels sampled per image; the sampling step is rounded down to whole pixels."""
+"""Maximum number of pixels sampled per image. It exceeds ``LOOKED_AT`` because the sampling step is rounded down."""
 
 
 # The ratios are positive, so their bit patterns sort like their values. The element of a given rank is therefore found
@@ -73,7 +73,10 @@ return result.number;
 def value_of_rank(
     thread: wp.int32, ratios: wp.array[wp.float32], first: wp.int32, count: wp.int32, rank: wp.int32
 ) -> wp.float32:
-    """Returns the element with a given rank among positive numbers. All threads of a block must call it."""
+    """Returns the ``rank``-th smallest of ``count`` positive numbers, counting from 0 and starting at index ``first``.
+
+    All threads of a block must call this function.
+    """
     ...
 
 
@@ -108,7 +111,7 @@ def measure_gain(
         targets: [views, 4, rows, columns] training images and masks.
         ratios: [3 · ``MOST_SAMPLED``] scratch buffer.
         counts: [3] scratch buffer.
-        gain: [3] output, median ratio of each channel; NaN if there are too few usable pixels.
+        gain: [3] output, median ratio of each channel, or NaN if there are too few usable pixels.
     """
     channel = wp.tid() // threads
     thread = wp.tid() - channel * threads
@@ -147,7 +150,7 @@ def end_round(
     Args:
         cameras: number of cameras that contribute to the frame.
         measured: [cameras, 3] measured gains.
-        pending: [cameras] 1 for cameras measured in this round; reset to 0.
+        pending: [cameras] 1 for cameras measured in this round, otherwise 0. It is reset to 0.
         gains: [cameras, 3] current gains, updated in place.
     """
     known = wp.int32(0)
@@ -184,7 +187,7 @@ def record_gain(
     gains: wp.array2d[wp.float32],
     exposures: wp.array2d[wp.vec2],
 ) -> None:
-    """Records a measured gain. A camera's second rendering starts a new round. Launched with one thread.
+    """Records a measured gain. The second measurement of a camera starts a new round. Launched with one thread.
 
     Args:
         view: [1] index of the view, or −1 to end the round.
@@ -277,7 +280,7 @@ class WarpGains:
     def record(
         self, cameras: wp.array, view: wp.array, planes: wp.array, targets: wp.array, exposures: wp.array
     ) -> None:
-        """Measures a camera's gain from a rendering. If the camera was already measured, a new round starts first."""
+        """Measures a camera's gain from a rendering; see ``measure_gain`` and ``record_gain`` for the arguments."""
         inputs = [self._threads, cameras, view, planes, targets, self._ratios, self._counts, self._gain]
         wp.launch(measure_gain, 3 * self._threads, inputs, device=self._device, block_dim=BLOCK)
         self._record(view, exposures)

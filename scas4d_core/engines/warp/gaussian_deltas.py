@@ -1,4 +1,4 @@
-"""Per-Gaussian deltas of equation (5), with the scale and floor losses; reference: ``engines.torch``."""
+"""Per-Gaussian deltas of equation (5), with the scale and floor losses. Reference: ``engines.torch``."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Terms:
 
     Attributes:
         separate: 1 if the Jacobian does not transform the covariance, otherwise 0.
-        axis_length: weight of the scale loss per axis; 0 disables the loss.
-        floor: weight of the floor loss per Gaussian; 0 disables the loss.
+        axis_length: weight of the scale loss per axis. A weight of 0 disables the loss.
+        floor: weight of the floor loss per Gaussian. A weight of 0 disables the loss.
         plane: floor plane; see ``UpdatePlan.floor``.
     """
 
@@ -102,9 +102,9 @@ def apply_deltas(
     """Applies Δp, ΔR and Δs after the cascade, with one thread per moving Gaussian.
 
     Args:
-        terms: constants; only ``separate`` is used.
+        terms: constants, of which only ``separate`` is used.
         rows: [M] rows of the moving Gaussians in Θ_t.
-        sound: [M] 0 for Gaussians with non-finite values, which remain unchanged; otherwise 1.
+        sound: [M] 1 for Gaussians with finite values, otherwise 0. The latter remain unchanged.
         points, jacobians, turned: [M] points, Jacobians and rotations after the cascade.
         previous_factors: [N] covariance factors of Θ_{t−1}.
         deltas: [M, 9] per-Gaussian deltas.
@@ -153,7 +153,7 @@ def apply_deltas_backward(
 ) -> None:
     """Backpropagates through ``apply_deltas``, and takes an Adam step for the deltas.
 
-    It also adds the scale and floor losses and their gradients.
+    Also adds the scale and floor losses and their gradients.
 
     Args:
         terms, rows, sound, jacobians, turned, previous_factors, deltas: see ``apply_deltas``.

@@ -1,6 +1,6 @@
-"""View-dependent colours on the device; formula: ``kernels.appearance.direction``, reference: ``engines.torch.gloss``.
+"""View-dependent colours on the device, and optimization of gloss and environment as in ``engines.cpu.gloss``.
 
-Gloss and environment are optimized during an attempt, as in ``engines.cpu.gloss``.
+The formula is in ``kernels.appearance.direction``. Reference: ``engines.torch.gloss``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ STEP = wp.constant(wp.float32((direction.SIDE - 1) / 2))
 
 @wp.struct
 class Reflection:
-    """Reflected direction of a Gaussian, and the environment cell in this direction.
+    """Reflection of a Gaussian towards a camera, with the environment cell that the Gaussian reflects.
 
     Attributes:
         valid: 0 if the Gaussian reflects no light towards the camera, otherwise 1.
@@ -55,8 +55,8 @@ class Reflection:
         middle: offset x − x₀ from the scene centre, in metres.
         direction: lookup direction r + k (x − x₀), not normalized.
         length: Manhattan norm of the direction.
-        sign_x, sign_y: signs of the direction.
-        cell: environment cell in this direction.
+        sign_x, sign_y: signs of the x and y components of the direction.
+        cell: index of the environment cell in this direction.
         u, v: position within the cell.
         grazing: factor f = (1 − μ)⁴ of the sheen.
         left: remaining fraction of the diffuse light.
@@ -126,7 +126,7 @@ def mirrored(environment: wp.array2d[wp.float32], at: Reflection, c: wp.int32) -
 
 @wp.func
 def turn_of(entries: wp.array[wp.int32], turns: wp.array[wp.vec4], turned: wp.int32, i: wp.int32) -> wp.vec4:
-    """Returns a Gaussian's rotation, or the identity if the Gaussian is static or ``turned`` is 0."""
+    """Returns the rotation of Gaussian ``i``, or the identity if the Gaussian is static or ``turned`` is 0."""
     turn = wp.vec4(1.0, 0.0, 0.0, 0.0)
     if turned == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
         if entries[i] >= 0:
@@ -199,9 +199,9 @@ def shade_backward(
         cameras, view, means, entries, turns, turned, gloss, environment, features: see ``shade``.
         adds: 1 to add to ``g_features`` and ``g_gloss``, 0 to overwrite them.
         g_seen: [N] gradients of ``seen``.
-        g_features: [N] gradients of ``features``.
-        g_gloss: [G, 3] gradients of ``gloss``.
-        g_environment: [ROWS, 3] gradient of the environment, accumulated; the row of x₀ stays 0.
+        g_features: [N] output, gradients of ``features``.
+        g_gloss: [G, 3] output, gradients of ``gloss``.
+        g_environment: [ROWS, 3] output, gradient of the environment, accumulated. The row of x₀ is not written.
     """
     i = wp.tid()
     g_out = g_seen[i]
@@ -264,7 +264,12 @@ def shade_backward(
 
 @wp.kernel
 def centre_environment(areas: wp.array[wp.float32], environment: wp.array2d[wp.float32]) -> None:
-    """Makes the environment sum to zero over the sphere and the nearness ≥ 0, with one thread per channel."""
+    """Makes the environment sum to 0 over the sphere and clamps the nearness to ≥ 0, with one thread per channel.
+
+    Args:
+        areas: [CELLS] fraction of the sphere covered by each cell.
+        environment: [ROWS, 3] environment, updated in place.
+    """
     c = wp.tid()
     mean = wp.float32(0.0)
     for cell in range(areas.shape[0]):
@@ -278,12 +283,12 @@ def centre_environment(areas: wp.array[wp.float32], environment: wp.array2d[wp.f
 def weigh_neighbours(
     gloss: wp.array2d[wp.float32], neighbours: wp.array2d[wp.int32], weights: wp.array2d[wp.float32]
 ) -> None:
-    """Gives equal weights to neighbours on the same side of a surface, with one thread per Gaussian.
+    """Computes equal weights for neighbours on the same side of a surface, with one thread per Gaussian.
 
     Args:
         gloss: [G, 3] normal of each Gaussian, scaled by its gloss strength.
         neighbours: [G, k] neighbours of each Gaussian, starting with the Gaussian itself.
-        weights: [G, k] output, weights that sum to 1 in each row.
+        weights: [G, k] output, weights that sum to 1 in each row. They are 0 for all other neighbours.
     """
     i = wp.tid()
     normal = wp.normalize(wp.vec3(gloss[i, 0], gloss[i, 1], gloss[i, 2]))
@@ -330,7 +335,7 @@ class GlossTables:
         count: number of Gaussians, N.
         glossy: number of glossy Gaussians, which precede all others.
         rows: [M] rows of the Gaussians that rotate.
-        scalars: [3] device array with the scalars of each of the two optimizers.
+        scalars: two [3] device arrays with the scalars of the optimizers for gloss and environment.
 
     Attributes:
         glossy: same as the argument.
@@ -378,7 +383,7 @@ class GlossTables:
         wp.launch(shade, self._count, inputs, device=self._device)
 
     def _rotations(self, turns: wp.array | None) -> list[object]:
-        """Returns the kernel arguments for rotations; without any, the array is a placeholder that is not read."""
+        """Returns the kernel arguments for rotations. If ``turns`` is None, its placeholder is not read."""
         return [self._entries, self.seen if turns is None else turns, int(turns is not None)]
 
     def shade_backward(
@@ -449,7 +454,11 @@ class WarpGloss(GlossTables):
         self.begin(self._rates)
 
     def smooth(self, first: bool) -> None:
-        """Averages gloss changes over neighbours; ``first`` must be true for the first call of an attempt."""
+        """Averages the gloss changes since Θ_{t−1} over neighbours.
+
+        Args:
+            first: whether this is the first call of an attempt, which computes the weights of the neighbours.
+        """
         gloss = self.tables[0]
         if first:
             inputs = [gloss, self._neighbours, self._weights]

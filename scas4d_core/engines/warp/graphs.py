@@ -15,8 +15,8 @@ class Graphs:
         device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
-        captures: whether to capture graphs; None captures them on GPUs only. Set it on the class before an engine is
-            bound: tests capture on the CPU device, and measurements of single kernels do not capture.
+        captures: whether to capture graphs. If None, graphs are captured on GPUs only. Tests and measurements of single
+            kernels set another value on the class before they bind an engine.
     """
 
     captures: ClassVar[bool | None] = None
@@ -31,7 +31,9 @@ class Graphs:
         self._graphs = {}
 
     def run(self, variant: Hashable, launch: Callable[[], None]) -> None:
-        """Runs a variant of the launch sequence; on a GPU, the second run captures it and later runs replay it.
+        """Runs a variant of the launch sequence.
+
+        If graphs are captured, the second run captures the variant, and later runs replay it.
 
         Args:
             variant: key that identifies the launches.

@@ -1,7 +1,8 @@
 """Warp-level primitives for kernels.
 
-A warp has 32 lanes on a GPU and one lane on Warp's CPU device; kernels that use these functions run on both. Functions
-that exchange data must be called by all lanes of a warp. Native code snippets have one branch per device type.
+A warp has 32 lanes on a GPU and one lane on Warp's CPU device. Kernels that use these functions run on both devices.
+Functions that exchange data must be called by all lanes of a warp. Native code snippets have one branch per device
+type.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ return value;
 #endif
 """)
 def broadcast(value: wp.int32, source: wp.int32) -> wp.int32:
-    """Returns, in all lanes, the value from lane ``source``."""
+    """Returns the value from lane ``source``, in all lanes."""
     ...
 
 
@@ -128,7 +129,7 @@ either.number = x;
 return either.bits;
 """)
 def bits_of(x: wp.float32) -> wp.uint32:
-    """Returns a number's bit pattern; patterns of positive numbers sort in the same order as the numbers."""
+    """Returns a number's bit pattern. Patterns of positive numbers sort in the same order as the numbers."""
     ...
 
 

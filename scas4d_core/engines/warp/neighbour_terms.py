@@ -1,4 +1,4 @@
-"""Rigidity, isometry and rotation losses between neighbours, with gradients; reference: ``engines.torch.losses``."""
+"""Rigidity, isometry and rotation losses between neighbours, with gradients. Reference: ``engines.torch.losses``."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ def neighbour_terms(
     into full-size gradients.
 
     Args:
-        weights: [3] weights of rigidity, isometry and rotation per pair; 0 disables a loss.
-        samples: [samples, S] entries of the sampled Gaussians; shorter samples are padded with −1.
+        weights: [3] weights of rigidity, isometry and rotation per pair. A weight of 0 disables a loss.
+        samples: [samples, S] entries of the sampled Gaussians. Shorter samples are padded with −1.
         sample: [1] index of the current sample.
         sound: [M] 1 for entries with finite values, otherwise 0.
         neighbours: [M, k] neighbours of each Gaussian.
-        pair_weights: [M, k] weights of the pairs; 0 for unused pairs.
-        distances: [M, k] distances of the pairs in frame 0, in metres.
+        pair_weights: [M, k] weights of the pairs, which are 0 for unused pairs.
+        distances: [M, k] distances of the pairs when the graph was built, in metres.
         rows: [M] rows of the moving Gaussians in Θ_t.
         previous: [N] means of Θ_{t−1}.
         means: [N] deformed means.
         turns: [M] rotations since Θ_{t−1}.
-        tied_means, tied_turns: [M] gradients of means and rotations, accumulated.
+        tied_means, tied_turns: [M] outputs, gradients of means and rotations, accumulated.
         iteration: [1] row of ``losses`` for this iteration.
         losses: weighted losses of each iteration, to which the three losses are added.
     """

@@ -1,9 +1,8 @@
 """Image loss 0.8 L1 + 0.2 (1 − SSIM) of views, and its gradient. Reference: ``engines.torch.losses``.
 
 SSIM follows 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding. Each thread computes four pixels of
-a column. It filters the 14 rows of their windows horizontally, and accumulates each row for all four pixels. Windows
-are recomputed instead of stored, because arithmetic is cheap: the pixels of an entire image occupy only a tenth of a
-GPU.
+a column. It filters the 14 rows of their windows horizontally, and accumulates each row for all four pixels. Filtered
+rows are recomputed instead of stored. Arithmetic is cheap, because a single image occupies only a tenth of a GPU.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ return 1;
 #endif
 """)
 def leads() -> wp.int32:
-    """Returns 1 in the thread that receives the result of ``sum_over_block`` (every thread on the CPU device)."""
+    """Returns 1 in a thread with the result of ``sum_over_block`` (on the CPU device, every thread), otherwise 0."""
     ...
 
 
@@ -83,13 +82,13 @@ return value;
 #endif
 """)
 def sum_over_block(value: wp.vec3) -> wp.vec3:
-    """Returns the sum over a block in its first thread. All threads of the block must call this function."""
+    """Returns the sum over a block, in the block's first thread. All threads of the block must call this function."""
     ...
 
 
 @wp.struct
 class Place:
-    """The context of a loss thread: view, channel, image size, and first pixel."""
+    """Inputs of a thread that computes losses: view, channel, image size, first pixel, exposure and weight."""
 
     view: wp.int32
     channel: wp.int32
@@ -109,7 +108,7 @@ def place_of(
     cameras: wp.array[Camera], channels: wp.array[wp.int32], view: wp.array[wp.int32],
     exposures: wp.array2d[wp.vec2], weights: wp.vec4, channel: wp.int32, band: wp.int32, x: wp.int32,
 ) -> Place:  # fmt: skip
-    """Returns the context of a loss thread."""
+    """Returns the inputs of the thread for a channel, a band of ``ROWS`` rows, and a column."""
     here = Place()
     here.view = view[0]
     here.channel = channel
@@ -141,8 +140,9 @@ def target_moments(
     """Computes the windowed means of each target and of its square, with one thread per pixel.
 
     Args:
+        cameras, window, taps: see ``picture_loss``.
         targets: [views, 4, rows, columns] training images and masks.
-        means, squares: [views, 4, rows, columns] outputs; values outside an image stay unchanged.
+        means, squares: [views, 4, rows, columns] outputs. Values outside an image stay unchanged.
     """
     view, channel, y, x = wp.tid()
     camera = cameras[view]
@@ -193,6 +193,7 @@ def find_blank(cameras: wp.array[Camera], targets: wp.array4d[wp.float32], blank
     """Marks the tiles in which a target is zero everywhere, with one thread per tile.
 
     Args:
+        cameras: [views] cameras of all views.
         targets: [views, 4, rows, columns] training images and masks.
         blank: [views, tile rows, tile columns] output, 1 for blank tiles, otherwise 0.
     """
@@ -248,11 +249,13 @@ def picture_loss(
 ) -> None:
     """Accumulates a view's loss, and stores its derivatives with respect to the windowed quantities of SSIM.
 
-    Windows in which both rendering and target are zero have no loss. Their derivatives are neither written nor read.
+    Windows in which both rendering and target are zero have no loss. Unless ``everywhere`` is 1, their derivatives are
+    neither written nor read.
 
     The launch dimensions are [4, bands of ``ROWS`` rows, columns]. Each block covers one channel.
 
     Args:
+        cameras: [views] cameras of all views.
         channels: [views] number of channels of each target.
         view: [1] index of the view.
         record: [1] row of the log.
@@ -346,7 +349,7 @@ def picture_gradient(
     by_window: wp.array3d[wp.vec3],
     g_planes: wp.array3d[wp.float32],
 ) -> None:
-    """Computes the gradient of a view's loss with respect to the planes; launched like ``picture_loss``.
+    """Computes the gradient of a view's loss with respect to the planes. Launched like ``picture_loss``.
 
     Unless ``everywhere`` is 1, tiles with empty lists are not written, because no Gaussian has a gradient there.
 
@@ -355,7 +358,7 @@ def picture_gradient(
         weights: weight of each channel's mean loss, scaled by the factor on the gradient.
         everywhere: 1 to write all pixels, otherwise 0.
         by_window: output of ``picture_loss``.
-        g_planes: [4, rows, columns] output, gradient of the planes; 0 in channels that the target does not have.
+        g_planes: [4, rows, columns] output, gradient of the planes. It is 0 in channels that the target does not have.
     """
     channel, band, x = wp.tid()
     at = place_of(cameras, channels, view, exposures, weights, channel, band, x)

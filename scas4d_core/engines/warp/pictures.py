@@ -62,7 +62,7 @@ class PicturePass:
     Attributes:
         grad_means, grad_factors, grad_features: [N] gradients of type vec3, mat33 and vec4, filled by ``launch``.
         planes: [5, rows, columns] last rendering: RGB before exposure, label, and remaining transmittance.
-        exposures: [views, 4] vec2 gain and offset of each channel; may be changed between launches.
+        exposures: [views, 4] vec2 gain and offset of each channel. They may be changed between launches.
         log: [records, 8] float32 log; see ``layout`` for the columns.
         generation: number of times that buffers were reallocated.
     """
@@ -81,7 +81,7 @@ class PicturePass:
 
     @property
     def planes(self) -> wp.array:
-        """Channels of the last rendering; see the class attributes."""
+        """Channels of the last rendering. See the class attributes."""
         return self._rasterizer.planes
 
     @property
@@ -155,7 +155,7 @@ class PicturePass:
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array, weight: float, *, add: bool, grad_features: wp.array | None = None,
     ) -> None:  # fmt: skip
-        """Runs ``measure``, and backpropagates the losses to the Gaussians.
+        """Renders a view like ``measure``, and backpropagates its losses to the Gaussians.
 
         Args:
             view, record, means, factors, opacities, features: see ``measure``.
@@ -172,7 +172,7 @@ class PicturePass:
         rasterizer.carry_to_world(cameras, view, means, factors, *gradients, add=add)
 
     def keep(self, view: wp.array, slot: wp.array) -> None:
-        """Stores the last rendering, subsampled, in a slot. Both arguments are [1] int32 arrays."""
+        """Copies the last rendering, subsampled, to a slot. Both arguments are [1] int32 arrays."""
         inputs = [self._loss.cameras, view, slot, self.planes, self._kept]
         wp.launch(keep_picture, self._kept.shape[1:], inputs, device=self._device)
 

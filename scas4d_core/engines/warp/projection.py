@@ -39,7 +39,7 @@ def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.floa
 
 @wp.func
 def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
-    """Returns the sum of the absolute values of a Gaussian's parameters; NaN or infinite if any of them is."""
+    """Returns the sum of the absolute values of a Gaussian's parameters. It is not finite if any parameter is not."""
     size = wp.abs(mean[0]) + wp.abs(mean[1]) + wp.abs(mean[2]) + wp.abs(opacity)
     for row in range(3):
         size += wp.abs(factor[row, 0]) + wp.abs(factor[row, 1]) + wp.abs(factor[row, 2])
@@ -132,7 +132,7 @@ def project(
     starts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Projects N Gaussians with one thread each, and counts the entries of each tile list; launched in whole warps.
+    """Projects N Gaussians with one thread each, and counts the entries of each tile list. Launched in whole warps.
 
     Args:
         raster: rasterizer constants.
@@ -148,7 +148,7 @@ def project(
         records: [4 N] gradient records, reset to 0.
         guard_counts: [3] number of times each guard in ``COUNTED_GUARDS`` was triggered, accumulated.
         tile_counts: [tiles] number of entries in each list, accumulated.
-        starts, keys: list buffers; unused.
+        starts, keys: arguments for ``enter_lists``, which does not use them while counting.
     """
     i = wp.tid()
     camera = cameras[view[0]]

@@ -1,4 +1,4 @@
-"""Kernel functions for quaternions (w, x, y, z) stored as ``wp.vec4``; reference: ``engines.torch.deformation``."""
+"""Kernel functions for quaternions (w, x, y, z) stored as ``wp.vec4``. Reference: ``engines.torch.deformation``."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def conjugate(q: wp.vec4) -> wp.vec4:
 def product(a: wp.vec4, b: wp.vec4) -> wp.vec4:
     """Returns the Hamilton product, i.e. rotation b followed by rotation a.
 
-    The product is linear in both factors. If g is the gradient of the product, the gradients of a and b are g b̄ and ā
-    g.
+    The product is linear in both factors. If g is the gradient of the product, the gradient of a is g b̄, and the
+    gradient of b is ā g.
     """
     u = vector_of(a)
     v = vector_of(b)
@@ -50,7 +50,7 @@ def of_tangent_backward(r: wp.vec3, g: wp.vec4) -> wp.vec3:
 
 @wp.func
 def change_of(q: wp.vec4, v: wp.vec3) -> wp.vec3:
-    """Returns R v − v for the rotation R of a unit quaternion; the result is exactly 0 for the identity."""
+    """Returns R v − v for the rotation R of a unit quaternion. The result is exactly 0 for the identity."""
     u = vector_of(q)
     across = wp.cross(u, v)
     return 2.0 * (q[0] * across + wp.cross(u, across))

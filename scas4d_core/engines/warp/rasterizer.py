@@ -1,4 +1,4 @@
-"""Rasterizer: buffers for one image, and kernel launches that render the image and backpropagate its gradient.
+"""Rasterizer, which launches the kernels that render an image and backpropagate its gradient, and owns their buffers.
 
 Except for ``resize`` and ``grow``, no method waits for the device or allocates memory, so all other methods can be
 captured in a CUDA graph.
@@ -19,11 +19,11 @@ LEAST_CAPACITY = 1 << 16
 TILES_EACH = 8
 """Initial tile-list capacity per Gaussian. On average, a Gaussian intersects two to four tiles."""
 WARPS_EACH = 24
-"""Number of warps per multiprocessor that blend segments; there are not enough registers for more."""
+"""Number of warps per multiprocessor that blend segments. There are not enough registers for more."""
 
 
 class Rasterizer:
-    """Renders images of a fixed number of Gaussians.
+    """Rasterizer for images of a fixed number of Gaussians.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -41,7 +41,7 @@ class Rasterizer:
         items: [capacity] Gaussian of each tile-list entry.
         tiles_x: number of tile columns.
         guard_counts: [3] number of times each guard in ``projection.COUNTED_GUARDS`` was triggered.
-        capacity: maximum number of tile-list entries; an image that needs more is rendered empty (see ``grow``).
+        capacity: maximum number of tile-list entries. An image that needs more is rendered empty (see ``grow``).
     """
 
     def __init__(self, device: str, count: int, limits: Limits = DEFAULT, detached: bool = False) -> None:
@@ -76,7 +76,7 @@ class Rasterizer:
         self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
 
     def draw_fewer(self, count: int) -> None:
-        """Sets the number of Gaussians, which must not exceed the size of the buffers."""
+        """Sets the number of Gaussians to render, which must not exceed the size of the buffers."""
         self.count = self._raster.count = count
 
     def holds(self, columns: int, rows: int) -> bool:

@@ -1,4 +1,4 @@
-"""GPU renderer: the ``Renderer`` of the Warp engine."""
+"""GPU renderer, which renders states with the kernels of the Warp engine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scas4d_core.guards import FEATURE_CEILING
 
 Array = NDArray[np.float32]
 PADDING = 32
-"""``reached`` pads image sizes to a multiple of this number of pixels."""
+"""Tile size in pixels. ``reached`` pads images to a multiple of this size."""
 
 
 class WarpRenderer:

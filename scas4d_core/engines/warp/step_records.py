@@ -1,4 +1,4 @@
-"""Values that change between iterations of a captured graph. The host writes them; kernels read them on the device."""
+"""Values that change between iterations of a captured graph. The host writes them, and kernels read them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import warp as wp
 from scas4d_core.engines.warp.adam import SCALARS
 
 WEIGHTS = 3
-"""Number of scalars that precede the optimizer scalars: weights of rigidity, isometry and rotation per neighbour
-pair."""
+"""Number of scalars that precede the optimizer scalars: the weights of rigidity, isometry and rotation per pair."""
 VIEW_COLUMNS = 3
 """Number of integers per view: index of the view, row of the log, and slot of the kept rendering."""
 
 
 class StepRecords:
-    """One record on the device, and a ring buffer of host records from which it is filled without waiting.
+    """One record in device memory, which is filled from a ring buffer in host memory without waiting for the device.
 
     Args:
         device: Warp device.
@@ -44,12 +43,12 @@ class StepRecords:
         self.weights = self._scalars[:WEIGHTS]
 
     def optimizer(self, place: int) -> wp.array:
-        """Returns the scalars of an optimizer, [``SCALARS``]."""
+        """Returns the scalars [``SCALARS``] of the optimizer with index ``place``."""
         first = WEIGHTS + SCALARS * place
         return self._scalars[first : first + SCALARS]
 
     def view(self, place: int) -> tuple[wp.array, wp.array, wp.array]:
-        """Returns the integers of one of the iteration's views, as [1] arrays; see ``VIEW_COLUMNS``."""
+        """Returns the integers of the iteration's view with index ``place``, as [1] arrays. See ``VIEW_COLUMNS``."""
         first = 2 + VIEW_COLUMNS * place
         view, record, slot = (self._integers[k : k + 1] for k in range(first, first + VIEW_COLUMNS))
         return view, record, slot
@@ -57,7 +56,7 @@ class StepRecords:
     def write(
         self, sample: int, iteration: int, views: Sequence[tuple[int, int, int]], scalars: Sequence[float]
     ) -> None:
-        """Enqueues a record.
+        """Writes a record to the ring buffer, and enqueues its upload.
 
         Args:
             sample: index of the neighbour sample.

@@ -2,7 +2,8 @@
 
 A splat consists of two rows of ``splats`` [2 N]: (mean x, mean y, conic a, conic b) and (conic c, ln opacity, reach,
 depth). Its support is the set of points whose squared Mahalanobis distance from the mean is at most the reach. The
-reach is slightly enlarged so that rounding never culls pixels that blending would cover. It is 0 for culled Gaussians.
+reach is slightly enlarged to prevent rounding from culling pixels that blending would cover. It is 0 for culled
+Gaussians.
 """
 
 from __future__ import annotations

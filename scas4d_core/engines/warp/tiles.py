@@ -79,7 +79,7 @@ def scan_lists(
     thread: wp.int32, capacity: wp.int32, length: wp.int32, counts: wp.array[wp.int32], starts: wp.array[wp.int32],
     segment_starts: wp.array[wp.int32],
 ) -> wp.float32:  # fmt: skip
-    """Implements ``place_lists``. All threads of one block must call this function."""
+    """Implements ``place_lists`` and returns the value for ``PAIRS``. All threads of the block must call it."""
     ...
 
 
@@ -93,7 +93,7 @@ def place_lists(
     record: wp.array[wp.int32],
     log: wp.array2d[wp.float32],
 ) -> None:
-    """Computes the first entry and the first segment of each list; launched as one block.
+    """Computes the first entry and the first segment of each list. Launched as one block.
 
     Args:
         threads: number of threads in the block, 1 on the CPU device.
@@ -122,7 +122,7 @@ def fill_lists(
     tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Writes the list entries in arbitrary order, with one thread per Gaussian; launched in whole warps.
+    """Writes the list entries in arbitrary order, with one thread per Gaussian. Launched in whole warps.
 
     Args:
         raster: rasterizer constants.
@@ -130,8 +130,8 @@ def fill_lists(
         view: [1] index of the view.
         splats, boxes: outputs of ``projection.project``.
         starts: [tiles + 1] output of ``place_lists``.
-        tile_counts: [tiles] initially 0; incremented to the number of entries in each list.
-        keys: [capacity] output, depth and row of each entry; sorting the keys orders entries by depth, then by row.
+        tile_counts: [tiles] counters, initially 0, incremented to the number of entries in each list.
+        keys: [capacity] output, depth and row of each entry. Sorting the keys orders entries by depth, then by row.
     """
     i = wp.tid()
     drawn = wp.int32(0)
@@ -184,7 +184,7 @@ for (int i = 0; i < count; ++i) items.data[first + i] = (int)(list[i] & 0xffffff
 def sort_list(
     thread: wp.int32, first: wp.int32, count: wp.int32, keys: wp.array[wp.uint64], items: wp.array[wp.int32]
 ) -> None:
-    """Sorts a list. All threads of a block must call this function; on the CPU device, a block is a single thread."""
+    """Sorts a list and writes its items. All threads of a block (one on the CPU device) must call this function."""
     ...
 
 
@@ -204,7 +204,7 @@ def sort_lists(
         threads: number of threads per block, 1 on the CPU device.
         starts, segment_starts: [tiles + 1] outputs of ``place_lists``.
         tile_counts: [tiles] number of entries in each list, reset to 0.
-        keys: [capacity] output of ``fill_lists``; its order is undefined afterwards.
+        keys: [capacity] output of ``fill_lists``. Its order is undefined afterwards.
         items: [capacity] output, Gaussian of each entry.
         segment_tiles: [segments] output, tile of each segment.
     """
@@ -231,7 +231,7 @@ def mark_blocks(
     """Marks the blocks of pixels that the supports of Gaussians intersect, with one thread per Gaussian.
 
     Args:
-        side: side length of a block in pixels; must divide the side length of a tile.
+        side: side length of a block in pixels, which must divide the side length of a tile.
         cameras: [1] camera of the image.
         splats, boxes: outputs of ``projection.project``.
         marks: [block rows, block columns] output, set to 1 for marked blocks and otherwise unchanged.
