@@ -141,7 +141,7 @@ def extrapolate_numbers(
 class WarpRenderer:
     """The ``Renderer`` implementation in NVIDIA Warp. Each call waits for the result.
 
-    The states and training images that were used last stay on the device (``DeviceCopies``, ``PictureLoss``).
+    States that were used last stay on the device (``DeviceCopies``), as do the images that an engine has loaded.
 
     Args:
         background: background colour, RGB in 0…1.
@@ -163,10 +163,9 @@ class WarpRenderer:
         self.device, self.limits, self.background = device, limits, background
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
-        self._loaded: dict[str, TrainingView] = {}
         self._copies, self._downloads = copies_on(device), Downloads(device)
         self._rasterizer = Rasterizer(device, 0, limits)
-        self._first, self._view = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
         self._log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
 
@@ -203,7 +202,7 @@ class WarpRenderer:
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
         self._render_view(state, view)
-        self._loss.measure(self._view, self._first, self._rasterizer, self._behind, self._log)
+        self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
         log = self._downloads.read(self._log)[0][0].astype(float)
         red, green, blue = log[SHIFT : SHIFT + 3].tolist()
         psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
@@ -228,7 +227,7 @@ class WarpRenderer:
         sums = wp.zeros(count, dtype=wp.vec4, device=self.device)
         for view in views:
             features, rasterizer = self._render_view(state, view), self._rasterizer
-            target = [loss.cameras, self._view, loss.exposures, loss.targets]
+            target = [loss.cameras, self._first, loss.exposures, loss.targets]
             inputs = [*target, rasterizer.planes, most, rasterizer.g_planes]
             wp.launch(weigh_residuals, rasterizer.g_planes.shape, inputs, device=self.device)
             rasterizer.carry_back(self._camera(view.camera), self._first, features)
@@ -277,7 +276,8 @@ class WarpRenderer:
         features = np.asarray(features, np.float32)
         groups = [features[:, first : first + CHANNELS] for first in range(0, features.shape[1], CHANNELS)]
         uploaded = [wp.array(np.ascontiguousarray(group), dtype=wp.vec4, device=self.device) for group in groups]
-        return uploaded, (np.abs(features) <= FEATURE_CEILING).all(axis=1)
+        sound = np.asarray(np.abs(features) <= FEATURE_CEILING).all(axis=1)
+        return uploaded, np.asarray(sound)
 
     def _project(
         self,
@@ -312,9 +312,7 @@ class WarpRenderer:
         features = features_seen(self._copies, state, cameras)
         self._project(state, view.camera, cameras, [features])
         self._draw(cameras, features, self._background)
-        self._loaded[view.name] = view  # replaces the camera's image of the previous frame
-        self._loss.load(list(self._loaded.values()))
-        self._view.fill_(list(self._loaded).index(view.name))
+        self._loss.load([view])
         return features
 
     def _sums(self, state: Gaussians, cameras: wp.array, features: wp.array) -> Array:
