@@ -103,14 +103,14 @@ class Reconstruction(CommittedScene):
         """
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
-        super().__init__(history, world, limits)
+        self.device = resolve_device(settings.device)
+        super().__init__(history, world, limits, self.device)
         self.calibrated = rig = effective_rig(
             rig, history.first_report if found is None else {"calibration": asdict(found)}
         )
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
-        self.device = resolve_device(settings.device)
         self._renderer = renderer_of(self.device, settings.scene.background_rgb, limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._renderer)
         self.static: StaticResult | None = None

@@ -24,6 +24,10 @@ class SceneEstimate(Model):
     worker_mb: float = Field(description="Peak memory of the worker process.")
     readers_mb: float = Field(description="Memory of the two reader processes, excluding queries over many frames.")
     memory_mb: float = Field(description="Total memory of all processes of the scene.")
+    gpu_mb: float = Field(
+        description="GPU memory of the worker and of the reader that renders views, if the scene runs on a GPU; 0 for "
+        "`device: cpu`."
+    )
     limit_mb: float = Field(description="Memory limit per scene on this service.")
     state_mb: float = Field(description="Disk space per exact state; older states take a twentieth of it.")
     history_mb: float = Field(description="Reader memory per frame for a query over all Gaussians.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import log10
 from typing import NamedTuple, Protocol
 
@@ -19,6 +20,9 @@ CHANNELS = 4
 """Number of feature channels rendered per pass: red, green, blue, label."""
 BLOCK = 4
 """Side length in pixels of the blocks in ``Renderer.reached``."""
+PRIOR_PIXELS = 1.0
+"""Number of pixels added to each Gaussian's blending weight in ``Renderer.step_colours``, so that barely visible
+Gaussians keep their colours."""
 
 
 class Picture(NamedTuple):
@@ -103,7 +107,7 @@ class Renderer(Protocol):
                 channels.
         """
 
-    def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
+    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """Renders a state and compares it with the training image of a view; see ``render``."""
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
@@ -112,10 +116,37 @@ class Renderer(Protocol):
         P is at most 4. For a plane of ones, the sum is the Gaussian's total blending weight, in pixels.
         """
 
+    def step_colours(
+        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+    ) -> Gaussians:
+        """Returns a state whose colours are corrected by the mean residual, weighted by blending weights.
+
+        The residual of a pixel is the training image minus the rendering, before exposure.
+
+        Args:
+            state: Gaussians to render.
+            views: training views over which the mean is taken.
+            learnt: [N] mask that is 1 for Gaussians whose colours are corrected, and 0 for all others.
+            most: magnitude to which residuals are clipped; RGB values are in 0…1.
+        """
+
+    def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+        """Returns a state moved further along its motion; see ``extrapolated``."""
+
+    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
+        """Returns a mask [h, w] of the ``BLOCK``-pixel blocks that the supports of moving Gaussians intersect.
+
+        The mask covers the image padded to a multiple of 32 pixels.
+        """
+
+
+class ResidualRenderer(Protocol):
+    """Renderer that computes the residuals of one view at a time."""
+
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """Sums the residuals (training image minus rendering), weighted by each Gaussian's blending weights.
+        """Sums the residuals of a view, weighted by each Gaussian's blending weights.
 
         Args:
             state: Gaussians to render.
@@ -127,8 +158,33 @@ class Renderer(Protocol):
             [N, 3] weighted sums of the RGB residuals before exposure, and [N] sums of the weights, in pixels.
         """
 
-    def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """Returns a mask [h, w] of the ``BLOCK``-pixel blocks that the supports of the Gaussians ``rows`` intersect.
 
-        The mask covers the image padded to a multiple of 32 pixels.
-        """
+def colour_step(
+    renderer: ResidualRenderer,
+    state: Gaussians,
+    views: Sequence[TrainingView],
+    learnt: NDArray[np.uint8],
+    most: float,
+) -> Gaussians:
+    """Implements ``Renderer.step_colours`` for renderers that compute residuals on the host."""
+    sums, weights = np.zeros((len(state), 3)), np.full(len(state), PRIOR_PIXELS)
+    for view in views:
+        more, seen = renderer.residuals(state, view, learnt, most)
+        sums += more
+        weights += seen
+    return state.replace(colours=state.colours + (sums / weights[:, None]).astype(np.float32))
+
+
+def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+    """Returns a state moved further along the motion between two states; only means and factors change.
+
+    Args:
+        before: state Θ_{t−1}.
+        after: state Θ_t of the same Gaussians.
+        share: share of the motion to add; negative values move the state back.
+    """
+    rows = np.flatnonzero(after.moving)
+    arrays = {name: getattr(after, name).copy() for name in ("means", "factors")}
+    for name, array in arrays.items():
+        array[rows] += np.float32(share) * (getattr(after, name)[rows] - getattr(before, name)[rows])
+    return after.replace(**arrays)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.engines.choose import Device
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query import parts as parts_of_history
@@ -41,11 +42,16 @@ class CommittedScene:
     array([[0.9]])
     """
 
-    def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT) -> None:
+    def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT, device: Device = "cpu") -> None:
         self.history = history
         self.world = world
         self._limits = limits
-        self._view = ViewRenderer(world, limits)
+        self._view = ViewRenderer(world, limits, device)
+
+    @property
+    def view_device(self) -> Device:
+        """Device that currently renders views."""
+        return self._view.device
 
     def render(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
-from scas4d_core.engines.choose import renderer_of
+from scas4d_core.engines.choose import Device, renderer_of
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import CHANNELS
 from scas4d_core.engines.views import LABEL, CameraArrays
@@ -17,6 +18,8 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
 
 Array = NDArray[np.float32]
+
+log = logging.getLogger("scas4d.renderer")
 
 MAX_LABEL = 254
 """Largest part label. A part is stored in 8 bits as 1 + its label, and 0 means no part."""
@@ -51,6 +54,11 @@ class ViewRenderer:
     Args:
         world: transform from the user's world to the internal world of the states.
         limits: rasterizer constants.
+        device: device that renders. If a GPU fails, for example because its memory is full, the CPU renders instead.
+
+    Attributes:
+        world: same as the argument.
+        device: device that currently renders.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
@@ -62,9 +70,14 @@ class ViewRenderer:
     array([0. , 0.9, 0. ], dtype=float32)
     """
 
-    def __init__(self, world: WorldFrame, limits: Limits = DEFAULT) -> None:
+    def __init__(self, world: WorldFrame, limits: Limits = DEFAULT, device: Device = "cpu") -> None:
         self.world = world
-        self._renderer = renderer_of("cpu", (0.0, 0.0, 0.0), limits)
+        self._limits = limits
+        self._use(device)
+
+    def _use(self, device: Device) -> None:
+        self.device = device
+        self._renderer = renderer_of(device, (0.0, 0.0, 0.0), self._limits)
 
     def render(
         self,
@@ -88,6 +101,23 @@ class ViewRenderer:
         Raises:
             ValueError: if the labels have the wrong shape or are out of range.
         """
+        try:
+            return self._render(gaussians, camera, background, colours, labels)
+        except RuntimeError as error:  # raised by NVIDIA Warp if memory is full or the GPU fails
+            if self.device == "cpu":
+                raise
+            log.warning("the GPU could not render a view; views are now rendered on the CPU: %s", error)
+            self._use("cpu")
+            return self._render(gaussians, camera, background, colours, labels)
+
+    def _render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        background: tuple[float, float, float],
+        colours: Array | None,
+        labels: NDArray[Any] | None,
+    ) -> View:
         inside = self.world.camera_to_inside(camera)
         arrays = CameraArrays.of(inside)
         picture = self._renderer.render(

@@ -155,7 +155,8 @@ def record_timing(
     views = [one for one in result.views if one.name in trace.shown and one.name not in trace.left_out]
     views = [one for one in views if not past.is_left_out(one.name)]
     views.sort(key=lambda one: looks.get(one.name, CameraTimingSums()).last)  # least recently measured first
-    (ahead, back), most = half_frame_states(before, after), max(1, min(LOOKS, trace.iterations // ITERATIONS))
+    ahead, back = (renderer.extrapolate(before, after, share) for share in (HALF, -HALF))
+    most = max(1, min(LOOKS, trace.iterations // ITERATIONS))
     for view in views[:most]:
         every, planes = trace.shown[view.name]
         # if the end was kept, its rendering exists already
@@ -173,19 +174,6 @@ def record_timing(
 def astuple(looks: CameraTimingSums) -> Row:
     """Returns the sums as a row of ``Past.timing``."""
     return looks.weight, looks.squares, looks.offset, looks.spread, looks.frame, looks.last
-
-
-def half_frame_states(before: Gaussians, after: Gaussians) -> tuple[Gaussians, Gaussians]:
-    """Returns Θ_t extrapolated by half a frame forward and backward; only means and factors change."""
-    rows = np.flatnonzero(after.moving)
-    ways = [(name, HALF * (getattr(after, name)[rows] - getattr(before, name)[rows])) for name in ("means", "factors")]
-    states = []
-    for sign in (1, -1):
-        arrays = {name: getattr(after, name).copy() for name, _ in ways}
-        for name, way in ways:
-            arrays[name][rows] += np.float32(sign) * way
-        states.append(after.replace(**arrays))
-    return states[0], states[1]
 
 
 def _rendered(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:

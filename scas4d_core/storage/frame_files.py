@@ -167,7 +167,7 @@ class FrameFiles:
                     return self._from_chunk(index, names, optional)
                 self.faults[self.path(index).name] = str(error)
                 if index in self.chunks:  # the file was rewritten or not yet deleted; fall back to the chunk
-                    return self.chunks.read(index, names, optional)
+                    return self._from_chunk(index, names, optional)
                 raise
             arrays = _read(self.first_copy, names, optional)
             self.faults[self.path(index).name] = _reason(self.path(index), error)

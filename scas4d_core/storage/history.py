@@ -111,7 +111,7 @@ class History(HistoryReader):
         copy = History(directory)
         for index in sorted(set(indices)):
             arrays, log = self.gaussians(index).arrays(), self.log_at(index)
-            frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
+            frame = {name: _owned(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
             births = {birth[0]: self._born(birth) for birth in births_in(log)}
             text, left = json.dumps(self.report(index)), self._left(index)
             copy._write(index, self._times[index], frame, text, log, births, self._fixed, left)
@@ -136,7 +136,7 @@ class History(HistoryReader):
             index: frame index, greater than all previous indices.
             time: time of the frame in seconds.
             gaussians: state with the same ids and opacities as the previous frame. Additional rows are newborn
-                Gaussians without ids; their ids are assigned here. The arrays are copied.
+                Gaussians without ids; their ids are assigned here. Writable arrays are copied.
             report: report as JSON values (finite numbers, strings, lists, mappings).
             parents: [B] row of each newborn Gaussian's parent, or None if no newborn Gaussian has a parent.
             roots: roots of all Gaussians (``births.extend_roots``), or None if newborn Gaussians are their own roots.
@@ -157,7 +157,7 @@ class History(HistoryReader):
             ) from error
         self.record_seconds = perf_counter() - began
         arrays, before = gaussians.arrays(), self._events()
-        fixed = self._fixed_after(births_in(before)) if self._fixed else {n: np.array(arrays[n]) for n in FIXED}
+        fixed = self._fixed_after(births_in(before)) if self._fixed else {n: _owned(arrays[n]) for n in FIXED}
         count, rows = len(fixed["ids"]), len(arrays["ids"])
         for name in FIXED:
             if not np.array_equal(arrays[name][:count], fixed[name]):
@@ -171,7 +171,7 @@ class History(HistoryReader):
                 raise HistoryError(
                     f"frame {index}: {name} has {len(arrays[name])} rows; expected {rows}, one per Gaussian"
                 )
-        frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
+        frame = {name: _owned(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         births: dict[int, Arrays] = {}
         ids = fixed["ids"]
         if rows > count:
@@ -380,3 +380,8 @@ class History(HistoryReader):
         self._stamps[index] = self._files.write(index, frame_file_arrays(frame, time, text, log, pack_effects(effects)))
         self.damaged.pop(index, None)
         self._times = dict(sorted([*self._times.items(), (index, float(time))]))
+
+
+def _owned(array: NDArray[Any]) -> NDArray[Any]:
+    """Returns the array if it owns its memory and is read-only, otherwise a copy."""
+    return array if array.base is None and not array.flags.writeable else np.array(array)

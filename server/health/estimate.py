@@ -34,6 +34,16 @@ GAUSSIAN = 2200
 """Bytes per Gaussian in the worker: state, deformation layers, Adam moments, neighbors and render buffers."""
 READ_GAUSSIAN = 500
 """Bytes per Gaussian in a reader."""
+GPU_CONTEXT = 500e6
+"""Bytes of GPU memory for the CUDA context and kernels of a process."""
+GPU_BASE = 40e6
+"""Bytes of GPU memory for buffers whose size depends neither on the images nor on the Gaussians."""
+GPU_PIXEL = 120
+"""Bytes of GPU memory per scaled pixel: the training images, SSIM's moments and buffers for the gradients."""
+GPU_GAUSSIAN = 4000
+"""Bytes of GPU memory per Gaussian in the worker, including frame 0."""
+GPU_READ_GAUSSIAN = 600
+"""Bytes of GPU memory per Gaussian in the reader that renders views."""
 STATE = 81
 """Bytes on disk per Gaussian and frame."""
 HISTORY = 28
@@ -69,6 +79,7 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
     pictures = pixels * PIXEL + scaled * (SCALED_PIXEL + NOVEL_PIXEL * bears)
     worker = PROCESS + pictures + gaussians * GAUSSIAN + VOXELS * bears
     readers = 2 * (PROCESS + gaussians * READ_GAUSSIAN)
+    gpu = 2 * (GPU_CONTEXT + GPU_BASE) + scaled * GPU_PIXEL + gaussians * (GPU_GAUSSIAN + GPU_READ_GAUSSIAN)
     limit = machine_mb() if server.max_scene_memory_mb is None else server.max_scene_memory_mb
     in_mb = {
         "pictures_mb": pictures,
@@ -76,6 +87,7 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
         "worker_mb": worker,
         "readers_mb": readers,
         "memory_mb": worker + readers,
+        "gpu_mb": 0.0 if settings.device == "cpu" else gpu,
         "state_mb": gaussians * STATE,
         "history_mb": gaussians * HISTORY,
     }

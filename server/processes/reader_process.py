@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from client.wire import GaussianModel, GaussiansModel, part_colour, parts_model
+from scas4d_core.engines.choose import Device, DeviceError, resolve_device
 from scas4d_core.engines.limits import rig_limits
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.storage.frame_files import frame_file
@@ -66,7 +67,7 @@ log = logging.getLogger("scas4d.renderer")
 
 def run_view_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Entry point of the process for views, which runs until it is asked to stop or the service exits."""
-    _serve(spec, connection)
+    _serve(spec, connection, view_device(spec))
 
 
 def run_bulk_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
@@ -74,12 +75,21 @@ def run_bulk_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os.nice(BULK_NICE)
     for left in spec.folder.path.glob(f"{EXPORT}.*"):  # files left by a process that was killed during a query
         left.unlink(missing_ok=True)
-    _serve(spec, connection)
+    _serve(spec, connection, "cpu")  # renders too rarely to occupy memory on a GPU
 
 
-def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+def view_device(spec: SceneSpec) -> Device:
+    """Returns the device that renders the views of a scene."""
+    try:
+        return resolve_device(spec.settings.device)
+    except DeviceError as error:  # the scene was created on a machine with a GPU
+        log.warning("scene %s: views are rendered on the CPU: %s", spec.folder.name, error)
+        return "cpu"
+
+
+def _serve(spec: SceneSpec, connection: Connection[Any, Any], device: Device) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    renderer = QueryReader(spec)
+    renderer = QueryReader(spec, device)
     while True:
         try:
             message = connection.recv()
@@ -97,10 +107,15 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class QueryReader:
-    """Reader that answers queries about committed states, one at a time."""
+    """Reader that answers queries about committed states, one at a time.
 
-    def __init__(self, spec: SceneSpec) -> None:
-        self.spec = spec
+    Args:
+        spec: scene specification.
+        device: device that renders.
+    """
+
+    def __init__(self, spec: SceneSpec, device: Device = "cpu") -> None:
+        self.spec, self.device = spec, device
         self._stale: set[int] | None = set()
         self._history: History | None = None
         self._reader: CommittedScene | None = None
@@ -127,7 +142,7 @@ class QueryReader:
             settings, rig = self.spec.settings.scene, self.spec.rig
             world = rig.world_frame(settings.metres_per_unit)
             limits = rig_limits(settings.near, world, rig.cameras)
-            self._reader = CommittedScene(history, world, limits)
+            self._reader = CommittedScene(history, world, limits, self.device)
         return self._reader
 
     def labels(self, count: int | None) -> NDArray[np.int64]:

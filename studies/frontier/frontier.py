@@ -99,7 +99,10 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     "views": (
         _changed("2 views", "update.views", 2),
         _changed("4 views", "update.views", 4),
-        Variant("50 iterations of 2 views", iterations=50, changes=("update.views=2",)),
+        *(
+            Variant(f"{count} iterations of {views} views", iterations=count, changes=(f"update.views={views}",))
+            for views, count in ((2, 50), (4, 50), (4, 25))
+        ),
     ),
     "gaussians": tuple(
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)

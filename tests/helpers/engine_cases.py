@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.engines.choose import WARP_DEVICE
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables, UpdateEngine
@@ -109,6 +111,17 @@ def moved(state: Gaussians) -> Gaussians:
     middle = means[60:120].mean(axis=0)
     means[60:120] = (means[60:120] - middle) @ turn.T + middle
     return state.replace(means=means, colours=np.float32(1.04) * state.colours)
+
+
+def assert_repeated(mine: object, true: object) -> None:
+    """Asserts that a computation gave the same result twice: the same bits on a CPU, nearly the same on a GPU.
+
+    On a GPU, the order of atomic sums is not fixed.
+    """
+    if os.environ.get(WARP_DEVICE, "cpu") == "cpu":
+        assert np.array_equal(np.asarray(mine), np.asarray(true))
+    else:
+        assert apart(np.asarray(mine, np.float64), np.asarray(true, np.float64)) < 0.01
 
 
 def apart(mine: np.ndarray, true: np.ndarray) -> float:

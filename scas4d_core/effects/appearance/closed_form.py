@@ -28,8 +28,6 @@ SUBSETS = 6
 MOST = 0.2
 """Limit on the residual of a pixel, RGB in 0…1; larger differences are not due to lighting. On `visit`, in which
 a ball enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
-FEW = 1.0
-"""Number of pixels added to each Gaussian's blending weight, so that barely visible Gaussians keep their colours."""
 
 
 def follow_pictures(
@@ -45,13 +43,7 @@ def follow_pictures(
     """
     views = from_all_sides(views)
     for first in range(min(SUBSETS, len(views))):
-        sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
-        for view in views[first::SUBSETS]:
-            more, seen = renderer.residuals(state, view, learnt, MOST)
-            sums += more
-            weights += seen
-        step = (sums / weights[:, None]).astype(np.float32)
-        state = state.replace(colours=state.colours + step)
+        state = renderer.step_colours(state, views[first::SUBSETS], learnt, MOST)
     return state
 
 

@@ -86,13 +86,14 @@ class Direction(Effect):
         if seen.before.gloss is None:
             return None
         state = seen.result.gaussians
+        matte = state.replace(gloss=None, environment=None)
         chosen = set(spread_cameras(seen.rig, [view.name for view in seen.views], FEW))
         left = np.zeros(2)
         for view in seen.views:
             if view.name not in chosen:
                 continue
-            for which, features in enumerate((state.features(state.colours), None)):
-                left[which] += 10 ** (-seen.renderer.compare(state, view, features).psnr / 10)
+            for which, shown in enumerate((matte, state)):
+                left[which] += 10 ** (-seen.renderer.compare(shown, view).psnr / 10)
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))
         return Evidence(share, f"view-dependent colour explains {100 * share:.0f} % of the residual")
 

@@ -127,7 +127,7 @@ def _compared(
 def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray[np.bool_]:
     """Returns the [h, w] mask of squares that moving Gaussians reach."""
     height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
-    blocks = renderer.reached(state, np.flatnonzero(state.moving), view.camera)
+    blocks = renderer.reached(state, view.camera)
     grid = blocks[: height * each, : width * each]
     return np.asarray(grid.reshape(height, each, width, each).any(axis=(1, 3)))
 

@@ -162,8 +162,9 @@ def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> l
     state = seen.result.gaussians
     known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
-    colours = state.colours.copy()
-    colours[: len(seen.before)] = seen.before.colours
+    colours = seen.before.colours
+    if len(state) > len(colours):
+        colours = np.concatenate([colours, state.colours[len(colours) :]])
     new_things = measure_novelty(state, colours, missing, seen.rig, seen.renderer)
     known.update({view.name: one for view, one in zip(missing, new_things, strict=True)})
     return [known[view.name] for view in views]

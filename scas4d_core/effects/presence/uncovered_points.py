@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
+from scas4d_core.engines.views import LABEL
 from scas4d_core.posed_pictures import pixels_inside
 
 if TYPE_CHECKING:
@@ -82,10 +83,9 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
 
 def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
     """Returns the [P, 3] points of a camera's bare pixels."""
-    features = np.zeros((len(standing), 4), np.float32)
-    planes, rest = renderer.render(standing, one.view.camera, features, depth_channel=0)
+    planes, rest = renderer.render(standing, one.view.camera, depth_channel=LABEL)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = (1 - rest) / planes[0]
+        inverse = (1 - rest) / planes[LABEL]
     known = (rest < OPAQUE) & one.behind & np.isfinite(inverse)
     regions, count = label(one.bare, np.ones((3, 3)))
     points = []

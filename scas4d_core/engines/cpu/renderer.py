@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,7 +12,7 @@ from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture, psnr_of
+from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture, colour_step, extrapolated, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import image_loss, tiles
@@ -88,10 +88,9 @@ class CpuRenderer:
         given = (state.means, state.factors, state.opacities, shown, camera, background)
         return self.rasterizer.forward(*given, depth_channel)
 
-    def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
+    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
-        shown = features_seen(state, view.camera) if features is None else features
-        self.forward(state.means, state.factors, state.opacities, shown, view)
+        self.forward(state.means, state.factors, state.opacities, features_seen(state, view.camera), view)
         return Comparison(self.psnr, self.image_part, self.colour_shift(view))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
@@ -107,7 +106,7 @@ class CpuRenderer:
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``."""
+        """See ``ResidualRenderer.residuals``."""
         tiles_x, tiles_y = tile_grid(view.camera)
         drawing = Drawing(np.full(tiles_x * tiles_y, 2**64 - 1, np.uint64), learnt)
         shown = features_seen(state, view.camera)
@@ -115,8 +114,19 @@ class CpuRenderer:
         self.rasterizer.forward(*given, drawing=drawing)
         return self._lacking(view, most)
 
-    def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
+    def step_colours(
+        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+    ) -> Gaussians:
+        """See ``Renderer.step_colours``."""
+        return colour_step(self, state, views, learnt, most)
+
+    def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+        """See ``Renderer.extrapolate``."""
+        return extrapolated(before, after, share)
+
+    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``."""
+        rows = np.flatnonzero(state.moving)
         features = np.zeros((len(state), CHANNELS), np.float32)
         means, factors, opacities, features = (
             np.take(array, rows, axis=0) for array in (state.means, state.factors, state.opacities, features)

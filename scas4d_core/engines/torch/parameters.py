@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,8 @@ GLOSS_BETAS = (0.9, 0.999)
 
 def leaf(values: object) -> Tensor:
     """Copies an array or tensor to a new float64 leaf tensor."""
-    return torch.as_tensor(values, dtype=torch.float64).detach().clone()
+    given = values if isinstance(values, torch.Tensor) else np.array(values)  # PyTorch warns about read-only arrays
+    return torch.as_tensor(given, dtype=torch.float64).detach().clone()
 
 
 @dataclass(eq=False)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import BLOCK, Comparison, Picture
+from scas4d_core.engines.renderer import BLOCK, Comparison, Picture, colour_step, extrapolated
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import colours_seen, no_turns
 from scas4d_core.engines.torch.parameters import leaf
@@ -48,9 +50,9 @@ class TorchRenderer:
         picture = self._drawn(state, camera, shown, background)
         return Picture(picture.features.permute(2, 0, 1).float().numpy(), (1 - picture.alpha).float().numpy())
 
-    def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
+    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
-        planes = leaf(self.render(state, view.camera, features).features[:LABEL])
+        planes = leaf(self.render(state, view.camera).features[:LABEL])
         shown = planes * leaf(view.exposure[:3, 0])[:, None, None] + leaf(view.exposure[:3, 1])[:, None, None]
         picture, target = shown.permute(1, 2, 0), leaf(view.target[:LABEL]).permute(1, 2, 0)
         red, green, blue = (view.mean - shown.mean(dim=(1, 2)).numpy()).tolist()
@@ -69,7 +71,7 @@ class TorchRenderer:
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``."""
+        """See ``ResidualRenderer.residuals``."""
         shown = self.render(state, view.camera).features[:LABEL]
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         more = np.clip((view.target[:LABEL] - offset) / gain - shown, -most, most)
@@ -77,9 +79,19 @@ class TorchRenderer:
         sums *= learnt[:, None]
         return sums[:, :LABEL], sums[:, LABEL]
 
-    def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
+    def step_colours(
+        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+    ) -> Gaussians:
+        """See ``Renderer.step_colours``."""
+        return colour_step(self, state, views, learnt, most)
+
+    def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+        """See ``Renderer.extrapolate``."""
+        return extrapolated(before, after, share)
+
+    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``. A block is marked if a support contains one of its pixel centres."""
-        chosen = state.rows(rows)
+        chosen = state.rows(np.flatnonzero(state.moving))
         params = CameraParams.of_arrays(camera)
         drawn = project(leaf(chosen.means), leaf(chosen.factors), params, self._limits)
         u = torch.arange(camera.width, dtype=torch.float64) + 0.5

@@ -76,13 +76,16 @@ class WarpColours:
         self._learned = wp.array(learned, dtype=wp.int32, device=self._device)
         self.gradients = wp.zeros((count, 3), dtype=wp.float32, device=self._device)
         self.optimizer = Optimizer((count, 3), scalars, varies_by_row=True)
+        self._rates: tuple[float, float] | None = None
 
     def begin(self, start: AttemptStart) -> None:
         """Starts an attempt, with zero moments."""
         self._reported = int(start.curve)
-        rates = np.full(self._count, start.static_colour if self._static else 0.0, np.float32)
-        rates[self._rows] = start.colour
-        self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2), rates)
+        rates, by_row = (start.static_colour if self._static else 0.0, start.colour), None
+        if rates != self._rates:
+            self._rates, by_row = rates, np.full(self._count, rates[0], np.float32)
+            by_row[self._rows] = rates[1]
+        self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2), by_row)
 
     def step(
         self, before: wp.array, g_features: wp.array, features: wp.array, iteration: wp.array, losses: wp.array

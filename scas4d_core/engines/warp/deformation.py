@@ -104,7 +104,10 @@ class WarpDeformation:
     def set_tables(self, tables: Tables) -> None:
         """Sets the parameters from host tables."""
         for table, values in zip([*self.clusters, self.deltas], [*tables.clusters, tables.deltas], strict=True):
-            table.assign(values)
+            if values.any():
+                table.assign(values)
+            else:  # by default, the deltas always start at 0
+                table.zero_()
 
     def begin(self, start: AttemptStart) -> bool:
         """Starts an attempt from the current parameters. ``restart`` must be called next.

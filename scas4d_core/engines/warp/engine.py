@@ -31,6 +31,7 @@ from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.engines.warp.adam import COUNTED_GUARDS as ADAM_GUARDS
 from scas4d_core.engines.warp.adam import IDLE
 from scas4d_core.engines.warp.colours import WarpColours
+from scas4d_core.engines.warp.copies import as_numbers, copies_on, features_on
 from scas4d_core.engines.warp.deformation import WarpDeformation
 from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.gains import WarpGains
@@ -94,6 +95,7 @@ class WarpEngine:
     def __init__(self, device: str = "cuda:0") -> None:
         self._device = device
         self.downloads = Downloads(device)
+        self._copies = copies_on(device)
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
         """See ``UpdateEngine.bind``. This engine supports all plans."""
@@ -129,11 +131,11 @@ class WarpEngine:
 
     def load_state(self, previous: Gaussians) -> None:
         """See ``UpdateEngine.load_state``."""
-        self._previous, device = previous, self._device
-        means = wp.array(previous.means, dtype=wp.vec3, device=device)
-        self._deformation.load_state(means, wp.array(previous.factors, dtype=wp.mat33, device=device))
-        self._opacities.assign(previous.opacities)
-        self._previous_features.assign(previous.features(previous.colours))
+        self._previous, copies = previous, self._copies
+        means, factors = copies.of(previous.means, wp.vec3), copies.of(previous.factors, wp.mat33)
+        self._deformation.load_state(means, factors)
+        wp.copy(self._opacities, copies.of(previous.opacities, wp.float32))
+        wp.copy(self._previous_features, features_on(copies, previous))
         self._load_gloss()
         self._pictures.forget_guards()
         self._start: AttemptStart | None = None
@@ -149,7 +151,7 @@ class WarpEngine:
         if self._gloss is not before:
             self._graphs.forget()
         if self._gloss is not None:
-            self._gloss.load(previous)
+            self._gloss.load(previous, self._copies)
 
     @property
     def _learnt_gloss(self) -> WarpGloss | None:
@@ -240,7 +242,7 @@ class WarpEngine:
         deformation.backward(pictures.grad_means, pictures.grad_factors, variant.frozen, self._losses)
         if self._colours is not None:
             tables = self._previous_features, pictures.grad_features, self._features
-            before, gradients, features = (_as_table(array) for array in tables)
+            before, gradients, features = (as_numbers(array) for array in tables)
             self._colours.step(before, gradients, features, self._records.iteration, self._losses)
         if gloss is not None:
             gloss.step()
@@ -389,10 +391,17 @@ class WarpEngine:
         means, factors, turns, *looks = self.downloads.read(*arrays)
         rotations = turned_rotations(previous.rotations, self._rows, turns)
         state = previous.replace(means=means, factors=factors, rotations=rotations)
+        self._copies.store(wp.clone(deformation.means), means)
+        self._copies.store(wp.clone(deformation.factors), factors)
         if not learnt:
             return state
         state = state.replace(colours=np.ascontiguousarray(looks[0][:, :LABEL]))
-        return state if self._gloss is None else state.replace(gloss=looks[1], environment=looks[2])
+        self._copies.store(wp.clone(self._features), state.colours, state.foreground)
+        if self._gloss is None:
+            return state
+        for table, values in zip(self._gloss.tables, looks[1:], strict=True):
+            self._copies.store(wp.clone(table), values)
+        return state.replace(gloss=looks[1], environment=looks[2])
 
     def exposures(self) -> Mapping[str, Array]:
         """See ``UpdateEngine.exposures``."""
@@ -432,8 +441,3 @@ def guard_counts(names: Sequence[str], values: NDArray[np.int32]) -> GuardCounts
     counts = GuardCounts(*names)
     counts.add(names, values.astype(np.int64))
     return counts
-
-
-def _as_table(rows: wp.array) -> wp.array:
-    """Returns a [N, 4] float32 view of a [N] vec4 array, without copying."""
-    return wp.array(ptr=rows.ptr, dtype=wp.float32, shape=(rows.shape[0], 4), device=rows.device)

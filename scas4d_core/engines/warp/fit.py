@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import GlossShading, features_seen
+from scas4d_core.engines.cpu.gloss import GlossShading
 from scas4d_core.engines.engine import EngineError
 from scas4d_core.engines.fit import COLUMNS as PARAMETERS
 from scas4d_core.engines.fit import FitGloss, FitLoss, FitScalars, FitTable, RenderingStatistics
@@ -18,9 +18,10 @@ from scas4d_core.engines.renderer import CHANNELS, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.engines.warp.activation import activate, step_parameters
 from scas4d_core.engines.warp.adam import IDLE, SCALARS, Optimizer
+from scas4d_core.engines.warp.copies import copies_on
 from scas4d_core.engines.warp.downloads import Downloads
-from scas4d_core.engines.warp.gloss import GlossTables
-from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, MASK_LOSS, PAIRS, SHIFT, SQUARES
+from scas4d_core.engines.warp.gloss import GlossTables, features_seen
+from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, MASK_LOSS, PAIRS, SHIFT, SQUARES, Camera, camera_of
 from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.engines.warp.renderer import WarpRenderer
@@ -67,9 +68,11 @@ class _Shapes(NamedTuple):
         rows = len(fixed)
         made = cls.empty(rows + count, device)._replace(fixed=rows)
         if rows:
-            values = fixed.means, fixed.factors, fixed.opacities, features_seen(fixed, camera)
-            for array, given in zip(made[1:], values, strict=True):
-                array[:rows].assign(given)
+            copies, cameras = copies_on(device), wp.array([camera_of(camera)], dtype=Camera, device=device)
+            kinds = {"means": wp.vec3, "factors": wp.mat33, "opacities": wp.float32}
+            shapes = [copies.of(getattr(fixed, name), kind) for name, kind in kinds.items()]
+            for array, given in zip(made[1:], [*shapes, features_seen(copies, fixed, cameras)], strict=True):
+                wp.copy(array, given, count=rows)
         return made
 
 

@@ -21,6 +21,7 @@ from scas4d_core.engines.cpu.gloss import (
     gloss_rate,
 )
 from scas4d_core.engines.warp.adam import Optimizer, step_table
+from scas4d_core.engines.warp.copies import DeviceCopies, features_on
 from scas4d_core.engines.warp.layout import Camera
 from scas4d_core.engines.warp.quaternions import change_of, conjugate
 from scas4d_core.gaussians import Gaussians
@@ -328,6 +329,25 @@ def smooth_changes(
         smooth[i, c] = before[i, c] + change
 
 
+def features_seen(copies: DeviceCopies, state: Gaussians, cameras: wp.array) -> wp.array:
+    """Returns the features of a state as seen by a camera, [N] vec4. The array must not be modified.
+
+    Args:
+        copies: device copies of the state's arrays.
+        state: Gaussians to shade.
+        cameras: [1] camera, of type ``Camera``.
+    """
+    plain = features_on(copies, state)
+    if state.gloss is None or state.environment is None:
+        return plain
+    seen, device = wp.empty_like(plain), plain.device
+    view, turns = wp.zeros(1, dtype=wp.int32, device=device), wp.empty(0, dtype=wp.vec4, device=device)
+    tables = copies.of(state.gloss, wp.float32), copies.of(state.environment, wp.float32)
+    inputs = [cameras, view, copies.of(state.means, wp.vec3), view, turns, 0, *tables, plain, seen]  # without rotations
+    wp.launch(shade, len(state), inputs, device=device)
+    return seen
+
+
 class GlossTables:
     """Gloss and environment parameters with their optimizers.
 
@@ -439,11 +459,12 @@ class WarpGloss(GlossTables):
         self._neighbours = wp.array(index, dtype=wp.int32, ndim=2, device=self._device)
         self._weights = wp.zeros(index.shape, dtype=wp.float32, device=self._device)
 
-    def load(self, previous: Gaussians) -> None:
+    def load(self, previous: Gaussians, copies: DeviceCopies) -> None:
         """Loads the gloss and environment of Θ_{t−1}."""
         assert previous.gloss is not None
+        assert previous.environment is not None
         for table, values in zip(self.before, (previous.gloss, previous.environment), strict=True):
-            table.assign(values)
+            wp.copy(table, copies.of(values, wp.float32))
         self._rates = gloss_rate(UPDATE_RATE_GLOSS, previous.gloss), UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS
         self.reset()
 

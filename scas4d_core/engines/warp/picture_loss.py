@@ -8,6 +8,7 @@ rows are recomputed instead of stored. Arithmetic is cheap, because a single ima
 from __future__ import annotations
 
 from collections.abc import Sequence
+from weakref import WeakSet
 
 import numpy as np
 import warp as wp
@@ -130,6 +131,7 @@ def place_of(
 
 @wp.kernel
 def target_moments(
+    changed: wp.array[wp.int32],
     cameras: wp.array[Camera],
     window: wp.int32,
     taps: wp.array[wp.float32],
@@ -137,14 +139,16 @@ def target_moments(
     means: wp.array4d[wp.float32],
     squares: wp.array4d[wp.float32],
 ) -> None:
-    """Computes the windowed means of each target and of its square, with one thread per pixel.
+    """Computes the windowed means of targets and of their squares, with one thread per pixel.
 
     Args:
+        changed: indices of the views whose targets changed.
         cameras, window, taps: see ``picture_loss``.
         targets: [views, 4, rows, columns] training images and masks.
         means, squares: [views, 4, rows, columns] outputs. Values outside an image stay unchanged.
     """
-    view, channel, y, x = wp.tid()
+    place, channel, y, x = wp.tid()
+    view = changed[place]
     camera = cameras[view]
     if x < camera.width and y < camera.height:
         mean = wp.float32(0.0)
@@ -189,15 +193,22 @@ def expand_levels(
 
 
 @wp.kernel
-def find_blank(cameras: wp.array[Camera], targets: wp.array4d[wp.float32], blank: wp.array3d[wp.int32]) -> None:
+def find_blank(
+    changed: wp.array[wp.int32],
+    cameras: wp.array[Camera],
+    targets: wp.array4d[wp.float32],
+    blank: wp.array3d[wp.int32],
+) -> None:
     """Marks the tiles in which a target is zero everywhere, with one thread per tile.
 
     Args:
+        changed: indices of the views whose targets changed.
         cameras: [views] cameras of all views.
         targets: [views, 4, rows, columns] training images and masks.
         blank: [views, tile rows, tile columns] output, 1 for blank tiles, otherwise 0.
     """
-    view, tile_y, tile_x = wp.tid()
+    place, tile_y, tile_x = wp.tid()
+    view = changed[place]
     camera = cameras[view]
     found = wp.int32(1)
     for channel in range(4):
@@ -427,6 +438,10 @@ def exposure_gradient(
         wp.atomic_add(gradients, channel, wp.vec2(by_gain, by_offset) / exposures[view[0], channel][0])
 
 
+_instances: WeakSet[PictureLoss] = WeakSet()
+"""All instances, which share the images of a frame."""
+
+
 class PictureLoss:
     """The training images of a frame on a device, and the loss of a rendering compared with one of these images.
 
@@ -445,12 +460,15 @@ class PictureLoss:
         self._device, self._everywhere = device, int(everywhere)
         self._weights = [image_weight / 3] * 3 + [mask_weight]
         self._taken: list[Array | None] = []
+        _instances.add(self)
         self._sent: wp.Event | None = None
         self._window = 2 * REACH + 1, wp.array(PADDED_TAPS, dtype=wp.float32, device=device)
         self.columns = self.rows = 0
 
     def load(self, views: Sequence[TrainingView]) -> bool:
-        """Uploads the images, cameras and exposures of a frame. Images that are already loaded are reused.
+        """Uploads the images, cameras and exposures of a frame.
+
+        Images that are already loaded are reused. Images that another instance has loaded are copied on the device.
 
         Returns:
             Whether buffers were reallocated, which invalidates captured graphs.
@@ -462,7 +480,7 @@ class PictureLoss:
             self._allocate(max(len(views), len(self._taken)), columns, rows)
         elif self._sent is not None:  # a pending upload must not be overwritten
             wp.synchronize_event(self._sent)
-        floats, levels = list[int](), list[int]()
+        floats, levels, copied = list[int](), list[int](), list[int]()
         for index, view in enumerate(views):
             channels, height, width = view.target.shape
             self._host_channels[index] = channels
@@ -474,6 +492,9 @@ class PictureLoss:
                         self._staged_floats[index] = self._pinned()
                     self._staged_floats[index].numpy()[:channels, :height, :width] = view.target
                     floats.append(index)
+                elif (loaded := self._loaded_elsewhere(view.target)) is not None:
+                    wp.copy(self._levels[index, :, :height, :width], loaded[:, :height, :width])
+                    copied.append(index)
                 else:
                     image, mask = view.source
                     self._host_levels[index, :3, :height, :width] = np.moveaxis(image, -1, 0)
@@ -488,16 +509,29 @@ class PictureLoss:
         for index in floats:
             wp.copy(self.targets, self._staged_floats[index], size * index, 0, size)
         for index in levels:  # a quarter of the bytes
-            wp.copy(self._levels, self._staged_levels, size * index, size * index, size)
+            used = size * int(self._host_channels[index]) // CHANNELS  # without the mask if there is none
+            wp.copy(self._levels, self._staged_levels, size * index, size * index, used)
+        for index in [*levels, *copied]:
             inputs = [index, int(self._host_channels[index]), self._levels, self.targets]
             wp.launch(expand_levels, self.targets.shape[1:], inputs, device=self._device)
-        if floats or levels:
-            moments = [self.targets, self.target_means, self.target_squares]
-            wp.launch(target_moments, self.targets.shape, [self.cameras, *self._window, *moments], device=self._device)
-            wp.launch(find_blank, self._blank.shape, [self.cameras, self.targets, self._blank], device=self._device)
+        if changed := floats + levels + copied:
+            places = wp.array(changed, dtype=wp.int32, device=self._device)
+            inputs = [places, self.cameras, *self._window, self.targets, self.target_means, self.target_squares]
+            wp.launch(target_moments, (len(changed), *self.targets.shape[1:]), inputs, device=self._device)
+            inputs = [places, self.cameras, self.targets, self._blank]
+            wp.launch(find_blank, (len(changed), *self._blank.shape[1:]), inputs, device=self._device)
         if wp.get_device(self._device).is_cuda:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
+
+    def _loaded_elsewhere(self, target: Array) -> wp.array | None:
+        """Returns the levels [4, rows, columns] of an image that another instance has loaded, or None."""
+        for other in _instances:
+            if other is not self and other._device == self._device:
+                for index, taken in enumerate(other._taken):
+                    if taken is target:
+                        return other._levels[index]
+        return None
 
     def _pinned(self) -> wp.array:
         """Returns a page-locked float32 buffer for one image of the maximum size."""

@@ -24,8 +24,6 @@ COUNTED_GUARDS = ("not_finite", "footprint_ceiling", "gradient_not_finite")
 RECORD = 4
 """Number of rows per splat in ``records`` [4 N]. The first ten values are sums over pixels: dL/dpower times 1, x, y,
 xx, xy and yy, where (x, y) is the offset from the mean, and dL/dfeatures. The rest is padding to 64 bytes."""
-FEATURES = 6
-"""Index of the first feature gradient among the ten values."""
 
 
 @wp.func

@@ -165,6 +165,7 @@ class Rasterizer:
         inputs = [*given, int(add), g_means, g_factors, g_features]
         wp.launch(projection.project_backward, self.count, inputs, device=self._device)
 
-    def mark(self, cameras: wp.array, side: int, marks: wp.array) -> None:
-        """Marks the ``side``-pixel blocks that the projected Gaussians intersect; see ``tiles.mark_blocks``."""
-        wp.launch(tiles.mark_blocks, self.count, [side, cameras, self.splats, self._boxes, marks], device=self._device)
+    def mark(self, cameras: wp.array, side: int, features: wp.array, marks: wp.array) -> None:
+        """Marks the ``side``-pixel blocks that projected moving Gaussians intersect; see ``tiles.mark_blocks``."""
+        inputs = [side, cameras, features, self.splats, self._boxes, marks]
+        wp.launch(tiles.mark_blocks, self.count, inputs, device=self._device)

@@ -2,28 +2,146 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import BLOCK, CHANNELS, Comparison, Picture, psnr_of
+from scas4d_core.engines.renderer import (
+    BLOCK,
+    CHANNELS,
+    PRIOR_PIXELS,
+    Comparison,
+    Picture,
+    extrapolated,
+    psnr_of,
+)
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
+from scas4d_core.engines.warp.copies import as_numbers, copies_on, features_on
+from scas4d_core.engines.warp.downloads import Downloads
+from scas4d_core.engines.warp.gloss import features_seen
+from scas4d_core.engines.warp.lanes import load
 from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, PAIRS, SHIFT, SQUARES, Camera, camera_of
 from scas4d_core.engines.warp.picture_loss import PictureLoss
-from scas4d_core.engines.warp.projection import FEATURES, RECORD
+from scas4d_core.engines.warp.projection import RECORD
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import FEATURE_CEILING
+
+wp.set_module_options({"enable_backward": False})
 
 Array = NDArray[np.float32]
 PADDING = 32
 """Tile size in pixels. ``reached`` pads images to a multiple of this size."""
 
 
+@wp.kernel
+def set_depth(
+    cameras: wp.array[Camera],
+    means: wp.array[wp.vec3],
+    channel: wp.int32,
+    features: wp.array[wp.vec4],
+    changed: wp.array[wp.vec4],
+) -> None:
+    """Copies features and replaces one channel with the depth of each mean, with one thread per Gaussian.
+
+    Args:
+        cameras: [1] camera.
+        means, features: [N] means and features.
+        channel: channel to replace.
+        changed: [N] output.
+    """
+    i = wp.tid()
+    feature = features[i]
+    feature[channel] = (cameras[0].rotation * means[i] + cameras[0].translation)[2]
+    changed[i] = feature
+
+
+@wp.kernel
+def weigh_residuals(
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    exposures: wp.array2d[wp.vec2],
+    targets: wp.array4d[wp.float32],
+    planes: wp.array3d[wp.float32],
+    most: wp.float32,
+    residuals: wp.array3d[wp.float32],
+) -> None:
+    """Computes the residuals of a rendering before exposure, with one thread per pixel and channel.
+
+    Args:
+        cameras: [views] cameras of all views.
+        view: [1] index of the view.
+        exposures: [views, 4] gain and offset of each channel.
+        targets: [views, 4, rows, columns] training images and masks.
+        planes: [5, rows, columns] rendering.
+        most: magnitude to which residuals are clipped.
+        residuals: [4, rows, columns] output, RGB residuals and a plane of ones.
+    """
+    channel, y, x = wp.tid()
+    camera = cameras[view[0]]
+    if x < camera.width and y < camera.height:
+        value = wp.float32(1.0)
+        if channel < 3:
+            exposure = exposures[view[0], channel]
+            value = (targets[view[0], channel, y, x] - exposure[1]) / exposure[0] - planes[channel, y, x]
+            value = wp.clamp(value, -most, most)
+        residuals[channel, y, x] = value
+
+
+@wp.kernel
+def add_sums(records: wp.array[wp.vec4], sums: wp.array[wp.vec4]) -> None:
+    """Adds the feature gradients of the gradient records to sums [N], with one thread per Gaussian."""
+    i = wp.tid()
+    r1 = load(records, RECORD * i + 1)
+    r2 = load(records, RECORD * i + 2)
+    sums[i] = sums[i] + wp.vec4(r1[2], r1[3], r2[0], r2[1])
+
+
+@wp.kernel
+def take_colour_step(
+    learnt: wp.array[wp.uint8],
+    sums: wp.array[wp.vec4],
+    prior: wp.float32,
+    features: wp.array[wp.vec4],
+    stepped: wp.array[wp.vec4],
+) -> None:
+    """Adds the weighted mean residual to the colours of the chosen Gaussians, with one thread per Gaussian.
+
+    Args:
+        learnt: [N] mask of the chosen Gaussians.
+        sums: [N] weighted sums of the RGB residuals, and sum of the weights.
+        prior: number added to the sum of the weights.
+        features: [N] colours and labels.
+        stepped: [N] output.
+    """
+    i = wp.tid()
+    feature = features[i]
+    if learnt[i] != wp.uint8(0):
+        total = sums[i]
+        weight = prior + total[3]
+        feature = feature + wp.vec4(total[0] / weight, total[1] / weight, total[2] / weight, 0.0)
+    stepped[i] = feature
+
+
+@wp.kernel
+def extrapolate_numbers(
+    share: wp.float32,
+    before: wp.array2d[wp.float32],
+    after: wp.array2d[wp.float32],
+    moved: wp.array2d[wp.float32],
+) -> None:
+    """Adds a share of the change between two [N, C] arrays, with one thread per number."""
+    i, k = wp.tid()
+    moved[i, k] = after[i, k] + share * (after[i, k] - before[i, k])
+
+
 class WarpRenderer:
-    """The ``Renderer`` implementation in NVIDIA Warp. Each call uploads a state and waits for the result.
+    """The ``Renderer`` implementation in NVIDIA Warp. Each call waits for the result.
+
+    States that were used last stay on the device (``DeviceCopies``), as do the images that an engine has loaded.
 
     Args:
         background: background colour, RGB in 0…1.
@@ -45,6 +163,7 @@ class WarpRenderer:
         self.device, self.limits, self.background = device, limits, background
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
+        self._copies, self._downloads = copies_on(device), Downloads(device)
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
@@ -60,91 +179,150 @@ class WarpRenderer:
         background: Array | None = None,
     ) -> Picture:
         """See ``Renderer.render``."""
-        shown = features_seen(state, camera) if features is None else features
+        cameras = self._camera(camera)
+        groups, sound = self._features(state, cameras, features)
         if depth_channel >= 0:
-            shown = shown.copy()
-            shown[:, depth_channel] = state.means @ camera.pose[2, :3] + camera.pose[2, 3]
+            group = groups[depth_channel // CHANNELS]
+            groups[depth_channel // CHANNELS] = changed = wp.empty_like(group)
+            inputs = [cameras, self._copies.of(state.means, wp.vec3), depth_channel % CHANNELS, group, changed]
+            wp.launch(set_depth, len(state), inputs, device=self.device)
         if background is None:
-            background = np.zeros(shown.shape[1], np.float32)
+            background = np.zeros(CHANNELS * len(groups), np.float32)
             background[:CHANNELS] = self._background
-        cameras = self._projected(state, camera, shown)
+        self._project(state, camera, cameras, groups, sound)
         drawn = []
-        for group in range(0, shown.shape[1], CHANNELS):
-            channels = slice(group, group + CHANNELS)
-            self._rasterize(cameras, shown[:, channels], background[channels])
-            drawn.append(self._rasterizer.planes.numpy()[:, : camera.height, : camera.width].copy())
+        for place, group in enumerate(groups):
+            self._draw(cameras, group, background[CHANNELS * place : CHANNELS * (place + 1)])
+            planes = self._rasterizer.planes[:, : camera.height, : camera.width]
+            drawn += self._downloads.read(planes.contiguous())
+        if len(drawn) == 1:
+            return Picture(drawn[0][:CHANNELS], drawn[0][CHANNELS])
         return Picture(np.concatenate([planes[:CHANNELS] for planes in drawn]), drawn[0][CHANNELS])
 
-    def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
+    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
-        shown = features_seen(state, view.camera) if features is None else features
-        cameras = self._projected(state, view.camera, shown)
-        self._rasterize(cameras, shown, self._background)
-        self._loss.load([view])
+        self._render_view(state, view)
         self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
-        log = self._log.numpy()[0].astype(float)
+        log = self._downloads.read(self._log)[0][0].astype(float)
         red, green, blue = log[SHIFT : SHIFT + 3].tolist()
         psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
         return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """See ``Renderer.gather``. The sums are computed as feature gradients of a weighted sum of pixels."""
-        features = np.zeros((len(state), CHANNELS), np.float32)
-        cameras = self._projected(state, camera, features)
-        on_device = self._rasterize(cameras, features, np.zeros(CHANNELS, np.float32))
-        rasterizer = self._rasterizer
-        given = np.zeros(rasterizer.g_planes.shape, np.float32)
-        given[: len(planes), : camera.height, : camera.width] = planes
-        rasterizer.g_planes.assign(given)
-        rasterizer.carry_back(cameras, self._first, on_device)
-        records = rasterizer.records.numpy().reshape(len(state), 4 * RECORD)
-        sums: Array = records[:, FEATURES : FEATURES + len(planes)].copy()
-        return sums
+        """See ``Renderer.gather``."""
+        cameras, features = self._camera(camera), wp.zeros(len(state), dtype=wp.vec4, device=self.device)
+        self._project(state, camera, cameras, [features])
+        self._draw(cameras, features, np.zeros(CHANNELS, np.float32))
+        weights = self._rasterizer.g_planes
+        weights.zero_()
+        given = wp.array(np.ascontiguousarray(planes, np.float32), dtype=wp.float32, ndim=3, device=self.device)
+        wp.copy(weights[: len(planes), : camera.height, : camera.width], given)
+        return self._sums(state, cameras, features)[:, : len(planes)]
 
-    def residuals(
-        self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
-    ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``."""
-        shown = self.render(state, view.camera).features[:LABEL]
-        gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
-        more = np.clip((view.target[:LABEL] - offset) / gain - shown, -most, most)
-        sums = self.gather(state, view.camera, np.concatenate([more, np.ones_like(more[:1])]))
-        sums *= learnt[:, None]
-        return sums[:, :LABEL], sums[:, LABEL]
+    def step_colours(
+        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+    ) -> Gaussians:
+        """See ``Renderer.step_colours``."""
+        count, loss = len(state), self._loss
+        sums = wp.zeros(count, dtype=wp.vec4, device=self.device)
+        for view in views:
+            features, rasterizer = self._render_view(state, view), self._rasterizer
+            target = [loss.cameras, self._first, loss.exposures, loss.targets]
+            inputs = [*target, rasterizer.planes, most, rasterizer.g_planes]
+            wp.launch(weigh_residuals, rasterizer.g_planes.shape, inputs, device=self.device)
+            rasterizer.carry_back(self._camera(view.camera), self._first, features)
+            wp.launch(add_sums, count, [rasterizer.records, sums], device=self.device)
+        chosen, plain = self._copies.of(learnt, wp.uint8), features_on(self._copies, state)
+        stepped = wp.empty_like(plain)
+        wp.launch(take_colour_step, count, [chosen, sums, PRIOR_PIXELS, plain, stepped], device=self.device)
+        features = self._downloads.read(stepped)[0]
+        state = state.replace(colours=np.ascontiguousarray(features[:, :LABEL]))
+        self._copies.store(stepped, state.colours, state.foreground)
+        return state
 
-    def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
+    def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
+        """See ``Renderer.extrapolate``."""
+        state = extrapolated(before, after, share)
+        for name, dtype in (("means", wp.vec3), ("factors", wp.mat33)):
+            first, last = (self._copies.of(getattr(each, name), dtype) for each in (before, after))
+            moved = wp.empty_like(last)
+            inputs = [as_numbers(array) for array in (first, last)]
+            wp.launch(extrapolate_numbers, inputs[0].shape, [share, *inputs, as_numbers(moved)], device=self.device)
+            self._copies.store(moved, getattr(state, name))
+        return state
+
+    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``."""
-        chosen = state.rows(rows)
-        cameras = self._projected(chosen, camera, np.zeros((len(rows), CHANNELS), np.float32))
+        cameras, features = self._camera(camera), features_on(self._copies, state)
+        self._project(state, camera, cameras, [features])
         height, width = (-(-size // PADDING) * PADDING // BLOCK for size in (camera.height, camera.width))
         marks = wp.zeros((height, width), dtype=wp.int32, device=self.device)
-        self._rasterizer.mark(cameras, BLOCK, marks)
+        self._rasterizer.mark(cameras, BLOCK, features, marks)
         blocks: NDArray[np.bool_] = marks.numpy() != 0
         return blocks
 
-    def _projected(self, state: Gaussians, camera: CameraArrays, features: Array) -> wp.array:
-        """Projects a state and builds sufficiently large tile lists. Returns the camera as a [1] device array."""
-        device, count = self.device, len(state)
+    def _camera(self, camera: CameraArrays) -> wp.array:
+        return wp.array([camera_of(camera)], dtype=Camera, device=self.device)
+
+    def _features(
+        self, state: Gaussians, cameras: wp.array, features: Array | None
+    ) -> tuple[list[wp.array], NDArray[np.bool_] | None]:
+        """Returns the features in groups of four channels, [N] vec4 each, and a [N] mask of valid features.
+
+        The mask is None if there is only one group, whose invalid features are culled by projection.
+        """
+        if features is None:
+            return [features_seen(self._copies, state, cameras)], None
+        features = np.asarray(features, np.float32)
+        groups = [features[:, first : first + CHANNELS] for first in range(0, features.shape[1], CHANNELS)]
+        uploaded = [wp.array(np.ascontiguousarray(group), dtype=wp.vec4, device=self.device) for group in groups]
+        sound = np.asarray(np.abs(features) <= FEATURE_CEILING).all(axis=1)
+        return uploaded, np.asarray(sound)
+
+    def _project(
+        self,
+        state: Gaussians,
+        camera: CameraArrays,
+        cameras: wp.array,
+        groups: Sequence[wp.array],
+        sound: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Projects a state and builds sufficiently large tile lists; see ``_features`` for the last arguments."""
+        device, count, copies = self.device, len(state), self._copies
         if count != self._rasterizer.count or not self._rasterizer.holds(camera.width, camera.height):
             self._rasterizer = Rasterizer(device, count, self.limits)
             self._rasterizer.resize(camera.width, camera.height)
-        cameras = wp.array([camera_of(camera)], dtype=Camera, device=device)
-        # Projection gets placeholder features, because there may be more than four. Gaussians that it would cull for
-        # invalid features get zero opacity instead.
-        sound = (np.abs(features) <= FEATURE_CEILING).all(axis=1)
-        means = wp.array(state.means, dtype=wp.vec3, device=device)
-        factors = wp.array(state.factors, dtype=wp.mat33, device=device)
-        opacities = wp.array(np.where(sound, state.opacities, np.float32(0)), dtype=wp.float32, device=device)
-        unseen = wp.zeros(count, dtype=wp.vec4, device=device)
-        given = (cameras, self._first, means, factors, opacities, unseen, self._first, self._log)
+        opacities, features = copies.of(state.opacities, wp.float32), groups[0]
+        if sound is not None and not sound.all():  # projection can check one group only
+            opacities = wp.array(np.where(sound, state.opacities, np.float32(0)), dtype=wp.float32, device=device)
+        shapes = copies.of(state.means, wp.vec3), copies.of(state.factors, wp.mat33), opacities
+        given = (cameras, self._first, *shapes, features, self._first, self._log)
         self._rasterizer.project(*given)
-        while self._rasterizer.grow(self._log.numpy()[0, PAIRS]):
+        while self._rasterizer.grow(self._downloads.read(self._log)[0][0, PAIRS]):
             self._rasterizer.project(*given)
-        return cameras
 
-    def _rasterize(self, cameras: wp.array, features: Array, background: Array) -> wp.array:
-        """Rasterizes features [N, 4] of the projected Gaussians, and returns the uploaded features."""
-        on_device = wp.array(np.ascontiguousarray(features, np.float32), dtype=wp.vec4, device=self.device)
+    def _draw(self, cameras: wp.array, features: wp.array, background: Array) -> None:
+        """Rasterizes features [N] vec4 of the projected Gaussians."""
         self._behind.assign(background[None])
-        self._rasterizer.draw(cameras, self._first, on_device, self._behind)
-        return on_device
+        self._rasterizer.draw(cameras, self._first, features, self._behind)
+
+    def _render_view(self, state: Gaussians, view: TrainingView) -> wp.array:
+        """Renders a state from the camera of a view, loads the view, and returns the features that it sees."""
+        cameras = self._camera(view.camera)
+        features = features_seen(self._copies, state, cameras)
+        self._project(state, view.camera, cameras, [features])
+        self._draw(cameras, features, self._background)
+        self._loss.load([view])
+        return features
+
+    def _sums(self, state: Gaussians, cameras: wp.array, features: wp.array) -> Array:
+        """Returns the sums [N, 4] of the planes in ``g_planes``, weighted by blending weights.
+
+        They are computed as the feature gradients of a sum of weighted pixels.
+        """
+        rasterizer = self._rasterizer
+        rasterizer.carry_back(cameras, self._first, features)
+        sums = wp.zeros(len(state), dtype=wp.vec4, device=self.device)
+        wp.launch(add_sums, len(state), [rasterizer.records, sums], device=self.device)
+        gathered: Array = self._downloads.read(sums)[0]
+        return gathered

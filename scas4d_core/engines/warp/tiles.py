@@ -224,22 +224,24 @@ def sort_lists(
 def mark_blocks(
     side: wp.int32,
     cameras: wp.array[Camera],
+    features: wp.array[wp.vec4],
     splats: wp.array[wp.vec4],
     boxes: wp.array[wp.vec4i],
     marks: wp.array2d[wp.int32],
 ) -> None:
-    """Marks the blocks of pixels that the supports of Gaussians intersect, with one thread per Gaussian.
+    """Marks the blocks of pixels that the supports of moving Gaussians intersect, with one thread per Gaussian.
 
     Args:
         side: side length of a block in pixels, which must divide the side length of a tile.
         cameras: [1] camera of the image.
+        features: [N] features; Gaussians with a label above 0.5 move.
         splats, boxes: outputs of ``projection.project``.
         marks: [block rows, block columns] output, set to 1 for marked blocks and otherwise unchanged.
     """
     i = wp.tid()
     first = load(splats, 2 * i)
     second = load(splats, 2 * i + 1)
-    if second[2] > 0.0:
+    if second[2] > 0.0 and features[i][3] > 0.5:
         camera = cameras[0]
         box = boxes[i]
         blocks = TILE // side

@@ -84,19 +84,34 @@ def test_sums_over_pixels(tested: Renderer) -> None:
     assert apart(mine, true) < CLOSE
 
 
-def test_residuals_of_some_gaussians(tested: Renderer) -> None:
-    scene = case(gaussians())
-    learnt = (np.arange(len(scene.previous)) % 3 == 0).astype(np.uint8)
-    mine, true = (renderer.residuals(scene.previous, scene.views[2], learnt, 0.05) for renderer in (tested, TRUE))
-    assert apart(mine[0][learnt == 1], true[0][learnt == 1]) < 1e-3  # small differences of pictures
-    assert apart(mine[1][learnt == 1], true[1][learnt == 1]) < CLOSE
-    assert not true[1][learnt == 0].any()
+@pytest.mark.parametrize("glossy", [False, True])
+def test_a_colour_step_of_some_gaussians(tested: Renderer, glossy: bool) -> None:
+    scene = case(gaussians(glossy=glossy))
+    before, learnt = scene.previous, (np.arange(len(scene.previous)) % 3 == 0).astype(np.uint8)
+    mine, true = (renderer.step_colours(before, scene.views[1:4], learnt, 0.05) for renderer in (tested, TRUE))
+    steps = [(state.colours - before.colours)[learnt == 1] for state in (mine, true)]
+    assert np.abs(steps[1]).max() > 0.01
+    assert apart(*steps) < 1e-3  # small differences of pictures
+    for state in (mine, true):
+        assert np.array_equal(state.colours[learnt == 0], before.colours[learnt == 0])
+        assert state.means is before.means
+    again, expected = (renderer.step_colours(mine, scene.views[:2], learnt, 0.05) for renderer in (tested, TRUE))
+    assert apart(again.colours - mine.colours, expected.colours - mine.colours) < 2e-3
+
+
+def test_states_between_and_beyond_frames(tested: Renderer) -> None:
+    before = gaussians()
+    after = before.replace(means=before.means + np.where(before.moving, np.float32(0.05), np.float32(0))[:, None])
+    for share in (0.5, -0.5):
+        state = tested.extrapolate(before, after, share)
+        np.testing.assert_allclose(state.means, after.means + share * (after.means - before.means), atol=1e-6)
+        assert apart(tested.render(state, CAMERA).features, TRUE.render(state, CAMERA).features) < CLOSE
 
 
 def test_blocks_that_are_reached(tested: Renderer) -> None:
     state = gaussians()
-    rows = np.arange(0, 40)
-    mine, true = (renderer.reached(state, rows, CAMERA) for renderer in (tested, TRUE))
+    state = state.replace(foreground=(np.arange(len(state)) < 40).astype(np.float32))
+    mine, true = (renderer.reached(state, CAMERA) for renderer in (tested, TRUE))
     assert mine.shape == true.shape
     assert not (true & ~mine).any()  # a support may pass between the centres of pixels
     assert (mine & ~true).sum() <= 0.2 * mine.sum()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scas4d_core.engines.renderer import extrapolated
 from scas4d_core.frame_outcome import Candidate, FrameOutcome, timing_warnings
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.gaussians import Gaussians
@@ -234,7 +235,7 @@ def test_moments_move_what_moves_alone() -> None:
     one = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=[1, 0, 0])
     before = one.replace(foreground=np.float32([1, 0]))
     now = before.replace(means=before.means + np.float32([[0.2, 0, 0], [0, 0, 0]]), factors=2 * before.factors)
-    ahead, back = timing.half_frame_states(before, now)
+    ahead, back = (extrapolated(before, now, share) for share in (0.5, -0.5))
     np.testing.assert_allclose(ahead.means[0], [0.3, 0, 2], atol=1e-6)
     np.testing.assert_allclose(back.means[0], [0.1, 0, 2], atol=1e-6)
     np.testing.assert_allclose(ahead.factors[0], 2.5 * before.factors[0], atol=1e-6)

@@ -176,15 +176,20 @@ def test_a_full_disk_loses_nothing_and_is_tried_again(tmp_path: Path, true: Hist
     assert held == [index for index in true.indices[1:-EXACT]]  # each once
 
 
+def damage_state(history: History, index: int) -> None:
+    """Changes a bit of a frame's state within its chunk."""
+    chunk = history.files.chunks.of(index)
+    assert chunk is not None
+    data = bytearray(chunk.path.read_bytes())
+    place = next(one for one in history.files.chunks.reader(index)._states if one.frame == index)
+    data[place.offset + place.size // 2] ^= 16
+    chunk.path.write_bytes(data)
+
+
 def test_a_damaged_chunk_hides_only_what_needs_it(tmp_path: Path, true: History) -> None:
     history = filled(tmp_path / "states")
     compacted(history)
-    chunk = history.files.chunks.of(6)
-    assert chunk is not None
-    data = bytearray(chunk.path.read_bytes())
-    place = next(one for one in history.files.chunks.reader(6)._states if one.frame == 6)
-    data[place.offset + place.size // 2] ^= 16
-    chunk.path.write_bytes(data)
+    damage_state(history, 6)
     reader = History.load(tmp_path / "states")
     readable = []
     for index in true.indices:
@@ -204,6 +209,19 @@ def test_a_damaged_chunk_hides_only_what_needs_it(tmp_path: Path, true: History)
     made_again(history, true, 7)
     assert np.array_equal(History.load(tmp_path / "states").gaussians(7).means, true.gaussians(7).means)
     assert History.load(tmp_path / "states").report(7) == {"recomputed": True}
+
+
+def test_a_frame_whose_file_and_chunk_are_damaged_is_reported(tmp_path: Path, true: History) -> None:
+    history = filled(tmp_path / "states")
+    compacted(history)
+    made_again(history, true, 6)
+    history.files.path(6).write_bytes(b"damaged")
+    assert np.allclose(History.load(tmp_path / "states").gaussians(6).means, true.gaussians(6).means, atol=0.01)
+    damage_state(history, 6)
+    reader = History.load(tmp_path / "states")
+    with pytest.raises(DamagedFrameError):
+        reader.gaussians(6)
+    assert "frame_000006.npz" in reader.pop_faults()
 
 
 def test_a_chunk_that_is_gone_takes_its_frames_and_no_others(tmp_path: Path, true: History) -> None:

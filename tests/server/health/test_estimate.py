@@ -48,6 +48,9 @@ def test_an_estimate_creates_nothing(http):
     found = http.post("/v1/estimate", json=scaled).json()
     assert (found["scaled_pixels"], found["gaussians"]) == (2 * 1000**2, 5000)
     assert found["worker_mb"] == pytest.approx(280 + 150 + found["pictures_mb"] + found["gaussians_mb"], abs=0.1)
+    assert large["gpu_mb"] > small["gpu_mb"] > 1000  # two processes
+    on_cpu = {"rig": rig(2000), "settings": {"device": "cpu"}}
+    assert http.post("/v1/estimate", json=on_cpu).json() == {**large, "gpu_mb": 0.0}
     problem(http.post("/v1/estimate", json={"rig": {}}), 422)
 
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
+from dataclasses import replace
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from histories import state
 from running import make_rig
 
+from scas4d_core.engines.choose import WARP_DEVICE
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
 from server.processes.part_labels import resize_labels
 from server.processes.queries import Answer, GaussiansQuery, NumberedQuery, PartsQuery, QueryRefused, RenderQuery
-from server.processes.reader_process import QueryReader
+from server.processes.reader_process import QueryReader, view_device
 from server.storage.layout import SceneFolder
 
 
@@ -63,3 +67,27 @@ def test_labels_are_fitted():
     assert resize_labels(labels, 5).tolist() == [2, 0, 1, -1, -1]
     assert resize_labels(labels, 2).tolist() == [2, 0]
     assert resize_labels(labels, 3).dtype == np.int16
+
+
+def test_views_are_rendered_by_the_scenes_device(tmp_path, monkeypatch, caplog):
+    spec = SceneSpec(SceneFolder(tmp_path), make_rig(), Settings(device="gpu"))
+    monkeypatch.setattr("scas4d_core.engines.choose.gpu_fault", lambda: "no NVIDIA driver is installed")
+    assert view_device(spec) == "cpu"  # the machine with the GPU may be another one
+    assert "no NVIDIA driver" in caplog.text
+    monkeypatch.setattr("scas4d_core.engines.choose.gpu_fault", lambda: None)
+    assert view_device(spec) == "gpu"
+    assert view_device(replace(spec, settings=Settings(device="cpu"))) == "cpu"
+
+
+def test_a_gpu_and_the_cpu_render_the_same_image(renderer, monkeypatch):
+    pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
+    monkeypatch.setenv(WARP_DEVICE, os.environ.get(WARP_DEVICE, "cpu"))
+    query = RenderQuery(make_rig().cameras[0], 3, ("colour",), "png", (0.0, 0.3, 0.0))
+    images = []
+    for reader in (renderer, QueryReader(renderer.spec, "gpu")):
+        found = reader.answer(NumberedQuery(1, query))
+        assert isinstance(found, Answer), found
+        images.append(imageio.imread(found.body).astype(int))
+        assert reader.reader.view_device == reader.device
+    assert images[0].std() > 5
+    assert np.abs(images[0] - images[1]).max() <= 1

@@ -7,10 +7,11 @@ import pytest
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
-from scas4d_core.effects.appearance import closed_form, shading
+from scas4d_core.effects.appearance import shading
 from scas4d_core.effects.appearance.closed_form import MOST, SUBSETS, follow_pictures, from_all_sides
 from scas4d_core.engines.cpu.changed_pixels import ChangedPixels
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.renderer import PRIOR_PIXELS
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
@@ -90,7 +91,7 @@ def test_steps_are_those_of_a_dense_twin() -> None:
     learnt[rows] = 1
     state = shown
     for first in range(SUBSETS):
-        sums, weights = np.zeros((len(BOX), 3)), np.full(len(BOX), closed_form.FEW)
+        sums, weights = np.zeros((len(BOX), 3)), np.full(len(BOX), PRIOR_PIXELS)
         for view in from_all_sides(views)[first::SUBSETS]:
             features = state.features(state.colours)
             residual = view.target[:3].astype(np.float64) - picture.render(state, view.camera, features).features[:3]

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
 
+import warp as wp
 from box_scene import RIG, make_box, moved, take_frame
 
 from scas4d_core.captures.frame import Frame
@@ -116,3 +119,34 @@ def test_a_scene_is_resumed_on_the_other_device(tmp_path: Path) -> None:
     scene.step(frames()[2])
     assert error(again, frames()[2]) == pytest.approx(error(scene, frames()[2]), abs=0.05)
     assert [again.history.report(index)["device"] for index in (1, 2)] == ["gpu", "cpu"]
+
+
+def test_a_frame_uploads_at_most_the_opacity_of_each_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = [make_box()]
+    while len(states) < 5:
+        states.append(moved(states[-1]))
+    shots = [take_frame(index, index / 30, state, RIG) for index, state in enumerate(states)]
+    scene = Reconstruction.start(RIG, shots[0], settings("gpu"), static=first_fit(glossy=False))
+    for shot in shots[1:-1]:
+        scene.step(shot)
+    uploads: list[NDArray[Any]] = []
+    construct, assign = wp.array.__init__, wp.array.assign
+
+    def constructed(self: wp.array, data: object = None, *given: object, **named: object) -> None:
+        if isinstance(data, np.ndarray) and data.ndim:
+            uploads.append(data)
+        construct(self, data, *given, **named)
+
+    def assigned(self: wp.array, values: object) -> None:
+        uploads.append(np.asarray(values))
+        assign(self, values)
+
+    monkeypatch.setattr(wp.array, "__init__", constructed)
+    monkeypatch.setattr(wp.array, "assign", assigned)
+    report = scene.step(shots[-1])
+    count = len(scene.history.newest)
+    assert report.outcome == "updated"
+    assert report.gaussians == count > 250
+    assert uploads
+    # opacities of a state without moving Gaussians, in which uncovered surfaces are searched
+    assert sum(array.nbytes for array in uploads if len(array) == count) <= 4 * count

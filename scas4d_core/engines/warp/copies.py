@@ -1,0 +1,90 @@
+"""Device copies of host arrays that several calls use, such as the arrays of Θ_{t−1}."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+
+MOST = 32
+"""Maximum number of copies per device: the arrays of about ten states."""
+
+
+class DeviceCopies:
+    """The most recently used device copies of host arrays, so that an array is uploaded only once.
+
+    A host array becomes read-only when a copy of it is stored, because the copy would not follow changes. Writable
+    views of other arrays are uploaded on each call. Callers must not modify the copies.
+
+    Args:
+        device: Warp device, such as "cpu" or "cuda:0".
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self._copies: OrderedDict[tuple[Any, ...], tuple[tuple[NDArray[Any], ...], wp.array]] = OrderedDict()
+
+    def of(self, array: NDArray[Any], dtype: object) -> wp.array:
+        """Returns a device copy of an array.
+
+        Args:
+            array: host array of N rows.
+            dtype: Warp type of a row, such as ``wp.vec3``.
+        """
+        return self.derived(lambda: array, dtype, array)
+
+    def derived(self, compute: Callable[[], NDArray[Any]], dtype: object, *sources: NDArray[Any]) -> wp.array:
+        """Returns a device copy of an array that is computed from other arrays.
+
+        Args:
+            compute: function that returns the array [N, …]; only called if no copy is stored.
+            dtype: Warp type of a row.
+            sources: arrays that determine the result.
+        """
+        key = self._key(dtype, sources)
+        entry = self._copies.pop(key, None)
+        if entry is None:
+            copy = wp.array(np.ascontiguousarray(compute()), dtype=dtype, device=self._device)
+            self.store(copy, *sources)
+            return copy
+        self._copies[key] = entry
+        return entry[1]
+
+    def store(self, copy: wp.array, *sources: NDArray[Any]) -> None:
+        """Stores a device array as the copy of an array, or of the array derived from several sources."""
+        for source in sources:
+            if source.base is not None and source.flags.writeable:
+                return
+        for source in sources:
+            source.flags.writeable = False
+        self._copies[self._key(copy.dtype, sources)] = sources, copy  # the reference keeps the identity unique
+        while len(self._copies) > MOST:
+            self._copies.popitem(last=False)
+
+    @staticmethod
+    def _key(dtype: object, sources: tuple[NDArray[Any], ...]) -> tuple[Any, ...]:
+        return (dtype, *(id(source) for source in sources))
+
+
+@cache
+def copies_on(device: str) -> DeviceCopies:
+    """Returns the copies on a device, which all engines and renderers of this process share."""
+    return DeviceCopies(device)
+
+
+def features_on(copies: DeviceCopies, state: Gaussians) -> wp.array:
+    """Returns the features of a state's colours and labels, [N] vec4 without gloss."""
+    return copies.derived(lambda: state.features(state.colours), wp.vec4, state.colours, state.foreground)
+
+
+def as_numbers(rows: wp.array) -> wp.array:
+    """Returns a [N, C] float32 view of N contiguous vectors or matrices of C numbers, without copying."""
+    shape = rows.shape[0], wp.types.type_size(rows.dtype)
+    return wp.array(ptr=rows.ptr, dtype=wp.float32, shape=shape, device=rows.device)

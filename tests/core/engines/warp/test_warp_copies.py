@@ -1,0 +1,68 @@
+"""Device copies of host arrays: uploaded once, never out of date, bounded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
+
+import warp as wp
+from warp_cases import DEVICE
+
+from scas4d_core.engines.warp.copies import MOST, DeviceCopies, features_on
+from scas4d_core.gaussians import Gaussians
+
+
+@pytest.fixture
+def copies() -> DeviceCopies:
+    return DeviceCopies(DEVICE)
+
+
+def points(value: float = 1) -> np.ndarray:
+    return np.full((4, 3), value, np.float32)
+
+
+def test_an_array_is_uploaded_once_and_becomes_read_only(copies: DeviceCopies) -> None:
+    array = points()
+    copy = copies.of(array, wp.vec3)
+    assert copies.of(array, wp.vec3) is copy
+    assert np.array_equal(copy.numpy(), array)
+    with pytest.raises(ValueError, match="read-only"):
+        array[0] = 2
+
+
+def test_a_view_that_may_change_is_uploaded_each_time(copies: DeviceCopies) -> None:
+    array = points()
+    copies.of(array[1:], wp.vec3)
+    array[1:] = 2
+    assert (copies.of(array[1:], wp.vec3).numpy() == 2).all()
+
+
+def test_equal_arrays_are_not_confused_when_one_is_freed(copies: DeviceCopies) -> None:
+    for value in range(3 * MOST):  # memory of arrays, and with it their ids, is used again
+        assert (copies.of(points(value), wp.vec3).numpy() == value).all()
+
+
+def test_the_copies_used_last_are_kept(copies: DeviceCopies) -> None:
+    first, second = points(), points()
+    kept, dropped = copies.of(first, wp.vec3), copies.of(second, wp.vec3)
+    for value in range(MOST - 1):
+        copies.of(points(value), wp.vec3)
+        assert copies.of(first, wp.vec3) is kept
+    assert copies.of(second, wp.vec3) is not dropped
+
+
+def test_features_follow_colours_and_labels(copies: DeviceCopies) -> None:
+    state = Gaussians.of_points(points(), radius=0.1, colours=[1, 0.5, 0])
+    features = features_on(copies, state)
+    assert np.array_equal(features.numpy(), state.features(state.colours))
+    assert features_on(copies, state.replace(means=state.means + 1)) is features
+    other = state.replace(foreground=np.zeros(4, np.float32))
+    assert (features_on(copies, other).numpy()[:, 3] == 0).all()
+
+
+def test_an_array_computed_on_the_device_is_a_copy(copies: DeviceCopies) -> None:
+    host, device = points(), wp.array(points(), dtype=wp.vec3, device=DEVICE)
+    copies.store(device, host)
+    assert copies.of(host, wp.vec3) is device
