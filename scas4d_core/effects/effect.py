@@ -1,4 +1,4 @@
-"""Interface of an effect: its user-facing texts, its part of an update, and the evidence for it.
+"""Interface that every effect implements: texts for users, a contribution to updates, and evidence.
 
 Effect modules must not import Numba or torch at import time, because the validation of settings imports them.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class EffectGroup(StrEnum):
-    """Groups of related effects."""
+    """A group of related effects."""
 
     MOTION = "motion"
     COHERENCE = "coherence"
@@ -33,7 +33,7 @@ class EffectGroup(StrEnum):
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect; each effect module has one instance named ``EFFECT``.
+    """A named part of an update. Each effect module defines one instance, named ``EFFECT``.
 
     Attributes:
         name: key in ``effect_names.EFFECTS``.
@@ -41,12 +41,12 @@ class Effect:
         description: one sentence for users.
         disambiguation: how the effect is distinguished from other effects that could explain the same pixels.
         cost: additional cost of an update with the effect.
-        auto: whether the effect requires evidence to be switched on; otherwise it is on unless it is refused.
+        auto: whether only evidence switches the effect on. Other effects are on unless they are refused or pinned off.
         on_above: the effect is switched on if ``Evidence.share`` is at least this value.
         off_below: the effect is switched off if ``Evidence.share`` is below this value.
         without_masks: whether the effect can be on in a scene whose first frame has no masks.
-        committed_arrays: names of the effect's arrays in ``Attempt.carried`` that are committed with each frame; they
-            should be small. Only these arrays and those of ``first_frame_arrays`` survive the loss of a checkpoint.
+        committed_arrays: names of the effect's arrays in ``Attempt.carried`` that are committed with each frame. They
+            should be small. Only these arrays and those from ``first_frame_arrays`` survive the loss of a checkpoint.
     """
 
     name: str
@@ -65,7 +65,10 @@ class Effect:
         return None
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns arrays of frame 0 that the effect needs later, or None. Not called if the effect is pinned off."""
+        """Returns the arrays of frame 0 that the effect needs in later frames, or None if it needs none.
+
+        Not called if the effect is refused or pinned off.
+        """
         return None
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
@@ -73,33 +76,33 @@ class Effect:
         return None
 
     def on_at_first(self, seen: FrameObservation) -> bool:
-        """Returns whether the first frame switches the effect on; requires ``first_frame_arrays``."""
+        """Returns whether frame 0 switches the effect on. Called only if ``first_frame_arrays`` returned arrays."""
         return False
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the evidence from a frame, or None if there is none; the switch then stays unchanged."""
+        """Returns the evidence from a learnt frame, or None to leave the switch unchanged."""
         return None
 
     def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
-        """Returns arrays for later frames, besides those of the effect's part, or None to keep the existing arrays.
+        """Returns arrays for later frames that replace the effect's carried arrays, or None to keep the existing ones.
 
         Called after each learnt frame, before the evidence is computed. It is also called while the effect is off,
         unless it is pinned off.
 
         Args:
             seen: the learnt frame.
-            on: whether the effect took part in the update of the frame.
+            on: whether the effect was on during the update of the frame.
         """
         return None
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """Returns the result of a frame with Gaussians added, retired or revived.
 
-        Called while the effect is on, after each learnt frame and before its commit. Rows may not change anywhere
-        else. Existing rows keep their order: return ``replace(seen.result, gaussians=..., parents=..., carried=...)``
-        with Gaussians from ``Gaussians.concatenate``, ``retire`` and ``revive``. ``parents`` includes the parents from
-        previous effects. Arrays in ``carried`` with a row per Gaussian are extended afterwards: new rows are copies of
-        the parents' rows, or zeros.
+        Called while the effect is on, after each learnt frame and before its commit. No other method may change the
+        number or order of rows. Existing rows keep their order: return ``replace(seen.result, gaussians=...,
+        parents=..., carried=...)`` with Gaussians from ``Gaussians.concatenate``, ``retire`` and ``revive``.
+        ``parents`` must also contain the parents from previous effects. Afterwards, arrays in ``carried`` with one row
+        per Gaussian are extended by copies of the parents' rows, or by zeros for Gaussians without a parent.
         """
         return seen.result
 
@@ -109,7 +112,7 @@ class Effect:
 
 
 Refusal = tuple[str, str]
-"""Description of a problem, and its remedy."""
+"""The description of a problem, and its remedy."""
 
 
 def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:

@@ -1,4 +1,4 @@
-"""Evidence for an effect, and the committed frame from which it is computed."""
+"""Evidence for an effect, and the learnt frame from which it is computed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ class Evidence:
     """Evidence for an effect, from the frames processed so far.
 
     Attributes:
-        share: share (0…1) that the effect explains or would explain; compared with the effect's thresholds.
+        share: strength of the evidence (0…1), compared with the effect's thresholds. For most effects, it is the share
+            of the error, pixels or Gaussians that the effect explains or would explain.
         text: human-readable explanation, such as "camera c2 is off by 0.8 pixels".
     """
 
@@ -34,7 +35,7 @@ class FitTime:
     Attributes:
         end: ``perf_counter`` value at which fits must end, or None if there is no limit.
         spent: time spent on fits, in seconds.
-        postponed: descriptions of fits for which there was no time; the next frame detects their objects again.
+        postponed: descriptions of the fits for which there was no time. The next frame detects their objects again.
     """
 
     end: float | None = None
@@ -44,7 +45,7 @@ class FitTime:
 
 @dataclass(frozen=True, eq=False)
 class FrameObservation:
-    """A learnt frame, as input for the evidence of effects.
+    """A learnt frame, from which effects compute their evidence and add or retire Gaussians.
 
     Attributes:
         index: index of the frame.

@@ -1,7 +1,7 @@
-"""On/off switches of a scene's effects, which are pinned by the settings or decided from evidence, with hysteresis.
+"""On/off switches of a scene's effects, which are pinned by the settings or set by evidence, with hysteresis.
 
 A switch changes between two frames. It is committed with the frame whose evidence changed it. A resumed scene continues
-with the switches of its checkpoint, so that a replay makes the same decisions.
+with the switches of its checkpoint, so a replay makes the same decisions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Switch:
     """The switch of one effect.
 
     Attributes:
-        on: whether the effect takes part in updates.
+        on: whether the effect contributes to updates.
         since: index of the frame after which the switch last changed.
         pinned: whether the settings pin the switch.
         share, text: latest evidence; see ``Evidence``.
@@ -46,7 +46,7 @@ class Switch:
 
 Switches = Mapping[str, Switch]
 NO_EVIDENCE: Mapping[str, Evidence] = MappingProxyType({})
-"""No evidence for any effect."""
+"""Empty mapping, used if there is no evidence for any effect."""
 
 
 def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
@@ -140,7 +140,7 @@ def _decide_switch(name: str, switch: Switch, settings: Settings, seen: FrameObs
 
 
 def first_frame_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Arrays]:
-    """Returns the arrays that the effects keep from the first frame, keyed by effect name."""
+    """Returns the arrays of the first frame that the effects need in later frames, keyed by effect name."""
     by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
@@ -186,7 +186,7 @@ def switches_after_first_frame(
     """Returns the switches after the first frame.
 
     Args:
-        found: arrays returned by ``first_frame_arrays``.
+        found: arrays returned by ``first_frame_arrays``, keyed by effect name.
         switches: switches before the first frame.
         seen: the first frame.
     """

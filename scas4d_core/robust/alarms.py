@@ -1,4 +1,4 @@
-"""Alarms point out conditions that need attention after a frame. They are raised only here; other modules show them.
+"""Alarms, which point out conditions that need attention after a frame. Only this module raises them.
 
 Alarms are derived from values that an update computes anyway. A camera is compared with its own past and with the other
 cameras of the frame. A change that all cameras see is not attributed to a single camera. Because a single frame may be
@@ -21,17 +21,17 @@ from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
 """Maximum deviation of one colour channel from the other two, relative to the camera's past and the other cameras. The
-first value applies to two consecutive frames, the second to a single frame. Clean captures reach 0.03."""
+first value applies to two consecutive frames, and the second to a single frame. Clean captures reach 0.03."""
 GAIN = (0.15, 0.25)
-"""Maximum common deviation of all channels, as in ``TINT``. Clean captures reach 0.09, for a sheet seen edge-on."""
+"""Same as ``TINT``, but for the common deviation of all channels. Clean captures reach 0.09, for a sheet edge-on."""
 SPREAD = 4.0
 """``TINT`` and ``GAIN`` are raised to at least this multiple of the median deviation over the cameras of the frame.
 If all cameras fit badly, as on small images, colours are unreliable."""
 SHARPNESS = (0.12, 0.2)
-"""Maximum deviation of the log sharpness, as in ``TINT``. Clean captures reach 0.07; a blur of one pixel causes
-0.42."""
+"""Same as ``TINT``, but for the deviation of the log sharpness. Clean captures reach 0.07, and a blur of one pixel
+causes 0.42."""
 FOLLOWS = 0.2
-"""Rate at which the usual colours and sharpness of a camera follow new values; paused while these are suspect."""
+"""Rate at which the usual colours and sharpness of a camera follow new values, except while these are suspect."""
 ROW = 2
 """Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
@@ -91,7 +91,7 @@ def alarms_of(
     same: Collection[str],
     left_out: Collection[str] = (),
 ) -> tuple[list[Alarm], Past]:
-    """Returns the alarms of an update, except those for excluded cameras, and the past updated for the next frame.
+    """Returns the alarms of an update, except those of excluded cameras, and the past for the next frame.
 
     Args:
         past, after: usual values before and after the frame.
@@ -101,8 +101,8 @@ def alarms_of(
         offsets: offset of each camera above (+) or below its usual fit, in dB.
         colours: ``colours_of`` for each rendered camera.
         sharp: ``sharpness_of`` for each image of the frame.
-        same: cameras whose image is bit-identical to the previous one.
-        left_out: excluded cameras, which have a separate alarm.
+        same: names of the cameras whose image is bit-identical to the previous one.
+        left_out: names of the excluded cameras, for which ``left_out_alarms`` returns the alarms.
     """
     count = len(sharp)
     found = _frame_alarms(outcome, reason, exposure, same, count)
@@ -206,12 +206,12 @@ def _check_camera(
 
 
 def odd_channel_change(change: Numbers) -> float:
-    """Returns how much one of three channels changed relative to the other two."""
+    """Returns the largest change of one of three channels relative to their median."""
     return float(np.abs(change - np.median(change)).max())
 
 
 def common_change(change: Numbers) -> float:
-    """Returns how much three channels changed together."""
+    """Returns the change that three channels share, which is their median change."""
     return float(np.median(change))
 
 

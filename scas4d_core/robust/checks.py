@@ -3,12 +3,12 @@
 A black frame contains no invalid values, but 100 iterations on it would turn the scene black. Lights flicker, and
 auto-exposure changes all cameras together. If such a change were learnt as colours, it would have to be unlearnt in the
 next frame. Its gain is therefore removed from the images. The gain is measured relative to the previous scene, as the
-median over pixels, because in most pixels only the lighting has changed. A lighting change that persists, or continues
-from frame to frame like a dimming lamp, is treated differently (``solve_frame``): the scene's colours are scaled by the
-gain, and the images are unchanged.
+median over pixels, because in most pixels only the lighting has changed. A lighting change may also persist, or
+continue from frame to frame like that of a dimming lamp. ``solve_frame`` then scales the scene's colours by the gain
+and leaves the images unchanged.
 
 A frame may repeat the images of the previous frame, because a camera runs at half the rate of its rig or an idle rig
-resends its last frame. Nothing is learnt from such a frame, and it does not count as a pause in the motion: the next
+resends its last frame. Nothing is learnt from such a frame. It does not count as a pause in the motion, so the next
 frame starts from the motion before the repeated images.
 
 A state that is not finite, bounded and plausible is never committed. Single faulty Gaussians keep their previous state.
@@ -35,14 +35,13 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 EXPOSURE = 1.05
-"""Brightness ratio, as the median over cameras, above which a frame's exposure differs. Clean captures reach 1.04."""
+"""Median brightness ratio over cameras above which the exposure of a frame differs. Clean captures reach 1.04."""
 ALIKE = 1.03
 """Maximum ratio between consecutive brightness steps of a light that changes continuously. A lamp that crosses a room
-and dims to half its brightness in ten frames has 1.017; flickering lights have no similar steps."""
+and dims to half its brightness in ten frames has a ratio of 1.017. Flickering lights have no similar steps."""
 ENOUGH = 8
-"""Minimum number of cameras for estimating exposure: a turning object can change the brightness of one image by a
-third.
-"""
+"""Minimum number of cameras for estimating exposure. A turning object can change the brightness of one image by a
+third."""
 UNUSABLE = 2.0
 """Brightness ratio above which the lighting is too different to learn from the frame."""
 BLIND = 0.05
@@ -58,7 +57,7 @@ SATURATED = 0.99
 """Channel value, 0…1, at which a pixel is saturated and only provides a lower bound on the brightness."""
 
 EVERY = 4
-"""Row and column stride of the pixels in a fingerprint; two images of a camera are never identical by chance."""
+"""Row and column stride of the pixels in a fingerprint. Two images of a camera are never identical by chance."""
 
 
 def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
@@ -72,15 +71,15 @@ def brightness_of(picture: NDArray[np.uint8]) -> float:
 
 
 def brightness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
-    """Returns the brightness of each camera's image."""
+    """Returns ``brightness_of`` each camera's image, keyed by camera name."""
     return {name: brightness_of(picture) for name, picture in pictures.items()}
 
 
 def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, dict[str, str], str | None]:
-    """Compares the brightness of a frame's images with the usual one, before anything is rendered.
+    """Compares the brightness of a frame's images with their usual brightness, before anything is rendered.
 
     Args:
-        past: usual values of the scene; excluded cameras stay excluded (``outliers.past_after_update``).
+        past: usual values of the scene. Excluded cameras stay excluded (``outliers.past_after_update``).
         bright: brightness of each camera's image.
 
     Returns:
@@ -109,7 +108,7 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
 
 
 def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
-    """Returns the median ratio of the cameras' brightness to the previous frame, or 1 if too few cameras are usable."""
+    """Returns the median ratio of the images' brightness to the last frame, or 1 if too few cameras are usable."""
     ratios = [
         value / past.last_brightness[name]
         for name, value in bright.items()
@@ -183,7 +182,7 @@ def measure_light_gain(renderer: Renderer, state: Gaussians, views: Sequence[Tra
 
 
 def with_light_gain(state: Gaussians, gain: float) -> Gaussians:
-    """Returns the state with colours scaled by ``gain``; colours are clipped at white."""
+    """Returns the state with its colours scaled by ``gain``, but not raised above white."""
     colours = state.colours
     return state.replace(colours=np.minimum(np.float32(gain) * colours, np.maximum(colours, np.float32(1))))
 
@@ -196,7 +195,7 @@ def _shown(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
 
 
 def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None:
-    """Returns the median ratio over usable cameras, or None if there are none."""
+    """Returns the median brightness ratio of views to renderings over usable cameras, or None if there are none."""
     ratios = [ratio for view, now in zip(views, shown, strict=True) for ratio in _ratio(view.target[:LABEL], now)]
     return float(np.median(ratios)) if ratios else None
 
@@ -209,7 +208,7 @@ def _ratio(picture: Array, shown: Array) -> list[float]:
 
 
 def _without(view: TrainingView, gain: float, shown: Array) -> Array:
-    """Returns the view's planes divided by the gain; saturated pixels are at least as bright as the rendering."""
+    """Returns the view's image divided by the gain, with saturated pixels at least as bright as the rendering."""
     target = view.target.copy()
     saturated = target[:LABEL] >= SATURATED
     target[:LABEL] /= np.float32(gain)
@@ -225,13 +224,13 @@ SHRUNK, STRETCHED = 0.1, 10.0
 """Bounds of an axis length relative to its length in frame 0. Over thousands of updates, small residuals add up and
 lengths would drift without limit (docs/stability.md, Long runs). An axis outside the bounds is clamped and counted."""
 BRIGHTEST = 8.0
-"""Maximum absolute value of a colour; cameras record 0…1, and camera gains extend this range."""
+"""Maximum absolute value of a colour. Cameras record 0…1, and camera gains extend this range."""
 FEW = 0.01
-"""Maximum share of moving Gaussians that keep their previous state; with more, the update is implausible."""
+"""Maximum share of moving Gaussians that keep their previous state. With more, the update is implausible."""
 
 
 def axis_lengths(gaussians: Gaussians) -> Array:
-    """Returns the [N, 3] axis lengths in metres."""
+    """Returns the [N, 3] axis lengths of Gaussians, in metres."""
     lengths: Array = np.sqrt(np.square(gaussians.factors).sum(axis=1))
     return lengths
 
@@ -249,7 +248,7 @@ def check_plausible(
         first: [N, 3] ``axis_lengths`` of frame 0, or None to limit axes only by ``LONGEST``.
 
     Returns:
-        The result with a state that may be committed, and None. If the whole state is implausible: the result with the
+        The result with a state that may be committed, and None. If the whole state is implausible, the result with the
         state ``before``, and the reason.
     """
     after = result.gaussians
@@ -278,7 +277,7 @@ def check_plausible(
 
 
 def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:
-    """Clamps the axis lengths to their bounds, and returns how many were changed.
+    """Returns the state with the axis lengths clamped to their bounds, and the number of clamped axes.
 
     Args:
         after: state to clamp.
@@ -317,5 +316,5 @@ def _pairs(before: Gaussians, after: Gaussians) -> list[tuple[str, NDArray[np.fl
 
 
 def _like(rows: NDArray[np.bool_], array: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns the mask of rows, reshaped to [N, 1, …] to match an array [N, …]."""
+    """Returns the mask of rows [N], reshaped to [N, 1, …] to match an array [N, …]."""
     return rows.reshape(-1, *[1] * (array.ndim - 1))

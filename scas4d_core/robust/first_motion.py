@@ -1,9 +1,9 @@
-"""Runs a scene's first update in several view orders, as it has no previous motion and later updates depend on it.
+"""First update of a scene, which runs in several view orders because there is no previous motion to start from.
 
-Which local minimum it reaches is a matter of chance. With a bad order, it ends 1 to 5 dB below other orders, and later
-updates do not recover. The orders also differ in their learning rates, because steps that are too large for one scene
-are too small for another. The errors in all training views decide which result is best; a few small images are not
-sufficient (docs/method.md).
+Which local minimum the update reaches is a matter of chance. With a bad order, it ends 1 to 5 dB below other orders,
+and later updates do not recover. The orders also differ in their learning rates, because steps that are too large for
+one scene are too small for another. The errors in all training views decide which result is best. A few small images
+are not sufficient (docs/method.md).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
     An update that needs no iterations is not repeated.
 
     Args:
-        run: function that runs the update with a seed and a factor on the layers' rates.
+        run: function that takes a seed and a factor on the layers' rates, and runs the update.
         seed: seed of the first order.
     """
     ends: list[OrderResult] = []

@@ -1,4 +1,4 @@
-"""Outlying cameras and frames: each camera is compared with its own past and with the other cameras of the frame.
+"""Outlying cameras and frames, detected by comparing each camera with its own past and with the other cameras.
 
 The comparison uses values that an update computes anyway: the fit of each camera when it was first and last rendered,
 and the mean brightness of its image (``checks``). A camera that fits much worse than the others is excluded. A change
@@ -20,33 +20,33 @@ FIRST_DB = -9.0
 """Offset from a camera's usual level, when first rendered, below which it is excluded at once. Clean captures reach
 -6.1."""
 LAST_DB = -5.0
-"""Same as ``FIRST_DB``, but when last rendered; the camera is then excluded from the next frame on. Clean captures
+"""Same as ``FIRST_DB``, but when last rendered. The camera is then excluded from the next frame on. Clean captures
 reach -3.7, and cameras that moved by one or two pixels reach -6 to -15."""
 NEAR_DB = -4.0
-"""Offset below which a camera is suspect. Its usual level is then not updated, so that a lasting fault remains visible;
-two consecutive frames raise an alarm. Clean captures reach -3.7."""
+"""Offset below which a camera is suspect. Its usual level is then not updated, so a lasting fault remains visible. Two
+consecutive suspect frames raise an alarm. Clean captures reach -3.7."""
 FITS_DB = -4.0
-"""Offset above which an excluded camera is accepted again; until then, colours follow only the other cameras."""
+"""Offset above which an excluded camera is accepted again. Until then, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""
 DROP_DB = 6.0
-"""Drop of the cameras' median PSNR below its usual value at which an update has not fitted its frame."""
+"""Drop of the cameras' median PSNR below its usual value from which an update has not fitted its frame."""
 DROPS_DB = (14.0, 9.0, 9.0)
-"""Same as ``DROP_DB``, but for the first updates, when the usual value is only known from frame 0 or a longer
+"""Same as ``DROP_DB``, but for the first updates, when the usual value is known only from frame 0 or a longer
 update."""
 HALVED_DB = 3.0
-"""Additional tolerance per halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 cost 3.2."""
+"""Additional tolerance per halving of the iterations. On the captures, 100 to 50 cost 1.7 dB, and 50 to 25 cost 3.2."""
 BEHIND_DB = 1.5
-"""Drop above which the update of the first frames after rejected ones is continued, because objects have moved on."""
+"""Drop above which updates after rejected or skipped frames are continued, because objects have moved on."""
 RESTS_DB = 3.0
-"""Drop up to which a scene without visible motion counts as static; noise that frame 0 fits costs 1 to 2 dB."""
+"""Drop up to which a scene without visible motion counts as static. Noise that frame 0 fits costs 1 to 2 dB."""
 CATCH_UP = 3
 """Maximum number of consecutive frames after a rejected or skipped frame that count as lagging."""
 MAX_OUT = 0.5
-"""Maximum share of excluded cameras; if more do not fit, the frame itself has changed."""
+"""Maximum share of excluded cameras. If more do not fit, the frame itself has changed."""
 
 CLEAN_DB = 40.0
-"""Upper limit of PSNR values: above it, 5 dB correspond to a thousandth of the value range and indicate no fault."""
+"""Upper limit of PSNR values. Above it, 5 dB correspond to a thousandth of the value range and indicate no fault."""
 
 ERROR_RISE = 1.02
 """Maximum factor by which the usual error of a probe view rises per update."""
@@ -77,11 +77,11 @@ class Past:
         fitted: time of the last learnt frame, in seconds.
         lagging_frames: number of frames since a rejected or skipped frame; 0 once the PSNR is back to normal.
         iterations: number of iterations of the last update.
-        error: usual error at the end of an update, for each probe view.
+        error: usual error at the end of an update, keyed by probe view.
         light: brightness ratio of the last frame; see ``checks.check_brightness``.
-        light_frames: number of consecutive brighter, or darker, frames.
-        last_brightness: mean of each camera's image in the last frame, in any lighting.
-        brightness_ratio: brightness of the last frame relative to the previous frame.
+        light_frames: number of consecutive frames that were all brighter, or all darker, than usual.
+        last_brightness: mean of each camera's latest image, 0…1, in any lighting.
+        brightness_ratio: brightness of the last frame relative to the frame before it.
         camera_figures: figures of each camera for alarms; see ``alarms.CameraFigures``.
         timing: figures of each camera for its timing; see ``timing.CameraTimingSums``.
     """
@@ -105,7 +105,7 @@ class Past:
 
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
-        """Returns the past after frame 0, from the PSNR in dB and the image brightness of each camera."""
+        """Returns the past after frame 0, from the PSNR in dB and the mean image brightness of each camera."""
         psnr = _capped(psnr)
         level = float(np.median(list(psnr.values()))) if psnr else nan
         places = {name: psnr.get(name, nan) - level for name in bright}
@@ -177,7 +177,7 @@ def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str
 
 
 def past_in_light(past: Past, gain: float) -> Past:
-    """Returns the past with its usual values adapted to the new lighting; errors are larger in brighter light."""
+    """Returns the past adapted to lighting that is ``gain`` times as bright. Brighter light causes larger errors."""
     brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
     return replace(past, brightness=brightness, level=level, error={}, light=1.0, light_frames=0)
@@ -194,7 +194,7 @@ def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
-    """Returns the cameras that fit much worse than usual, mapped to the reason.
+    """Returns the cameras that fit much worse than usual, mapped to the reason, or none if most cameras do.
 
     Args:
         past: usual values of the cameras.
@@ -226,7 +226,7 @@ def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) ->
     Args:
         past: usual values before the update.
         psnr: PSNR of each camera when last rendered, in dB.
-        iterations: number of iterations; a lower PSNR is accepted if there were fewer than in the previous update. 0
+        iterations: number of iterations. If there were fewer than in the previous update, a lower PSNR is accepted. 0
             means the same number.
     """
     if not psnr or past.level != past.level:
@@ -280,10 +280,10 @@ def past_after_update(
         past: usual values before the update.
         psnr: PSNR of each camera in dB: when last rendered for used cameras, at the end of the update for excluded
             cameras.
-        bright: brightness of each image of the frame.
+        bright: mean of each camera's image, 0…1.
         exposure: brightness ratio of the frame.
         iterations: number of iterations of the update; 0 means as in the previous update.
-        moved: whether this or an earlier update changed the state; otherwise, the usual values of updates are unknown.
+        moved: whether this or an earlier update changed the state. Otherwise, the usual values of updates are unknown.
     """
     psnr = _capped(psnr)
     off = offsets(past, psnr)
@@ -329,7 +329,7 @@ def past_after_update(
 def usual_errors(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
     """Returns the usual error of each view, which falls immediately but rises slowly.
 
-    Otherwise, after the large error of a noisy frame, the next good frame would be skipped although objects moved.
+    If it rose immediately, the frame after a noisy frame could be skipped although objects moved.
     """
     return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}
 
@@ -340,5 +340,5 @@ def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def unless_most(found: dict[str, Fault], count: int) -> dict[str, Fault]:
-    """Returns the problems of the cameras, or none if most of the ``count`` cameras have a problem."""
+    """Returns the problems of the cameras, or none if more than ``MAX_OUT`` of the ``count`` cameras have one."""
     return found if len(found) <= MAX_OUT * count else {}

@@ -1,4 +1,4 @@
-"""Relocates an object after a jump: the update only tracks motion up to about the object's size.
+"""Relocation of an object after a jump, because an update tracks motion only up to about the object's size.
 
 Each image is compared with a rendering of the scene without moving Gaussians; pixels that differ show the object. The
 rays of all cameras through the object's centre are intersected, once for the images and once for renderings of the
@@ -26,7 +26,7 @@ SMALLEST_AREA = 0.25
 CAMERAS = 3
 """Minimum number of cameras with a plausible object area."""
 AGREE = 0.25
-"""Maximum RMS distance of the rays from their intersection, relative to the displacement; above it, they disagree."""
+"""Maximum RMS distance of the rays from their intersection, relative to the displacement, at which cameras agree."""
 
 
 def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Renderer, rig: Rig) -> Float | None:
@@ -80,7 +80,7 @@ def _ray(camera: Camera, pixels: NDArray[np.bool_]) -> tuple[Float, Float]:
 
 
 def _meeting(rays: Sequence[tuple[Float, Float]]) -> tuple[Float, float]:
-    """Returns the [3] point nearest to all rays, and its RMS distance from them."""
+    """Returns the [3] point with the smallest RMS distance to all rays, and that distance."""
     across = [np.eye(3) - np.outer(direction, direction) for _, direction in rays]
     left = np.sum(across, axis=0)
     right = np.sum([matrix @ origin for matrix, (origin, _) in zip(across, rays, strict=True)], axis=0)

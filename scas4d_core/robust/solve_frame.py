@@ -47,8 +47,8 @@ LADDER = (
 """Options of additional attempts, which are made in order until the resulting state is plausible."""
 
 SEARCH = AttemptOptions("longer search", cold=True, iteration_factor=5.0)
-"""Options of a search from the position that silhouettes suggest or from the end of the update. If two of three frames
-of robot are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB with a factor of 2."""
+"""Options of a search from the position that silhouettes suggest, or from the end of the update. If two of three frames
+of `robot` are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB with a factor of 2."""
 
 
 Solved = tuple[UpdateResult, Past]
@@ -58,10 +58,10 @@ Validated = tuple[UpdateResult, str | None]
 
 
 class FrameSolver:
-    """Solves the frames of a scene.
+    """Solves the frames of a scene with updates, retries and searches.
 
     Args:
-        updater: updates the scene's frames.
+        updater: runs the updates of the scene.
         factory: factory that creates the scene's training views.
         renderer: renderer with the background and limits of the settings.
         settings: update settings.
@@ -80,13 +80,16 @@ class FrameSolver:
         self.check_seconds = 0.0
 
     def run(self, given: UpdateInput) -> Solved:
-        """Solves a frame. If the frame is rejected, the state and motion of the input are returned unchanged."""
+        """Returns the result of a frame, and the usual values after it.
+
+        If the frame is rejected, the result contains the state and the motion of the input.
+        """
         result, past = self._solve(given)
         with self._time_checks():
             return self._with_alarms(given, result, past)
 
     def _with_alarms(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
-        """Adds the camera health, the alarms and the camera timing to a result."""
+        """Returns a result with the camera health, the alarms and the camera timing added, and the usual values."""
         if self._settings.reject_outliers:
             past = timing.record_timing(
                 past, given.state, result, self._renderer, given.seconds, given.step, given.seed
@@ -171,9 +174,11 @@ class FrameSolver:
         return "no motion detected" if level > given.past.level - outliers.RESTS_DB else None
 
     def _retry_with_light_gain(self, given: UpdateInput) -> Solved | None:
-        """Solves a frame under permanently changed lighting by scaling the colours; None if no gain is measured.
+        """Solves a frame under permanently changed lighting by scaling the colours of the scene.
 
-        If the lighting is unchanged, a new object makes the images brighter, which is no reason to reject them.
+        If the lighting is unchanged, a frame that seemed unusable is solved without scaling, because only a new object
+        made its images brighter or darker. Returns None if a usable frame has no changed lighting, or if no gain can be
+        measured.
         """
         gain = measure_light_gain(self._renderer, given.state, given.views)
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
@@ -204,10 +209,10 @@ class FrameSolver:
         return result, fault
 
     def _is_first_motion(self, given: UpdateInput, template: AttemptOptions) -> bool:
-        """Returns whether this is the first motion of a scene, and its update may take longer and has no time limit.
+        """Returns whether an attempt is the first with motion in a scene, and may take longer without a time limit.
 
-        A scene that resumes without its carry-over does not count: it has no usual values for its cameras. Nor does a
-        scene after rejected frames, for which a longer search has already been made.
+        A scene that resumes without its carry-over does not count, because it has no usual values for its cameras. Nor
+        does a scene after rejected frames, for which a longer search has already been made.
         """
         first = (
             given.motion is None
@@ -269,7 +274,7 @@ class FrameSolver:
         )
 
     def _attempt_deadline(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
-        """Returns the deadline of an attempt; after rejected frames, half of the time left is reserved for a search."""
+        """Returns the deadline of an attempt. After rejected frames, it reserves half of the time left for a search."""
         now = perf_counter()
         return (now + end) / 2 if given.past.rejected and template is AS_CONFIGURED and now < end else end
 
@@ -292,7 +297,7 @@ class FrameSolver:
         """Runs longer attempts from the position that silhouettes suggest, and from the end of ``tried``.
 
         The end of ``tried`` has been validated, because non-finite Gaussians cannot recover. Returns None if all
-        attempts fail.
+        attempts fail or there is no time for any.
         """
         if self._budget_is_spent(given, len(given.views)):
             attempts.append("no search: the time budget is used up")
@@ -366,17 +371,17 @@ class FrameSolver:
             return committed_errors(self._factory.rig, self._renderer, views, state)
 
     def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
-        """Returns the PSNR of each view for a state, in dB; excluded cameras that fit well are accepted again."""
+        """Returns the PSNR of a state in each view in dB, keyed by camera name."""
         return {view.name: self._renderer.compare(state, view).psnr for view in views}
 
 
 def _with_colours_of(state: Gaussians, before: Gaussians) -> Gaussians:
-    """Returns a state with the previous colours, because colours fitted to a wrong motion are misleading."""
+    """Returns the state with the colours of ``before``, because colours fitted to a wrong motion are misleading."""
     return state.replace(colours=before.colours)
 
 
 def _skipped(given: UpdateInput, trace: UpdateTrace, exposure: float, reason: str) -> Solved:
-    """Returns the unchanged Θ_{t−1}; nothing was rendered, so the usual values do not change."""
+    """Returns the result of a skipped frame, with the state, the motion and the usual fit of cameras unchanged."""
     past = replace(
         given.past, rejected=0, lagging_frames=max(1, given.past.lagging_frames)
     )  # the motion may continue from here or from farther away

@@ -1,10 +1,10 @@
 """Camera timing: without genlock, cameras capture images up to half a frame before or after the other cameras.
 
 After an update, a few cameras are measured (different cameras in each frame). Moving Gaussians move from Θ_{t−1} to Θ_t
-within a frame. Renderings extrapolated forward and backward by half of this motion predict images of other times. They
-explain the residual of the image relative to Θ_t, and the fraction of the motion that fits best is the capture time.
-Measurements of a camera are averaged with exponential forgetting. An offset that all cameras share is a tracking lag,
-so the median over cameras is defined as 0. Nothing is corrected: no state depends on these values.
+within a frame. Renderings extrapolated forward and backward by half of this motion predict images of other times. The
+capture time is the fraction of the motion that best explains the residual of the image relative to Θ_t. Measurements of
+a camera are averaged with exponential forgetting. An offset that all cameras share is a tracking lag, so the median
+over cameras is defined as 0. Nothing is corrected, and no state depends on these values.
 """
 
 from __future__ import annotations
@@ -25,11 +25,10 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.update.result import UpdateResult
 
 LOOKS, ITERATIONS = 4, 25
-"""Maximum number of measured cameras per frame, and number of iterations of the update per measured camera; each camera
-needs two renderings.
-"""
+"""Maximum number of measured cameras per frame, and minimum number of iterations of the update per measured camera.
+Each camera needs two or three renderings."""
 HALF = 0.5
-"""Fraction of a frame's motion by which moving Gaussians are extrapolated; larger offsets are not expected."""
+"""Fraction of a frame's motion by which moving Gaussians are extrapolated. Larger offsets are not expected."""
 STEEP = 0.02
 """Minimum change of a pixel value (0…1) in half a frame that is above noise."""
 BRIGHT = 0.98
@@ -37,24 +36,24 @@ BRIGHT = 0.98
 FEW, MOST = 50, 1500
 """Minimum and approximate maximum number of changing pixels that are used."""
 CAUCHY, QUIETEST = 2.4, 1 / 255
-"""As in ``effects.cameras.alignment``: large residuals get less weight, and the lower bound is quantization noise."""
+"""Residual at which the Cauchy weight is one half, and lower bound on the usual residual; see ``alignment``."""
 SMALLEST = 1e-6
 """Regularization of possibly singular equations, relative to the square of each unknown."""
 NEIGHBOURS = 10.0
-"""Approximate number of pixels with correlated errors; variances are multiplied by it."""
+"""Approximate number of pixels with correlated errors. Variances are multiplied by this number."""
 USUAL = 0.1
 """Variation of a camera's measurements in fast motion, in frames, caused by tracking lag and curved motion."""
 FARTHEST = 0.75
-"""Limit to which a measured offset is clamped, in frames: motion that reverses has no measurable shift."""
+"""Limit to which a measured offset is clamped, in frames. Motion that reverses has no measurable shift."""
 KEEPS = 0.95
-"""Factor applied to earlier measurements' weights at each new one; effectively, the last forty count."""
+"""Factor by which each new measurement multiplies the weights of earlier ones. Effectively, the last forty count."""
 ENOUGH = 2.5
 """Minimum effective number of measurements for a mean to count as known."""
 CAMERAS = 4
-"""Minimum number of cameras with known means for a median; with fewer, a camera that is off cannot be identified."""
+"""Minimum number of cameras with known means for a median. With fewer, a camera that is off cannot be identified."""
 APART = 0.02
-"""Measured difference between the means of synchronized cameras on captures, in frames; added to each standard error in
-quadrature."""
+"""Measured difference between the means of synchronized cameras on captures, in frames. It is added to each standard
+error in quadrature."""
 MAX_ERROR = 0.1
 """Maximum standard error of a reported mean, in frames."""
 OFF, SURE = 0.15, 4.0
@@ -67,7 +66,7 @@ Row = tuple[float, ...]
 
 
 class PictureTiming(NamedTuple):
-    """Capture time of one image relative to the state: ``offset`` in frames (+ if later), and its ``variance``."""
+    """Capture time of an image relative to the state: ``offset`` in frames, positive if later, and its ``variance``."""
 
     offset: float
     variance: float
@@ -81,7 +80,7 @@ class CameraTimingSums:
         weight: sum of weights.
         squares: sum of squared weights.
         offset: weighted sum of the offsets after the state, in seconds.
-        spread: weighted sum of the squared offsets.
+        spread: weighted sum of the squared offsets, in square seconds.
         frame: weighted sum of frame durations, in seconds.
         last: index of the last frame in which the camera was measured.
     """
@@ -135,8 +134,8 @@ def record_timing(
 ) -> Past:
     """Returns the past with measurements of some of a frame's cameras, or unchanged if the frame cannot be used.
 
-    Frames that were rejected, retried, skipped or lit differently cannot be used. Nor can the first frames with
-    motion. Excluded cameras are not measured.
+    Frames that were rejected, retried or skipped, or whose brightness changed, cannot be used. Nor can the first frames
+    with motion. Excluded cameras are not measured.
 
     Args:
         past: usual values after the frame.
@@ -219,7 +218,10 @@ def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Pic
 
 
 def timings(past: Past) -> dict[str, CameraTiming]:
-    """Returns the relative capture time of each camera for which it is known accurately enough."""
+    """Returns the relative capture time of each camera that has been measured accurately enough.
+
+    Returns an empty dictionary if there are fewer than ``CAMERAS`` such cameras.
+    """
     looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     known = {name: one for name, one in looks.items() if one.count >= ENOUGH and one.error <= MAX_ERROR}
     if len(known) < CAMERAS:

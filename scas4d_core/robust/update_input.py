@@ -1,4 +1,4 @@
-"""Input of one frame's update: the state, the images, and the values carried over from earlier frames."""
+"""Input of one frame's update: state, images, and values carried over from earlier frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.warm_start import Motion
 
 RESTING = 10
-"""Maximum number of initial frames that may count as static; objects enter only in frames that are not static."""
+"""Maximum number of initial frames that may count as static. Objects can enter only in frames that do not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,20 +24,20 @@ class UpdateInput:
 
     Attributes:
         state: previous state Θ_{t−1}.
-        motion: latest motion, or None.
+        motion: latest motion, or None for a cold start.
         seconds: time since the last learnt frame, in seconds.
         step: time since the previous frame, in seconds.
         views: training views used for the update.
         suspects: views of excluded cameras.
-        brightness: mean of each camera's image.
+        brightness: mean of each camera's image, 0…1, keyed by camera name.
         seed: seed of the update.
         past: usual values of the scene and its cameras.
         lengths: [N, 3] axis lengths in frame 0, in metres.
         exposure: brightness ratio of the frame; see ``checks.check_brightness``.
         light_moves: whether the lighting change continues from frame to frame; see ``checks.light_continues``.
         may_be_static: whether the images have shown no motion yet, in scenes that learn labels from motion.
-        same: cameras whose image equals that of the last accepted frame.
-        sharp: ``alarms.sharpness`` of each camera.
+        same: names of the cameras whose image equals that of the last accepted frame.
+        sharp: sharpness of each camera's image; see ``alarms.sharpness``.
         left_out: maps each camera excluded before the update to the reason.
         unusable: reason why nothing can be learnt from the frame, or None.
         carried: arrays carried over by the effects, keyed by effect name.

@@ -19,10 +19,10 @@ from threadpoolctl import threadpool_limits
 Int = NDArray[np.int64]
 
 KMEANS_ROUNDS = 30
-"""Maximum number of Lloyd iterations; the update needs compact clusters, not an optimum."""
+"""Maximum number of Lloyd iterations. The update needs compact clusters, not optimal ones."""
 
 KMEANS_SAMPLE_PER_CLUSTER = 256
-"""Number of points per cluster on which K-means is fitted; sampling bounds time and memory (330,000 of 1 M points)."""
+"""Maximum number of points per cluster to which K-means is fitted. Sampling bounds time and memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +103,10 @@ def build_hierarchy(
 
 
 def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
-    """Returns K-means labels [M]; empty clusters are removed.
+    """Returns the [M] K-means labels of points [M, 3], without empty clusters.
 
-    Points are centred and in float64, so that nearly equidistant points get the same label on every processor despite
-    differences in rounding.
+    Points are centred and in float64. Despite rounding differences between processors, nearly equidistant points thus
+    get the same label everywhere.
     """
     from sklearn.cluster import KMeans  # the import takes a second and is not needed for views and frame 0
 
@@ -122,10 +122,10 @@ def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
 
 
 def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
-    """Merges clusters into ``count`` larger ones, and returns the new labels [M].
+    """Returns the [M] labels after merging clusters into ``count`` larger ones.
 
     Agglomerative clustering of the centroids (as in the paper) initializes K-means over the clusters. K-means assigns
-    clusters at a border to the nearer parent, and keeps the layers nested. Without K-means, clusters that were merged
+    clusters at a border to the nearer parent and keeps the layers nested. Without K-means, clusters that were merged
     early would stay together even if they no longer belong together.
     """
     from sklearn.cluster import AgglomerativeClustering, KMeans

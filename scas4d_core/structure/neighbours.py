@@ -15,9 +15,9 @@ class Neighbours:
     """Neighbour graph over M Gaussians, in the order of the hierarchy.
 
     Attributes:
-        index: [M, k] int32 indices of the neighbours of each Gaussian.
+        index: [M, k] int32 indices of the neighbours of each Gaussian, 0 for missing neighbours.
         weights: [M, k] float32 weights exp(−falloff d²), 0 for missing neighbours.
-        distances: [M, k] float32 distances in metres when the graph was built.
+        distances: [M, k] float32 distances in metres when the graph was built, 0 for missing neighbours.
     """
 
     index: NDArray[np.int32]
@@ -26,7 +26,7 @@ class Neighbours:
 
 
 def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbours:
-    """Finds the ``count`` nearest neighbours of each Gaussian, or fewer if there are fewer Gaussians.
+    """Returns the graph of the ``count`` nearest neighbours of each Gaussian, or of all others if there are fewer.
 
     Args:
         means: [M, 3] positions in metres.

@@ -1,4 +1,4 @@
-"""Compares the candidates for Θ_t on a few training views: the end of an update, its warm start, and Θ_{t−1}.
+"""Comparison of the candidates for Θ_t on a few training views: the end of an update, its warm start, and Θ_{t−1}.
 
 An update may end at any time. The committed state is never worse than the previous state or the extrapolated motion.
 The probe views are the same in every frame, and the time to render them counts towards the update.
@@ -24,11 +24,10 @@ from scas4d_core.update.warm_start import Motion, warm_start
 VIEWS = 4
 """Number of probe views per frame."""
 SCALE = 0.5
-"""Scale of probe-view images; a quarter of the pixels is sufficient for comparing states."""
+"""Scale of probe-view images. A quarter of the pixels is sufficient for comparing states."""
 FEWEST = 80
-"""Minimum side of the scaled images, in pixels; if they are smaller, full-size images are compared. With 32, the
-extrapolated motion was preferred for ten consecutive frames while all cameras lost 1.2 dB.
-"""
+"""Minimum side of the scaled images, in pixels. If they are smaller, full-size images are compared. With a minimum of
+32, the extrapolated motion was preferred for ten consecutive frames while all cameras lost 1.2 dB."""
 ALIASED = 2.0
 """Ratio between the previous state's errors in small and full-size images above which full-size images are compared.
 Small images then show aliasing from Gaussians smaller than their pixels."""
@@ -50,16 +49,16 @@ WHOLE = " whole"
 """Suffix of the names of views compared at full size, in the errors kept across frames."""
 
 COMMITTED = " committed"
-"""Suffix, in the same errors, of the names of views in which a committed state was evaluated at full size."""
+"""Suffix of the names of views in which a committed state was evaluated at full size, in the same errors."""
 CONFIRMING = 2
-"""Number of views in which a committed state is evaluated; full-size images have four times as many pixels."""
+"""Number of views in which a committed state is evaluated. Full-size images have four times as many pixels."""
 SLOW = 0.5
-"""Relative excess error of Θ_{t−1} over Θ_t in small images up to which the next frame may be static; only then are
-full-size images evaluated."""
+"""Relative excess error of Θ_{t−1} over Θ_t in small images up to which the next frame may be static. Full-size images
+are evaluated only in this case."""
 
 
 def label_by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
-    """Returns errors with names that distinguish full-size images, whose errors are smaller, from scaled images.
+    """Returns errors under names that distinguish full-size images, whose errors are smaller, from scaled images.
 
     >>> label_by_size({"c0": 0.1}, whole=True)
     {'c0 whole': 0.1}
@@ -74,15 +73,15 @@ def probe_views(rig: Rig, views: Sequence[TrainingView], count: int = VIEWS) -> 
 
 
 class ProbeViews:
-    """Fixed training views for comparing states; the engine loads ``views`` as the probes of a frame.
+    """Fixed training views for comparing states. The engine loads ``views`` as the probes of a frame.
 
     Args:
         factory: factory of the rig's training views.
         engine: engine that computes the errors.
-        views: views of the frame, from which ``spread_cameras`` selects the probe views; if empty, nothing is compared.
+        views: views of the frame, from which the probe views are selected. If empty, nothing is compared.
 
     Attributes:
-        views: the probe views at full size, then the scaled ones if they are used.
+        views: the probe views at full size, followed by the scaled ones if they are used.
         whole: whether full-size images are compared; known after the first comparison.
     """
 
@@ -183,7 +182,7 @@ class BestState:
         return self._probes.whole
 
     def start(self, step: float | None = None) -> Tables:
-        """Starts the engine from the previous motion, or from no motion if that fits the frame better.
+        """Sets the engine to the previous motion, or to no motion if that fits better, and returns the deformation.
 
         Args:
             step: time since the previous frame in seconds, if that frame was skipped and the motion may have paused. If
@@ -201,7 +200,7 @@ class BestState:
         return tables
 
     def _try_after_pause(self, motion: Motion, step: float) -> Tables:
-        """Tries to extrapolate the motion only over the last ``step`` seconds, and keeps the better fit."""
+        """Extrapolates the motion only over the last ``step`` seconds if that fits better; returns the deformation."""
         whole, errors = self.seconds, self.errors[Candidate.WARM]
         self.seconds = step
         tables = self._set(motion)
@@ -248,16 +247,16 @@ class BestState:
         return (led - met) / (unmoved - met) if unmoved > met else 1.0
 
     def error(self) -> float:
-        """Returns the mean error on the probe views of the current state of the update."""
+        """Returns the mean error of the update's current state on the probe views."""
         errors = self._probes.errors(moved=True, learnt=True)
         return mean_error(errors, list(errors))
 
     def end(self, iterations: int, left_out: Mapping[str, str]) -> Candidate:
-        """Selects the best candidate and sets the engine's tables to it.
+        """Returns the best candidate, and sets the engine's tables to it.
 
         Args:
             iterations: number of iterations in the update.
-            left_out: cameras to ignore.
+            left_out: maps each camera to ignore to the reason.
         """
         if not self.errors:
             return Candidate.END
@@ -300,7 +299,7 @@ class BestState:
             self.errors[candidate] = errors
 
     def _full_size_error(self, learnt: bool, left_out: Mapping[str, str]) -> float:
-        """Returns the mean error on full-size images, without ignored cameras; infinity instead of NaN."""
+        """Returns the mean error on full-size images of all cameras not in ``left_out``, or infinity for NaN."""
         errors = self._probes.full_size_errors(moved=True, learnt=learnt)
         return _nan_to_inf(mean_error(errors, [name for name in errors if name not in left_out]))
 
@@ -310,7 +309,7 @@ class BestState:
 
 
 def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
-    """Returns whether the mean error of the views with a limit is at most the mean limit; false without such views.
+    """Returns whether the mean error of the views with a limit is at most the mean limit, or false without such views.
 
     >>> mean_is_within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), mean_is_within({"a": 1.0}, {"b": 2.0})
     (True, False)
@@ -320,5 +319,5 @@ def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> 
 
 
 def _nan_to_inf(value: float) -> float:
-    """Returns infinity for NaN, so that it sorts last."""
+    """Returns the value, or infinity for NaN, which then sorts last."""
     return value if value == value else np.inf

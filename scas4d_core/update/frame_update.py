@@ -38,7 +38,7 @@ class FrameUpdate:
     """Updates the frames of a scene for one hierarchy, on one engine.
 
     Args:
-        engine: engine that computes the updates; it is bound to the plan here.
+        engine: engine that computes the updates. The constructor binds it to the plan.
         built: plan and parts of the active effects.
         neighbours: neighbours of the moving Gaussians, or None if no term needs them.
 
@@ -46,7 +46,7 @@ class FrameUpdate:
         settings: settings of the updates.
         plan: plan of the updates.
         hierarchy: hierarchy of the moving Gaussians.
-        curve: whether to compute loss terms that only the report needs; they do not affect the state or the evidence.
+        curve: whether to compute loss terms that only the report needs, and that affect neither state nor evidence.
 
     Raises:
         EngineError: if the engine does not support the plan.
@@ -71,7 +71,7 @@ class FrameUpdate:
         options: AttemptOptions = AS_CONFIGURED,
         carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
-        """Finds the deformation D_t and applies it to Θ_{t−1}.
+        """Finds the deformation D_t, applies it to Θ_{t−1}, and returns the result.
 
         Args:
             previous: previous state Θ_{t−1}.
@@ -134,7 +134,7 @@ class FrameUpdate:
         return UpdateResult(state, after, trace, carried=attempt.carried, views=self._exposed(views))
 
     def _exclude_outliers(self, gate: Gate, attempt: Attempt, order: ViewPlan, trace: UpdateTrace) -> None:
-        """Excludes cameras that do not fit from the rest of an attempt; called once every camera has been rendered."""
+        """Excludes cameras that do not fit from the rest of an attempt, once every camera has been rendered."""
         trace.load_log(self._engine.log(), attempt.views)
         trace.left_out.update(gate(trace.first))
         excluded = [index for index, view in enumerate(attempt.views) if view.name in trace.left_out]

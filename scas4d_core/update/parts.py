@@ -48,7 +48,7 @@ class Attempt:
         views: training views that the attempt uses.
         rates: learning rates of this attempt.
         tables: initial deformation; a part may change it in ``begin``.
-        carried: arrays from the previous frame, keyed by effect name; in ``end``, parts replace them with the arrays
+        carried: arrays from the previous frame, keyed by effect name. In ``end``, parts replace them with the arrays
             for the next frame.
         gains: [cameras, 3] initial camera gains, or None if gains are not estimated.
         kept: candidate that becomes Θ_t; valid in ``end``.
@@ -66,7 +66,7 @@ class Attempt:
 
 
 class UpdatePart:
-    """The contribution of one effect before and after the iterations; by default, both methods do nothing."""
+    """The contribution of one effect before and after the iterations. By default, it changes nothing."""
 
     def begin(self, attempt: Attempt) -> None:
         """Prepares the attempt before its first iteration."""
@@ -78,7 +78,7 @@ class UpdatePart:
 
 @dataclass(eq=False)
 class PlanBuilder:
-    """Builds the plan and the parts of a scene's updates, as the active effects register themselves.
+    """Collects the plan and the parts of a scene's updates while the active effects register themselves.
 
     Attributes:
         scene: scene settings, with the floor in the internal world.

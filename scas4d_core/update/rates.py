@@ -1,8 +1,8 @@
-"""Learning rates of an update, identical on every engine: the rate and the active period of each parameter.
+"""Learning rate and active period of each parameter in an update, identical on every engine.
 
-Coarse motion is found first: a layer of clusters starts after the layers above it. If the previous motion predicts the
-frame well, coarse layers are frozen before the finer ones. Their remaining fluctuation from view to view would move
-thousands of Gaussians. If the prediction is poor, all layers learn to the end.
+Coarse motion is found first, because a layer of clusters starts after the layers above it. If the previous motion
+predicts the frame well, coarse layers are frozen before the finer ones. Their remaining fluctuation from view to view
+would move thousands of Gaussians. If the prediction is poor, all layers learn to the end.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ STANDARD_RADIUS_M = 4.0
 
 
 LAYER_STARTS = (0.0, 0.2, 0.4)
-"""Share of the iterations after which a layer starts to learn, coarse to fine; the last value repeats for more layers.
+"""Share of the iterations after which a layer starts to learn, coarse to fine. The last value repeats for more layers.
 If all layers started at once, each cluster of the finer layers would absorb part of the coarse motion."""
 
 LAYER_ENDS = (0.5, 0.75, 1.0)
 """Share of the iterations after which a layer is frozen, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 gave similar results
 (docs/tried.md)."""
 FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
-"""Same as ``LAYER_ENDS``, but for the first update, which runs in several view orders: motion that one order misses by
-then is found by another. These values gained 0.0 to 0.5 dB (docs/tried.md)."""
+"""Same as ``LAYER_ENDS``, but for the first update, which runs in several view orders. If one order misses a motion,
+another order finds it. These values gained 0.0 to 0.5 dB (docs/tried.md)."""
 NEAR_FINEST = 4.0
 """Factor on the rates of the finest layer if the layers above it are frozen early."""
 NEAR_OWN = 2.0
@@ -46,7 +46,7 @@ about 0.55 to 1.2, and unconditional freezing cost 0.6 to 3.5 dB (docs/tried.md)
 
 
 FASTER_IN_CHANGING_LIGHT = 2.0
-"""Factor on the rate of static colours while the lighting changes; gains 0.1 to 0.2 dB for a lamp that crosses a
+"""Factor on the rate of static colours while the lighting changes. It gains 0.1 to 0.2 dB for a lamp that crosses a
 room."""
 
 
@@ -56,9 +56,11 @@ def first_iteration(start: float, iterations: int) -> int:
 
 
 def learning_span(start: float, rest: float, iterations: int) -> range:
-    """Returns the indices of the iterations in which a parameter learns, from one share of the update to another.
+    """Returns the indices of the iterations in which a parameter learns; at least one iteration.
 
-    The range contains at least one iteration.
+    Args:
+        start, rest: shares of the iterations after which the parameter starts and stops learning.
+        iterations: total number of iterations.
 
     >>> learning_span(0.25, 0.75, 8), learning_span(0.4, 0.5, 2)
     (range(2, 6), range(1, 2))
@@ -69,7 +71,7 @@ def learning_span(start: float, rest: float, iterations: int) -> range:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam learning rates per iteration; with a rate of 0, a parameter keeps its initial value.
+    """Adam learning rates per iteration. With a rate of 0, a parameter keeps its initial value.
 
     Attributes:
         layers: rates of rotation r, translation t (in metres), and scaling c and s of each layer, coarse to fine.
@@ -78,8 +80,8 @@ class Rates:
         scale: rate of Δs.
         colour: rate of the RGB of moving Gaussians.
         static_colour: rate of the RGB of static Gaussians.
-        end: fraction to which a rate decays on a half-cosine until its layer is frozen or the update ends; 1 means
-            constant rates.
+        end: fraction to which a rate decays on a half-cosine until its layer is frozen or the update ends. With 1,
+            the rates are constant.
         beta1, beta2: decay rates of Adam.
         layer_starts: share of the iterations after which each layer starts to learn; missing layers start at once.
         layer_ends: share of the iterations after which each layer is frozen; missing layers learn to the end.
@@ -107,7 +109,7 @@ class Rates:
         Args:
             iteration: index of the iteration.
             iterations: total number of iterations.
-            start, rest: shares of the iterations after which the parameter starts and stops to learn.
+            start, rest: shares of the iterations after which the parameter starts and stops learning.
 
         >>> rates = Rates((), 0, 0, 0, 0, end=0.2)
         >>> [round(rates.factor(i, 8, 0.25, 0.75), 2) for i in range(8)]
@@ -151,7 +153,7 @@ class Rates:
         )
 
     def colour_rates(self, plan: ColourPlan | None) -> tuple[float, float]:
-        """Returns the colour rates of moving and static Gaussians, as enabled by a plan."""
+        """Returns the colour rates of moving and static Gaussians, or 0 for those that the plan does not enable."""
         if plan is None:
             return 0.0, 0.0
         moving, static = self.colour, self.static_colour
@@ -164,7 +166,7 @@ class Rates:
         """Returns the rates for an update without a previous motion.
 
         Layers rotate and translate faster by ``factor``, because they have farther to go. They are frozen early only if
-        the update is run in several view orders.
+        the update runs in several view orders.
         """
         layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
         return replace(
@@ -210,7 +212,13 @@ class Rates:
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
-        """Returns the rates for ``layers`` layers and a rig whose reach is ``radius`` metres (``Rig.reach``)."""
+        """Returns the rates from the settings.
+
+        Args:
+            settings: update settings.
+            layers: number of layers of clusters.
+            radius: reach of the rig in metres (``Rig.reach``), which scales the rates of translations.
+        """
         layer_starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
@@ -232,7 +240,7 @@ class Rates:
 def _layer_ends(layer_ends: tuple[float, ...], layer_starts: tuple[float, ...]) -> tuple[float, ...]:
     """Returns the share of the iterations after which each layer is frozen, at least ``LEAST_TIME`` after its start.
 
-    With fewer layers, the last values of ``layer_ends`` are used; with more layers, the first value repeats.
+    For fewer layers than values, the last values of ``layer_ends`` are used. For more layers, the first value repeats.
     """
     ends = (layer_ends[max(k - len(layer_starts), -len(layer_ends))] for k in range(len(layer_starts)))
     return tuple(min(1.0, max(end, start + LEAST_TIME)) for end, start in zip(ends, layer_starts, strict=True))

@@ -19,11 +19,11 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Function that takes each camera's first PSNR in dB, and maps each camera to be excluded to the reason."""
+"""Function that takes the first PSNR of each camera in dB, and returns the cameras to exclude with the reasons."""
 
 
 class Stopwatch:
-    """Measures the time spent in each stage; the overhead of the timers counts as ``REPORT``.
+    """Measures the time spent in each stage. The overhead of the timers counts as ``REPORT``.
 
     Args:
         began: ``perf_counter`` value at the start, or None for the current time.
@@ -67,16 +67,16 @@ class AttemptOptions:
         freeze_colours: whether colours are frozen.
         cold: whether to ignore the previous motion.
         iteration_factor: factor on the number of iterations.
-        several_orders: whether several view orders are tried and the best result is used.
+        several_orders: whether the attempt is one of several in different view orders, of which the best is used.
         layer_rate_factor: factor on the layers' rates without a previous motion.
         stopping: rule that decides the number of iterations, or None for the number in the settings.
-        gate: function that selects cameras to exclude based on their first PSNR in dB, called once all cameras have
-            been rendered, or None to exclude no cameras.
+        gate: function that selects cameras to exclude, or None to exclude no cameras. Called once all cameras have been
+            rendered.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
         skip_below: maximum image loss of Θ_{t−1} in each probe view for skipping the iterations, or None to never skip
             them.
-        confirm_skip: function called before a skip, which returns whether full-size images confirm it, or None if no
-            confirmation is needed.
+        confirm_skip: function that returns whether full-size images confirm a skip, or None if no confirmation is
+            needed.
         reference_errors: errors at the end of previous updates, named as by ``best_state.label_by_size``, or None if
             unknown.
         step: time since the previous frame in seconds, if nothing was learnt from that frame (``BestState.start``);
@@ -120,7 +120,7 @@ class CameraFit(TypedDict):
 
 
 def camera_fit(psnr: float, colour_shift: tuple[float, float, float] | None = None) -> CameraFit:
-    """Returns the fit of a camera that has no usual level for comparison."""
+    """Returns the fit of a camera that has no usual level for comparison, and therefore has full health."""
     return {"psnr": psnr, "colour_shift": colour_shift, "health": 1.0}
 
 
@@ -140,8 +140,8 @@ class UpdateTrace:
         errors: image loss of each candidate in each probe view; empty if nothing was compared.
         kept: candidate that became Θ_t.
         whole: whether ``errors`` are for full-size images.
-        shown: rendering of each camera in the last ``engine.KEPT_PICTURES`` iterations, which evidence uses without
-            rendering again. Empty if the update ended earlier than planned.
+        shown: rendering of each camera in the last ``engine.KEPT_PICTURES`` iterations, from which evidence is computed
+            without rendering again. Empty if the update ended earlier than planned.
         guards: number of interventions of each guard that intervened.
     """
 
@@ -175,7 +175,12 @@ class UpdateTrace:
         return {name: psnr for name, psnr in self.fits.items() if name not in self.left_out}
 
     def load_log(self, log: IterationLog, views: Sequence[TrainingView]) -> None:
-        """Copies the engine's log; colour shifts are also evidence for camera gains."""
+        """Copies the losses, fits, renderings and guards from a log of the engine.
+
+        Args:
+            log: log of the attempt.
+            views: training views, in the order in which the engine loaded them.
+        """
         self.losses, self.guards = log.losses, log.guards
         self.psnr = [rendered.psnr for rendered in log.rendered]
         self.first, self.cameras = {}, {}
@@ -229,13 +234,13 @@ class UpdateResult:
     parents: NDArray[np.int64] | None = None
 
     def with_motion_after(self, first: UpdateResult) -> UpdateResult:
-        """Returns the result of an update that continued ``first``, with the motions of both combined."""
+        """Returns the result of an update that continued ``first``, with both motions combined."""
         if self.motion is None or first.motion is None:
             return self
         return replace(self, motion=self.motion.after(first.motion))
 
     def with_errors_of(self, first: UpdateResult) -> UpdateResult:
-        """Returns the result of a later attempt, with the errors of the previous state and warm start of ``first``."""
+        """Returns the result of a later attempt, with the errors of the other candidates taken from ``first``."""
         errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
         errors.pop(Candidate.END, None)
         if self.trace.errors:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scas4d_core.settings import UpdateSettings
 
 NEIGHBOUR_SAMPLE = 4000
-"""Number of Gaussians whose neighbours are used in an iteration, so that the cost does not grow with the scene."""
+"""Number of Gaussians whose neighbours are used in an iteration. It limits the cost in large scenes."""
 
 IMAGE_WEIGHT = 1.0
 """Weight of the image loss, 0.8 L1 + 0.2 (1 − SSIM); other weights (``Weights``) are relative to it."""
@@ -25,7 +25,13 @@ SOFT_COLOUR_WEIGHT = 0.01
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
-    """Returns the view of each iteration, from successive random permutations of all views."""
+    """Returns the view index of each iteration, from successive random permutations of all views.
+
+    Args:
+        count: number of views.
+        iterations: number of iterations.
+        rng: random generator for the permutations.
+    """
     rounds = -(-iterations // count)
     order = np.concatenate([rng.permutation(count) for _ in range(rounds)])[:iterations]
     return [int(index) for index in order]
@@ -49,7 +55,11 @@ class ViewPlan:
         self._left_out: set[int] = set()
 
     def leave_out(self, views: Iterable[int]) -> None:
-        """Excludes views from the following iterations; at least one view must remain."""
+        """Excludes views from the following iterations.
+
+        Raises:
+            ValueError: if no view remains.
+        """
         self._left_out |= set(views)
         if len(self._left_out) == self._count:
             raise ValueError(f"all {self._count} views are excluded; an update needs at least one")
@@ -67,9 +77,9 @@ class ViewPlan:
 
 
 def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Divides ``count`` Gaussians into disjoint random sets of ``NEIGHBOUR_SAMPLE``; one set is used per iteration.
+    """Returns ``count`` indices divided into disjoint random sets of ``NEIGHBOUR_SAMPLE``, one per iteration.
 
-    A remainder of less than a quarter of a set joins the previous set; otherwise a few Gaussians would get all the
+    A remainder of less than a quarter of a set joins the previous set. Otherwise, a few Gaussians would get all the
     weight.
     """
     order = rng.permutation(count)
@@ -86,7 +96,7 @@ def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
 
 
 COOLING = 0.15
-"""Share of the iterations between the decision to stop and the end, in which the rates decay, except in layers that are
+"""Share of the iterations that still follow the decision to stop. Meanwhile, the rates decay, except in layers that are
 already frozen."""
 
 LOOK_EVERY = 10
@@ -104,23 +114,23 @@ UNTIMED = 100
 RATE = 0.3
 """Rate at which the budget's predictions follow new measurements."""
 FOR_BIRTHS = 0.4
-"""Share of the time budget for fitting added Gaussians: about as long as an update takes when an object enters."""
+"""Share of the time budget for fitting added Gaussians, which takes about as long as an update if an object enters."""
 AFTER_S = 0.05
-"""Predicted time after the last iteration before any frame has been measured, in seconds."""
+"""Predicted time after the last iteration, in seconds, until a frame has been measured."""
 
 
 class Stopping:
-    """Determines when an update ends: after a number of iterations, at a time limit, or once it makes no progress.
+    """Rule that ends an update after a number of iterations, at a time limit, or once there is no more progress.
 
     Args:
         most: maximum number of iterations.
-        end: ``clock`` time by which the last iteration must end, in seconds; at least one iteration is run. If None,
+        end: ``clock`` time by which the last iteration must end, in seconds. At least one iteration is run. If None,
             ``most`` iterations are run.
         iteration_seconds: time per iteration in previous updates, in seconds, or None if unknown.
-        gain: minimum relative decrease of the error on the probe views per ``LOOK_EVERY`` iterations; with less, the
+        gain: minimum relative decrease of the error on the probe views per ``LOOK_EVERY`` iterations. With less, the
             update cools down and stops. Probe views are training views, never held-out ones. If 0, there is no early
             stop.
-        first: share of the iterations before which there is no early stop, so that all parameters have started.
+        first: share of the iterations before which there is no early stop, because not all parameters have started.
         clock: function that returns the current time in seconds.
 
     Attributes:
@@ -149,7 +159,7 @@ class Stopping:
         self._stop: int | None = None
 
     def planned(self, done: int) -> int:
-        """Returns the planned total number of iterations after ``done`` iterations; the update ends at this total."""
+        """Returns the total number of iterations of the update, as planned after ``done`` iterations."""
         total = self._total(done)
         if self._stop is not None:
             total = min(total, self._stop)
@@ -162,7 +172,7 @@ class Stopping:
         return self._gain > 0 and self._stop is None and done % LOOK_EVERY == 0
 
     def record_error(self, done: int, error: float) -> None:
-        """Records the error on the probe views after ``done`` iterations; call it if ``needs_error`` is true."""
+        """Records the error on the probe views after ``done`` iterations, if ``needs_error`` is true."""
         total = self._total(done)
         if self._error is not None and done >= self._first * total and error > (1 - self._gain) * self._error:
             self._stop = done + max(1, round(COOLING * total))
@@ -185,17 +195,20 @@ class Stopping:
 
 
 class TimeBudget:
-    """A scene's time limit per frame; predicts the time needed after the iterations, based on previous frames.
+    """A scene's time limit per frame, with a prediction of the time needed after the iterations of an update.
 
     Decoding happens before the iterations and is measured by the clock. The comparison and checks at the end, the
-    checkpoint and the commit happen after the iterations, and their time is predicted.
+    checkpoint and the commit happen after the iterations. Their time is predicted from previous frames.
+
+    Args:
+        milliseconds: time limit per frame in milliseconds, or None for no limit.
 
     Attributes:
         milliseconds: time limit per frame in milliseconds, or None for no limit.
         iteration_seconds: predicted time per iteration in seconds, or None if unknown.
         after: predicted time from the last iteration to the end of the commit in seconds, without fits of added
             Gaussians.
-        births: whether time is reserved for such fits in the next frame, because the previous frame had some.
+        births: whether time is reserved for fits of added Gaussians, because the previous frame had some.
     """
 
     def __init__(self, milliseconds: float | None) -> None:
@@ -214,7 +227,12 @@ class TimeBudget:
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
     def record_birth_fits(self, spent: float, postponed: Sequence[str]) -> None:
-        """Records the time spent on fits of added Gaussians, and the fits that exceeded the budget."""
+        """Records the fits of added Gaussians in a frame.
+
+        Args:
+            spent: time spent on these fits, in seconds.
+            postponed: descriptions of the fits for which there was no time.
+        """
         kept = self.births  # time that was reserved but was not sufficient is not reserved again
         self.births = bool(spent or postponed) and not (kept and postponed)
 

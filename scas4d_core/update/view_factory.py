@@ -1,4 +1,4 @@
-"""Creates the training views of a frame: images at the size of the internal rig's cameras, exposures and masks."""
+"""Creation of training views from a frame: images at the size of the rig's cameras, exposures and masks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Array = NDArray[np.float32]
 
 
 class ViewFactory:
-    """Creates the training views of each frame of a rig; caches the cameras.
+    """Creates the training views of each frame of a rig.
 
     Args:
         rig: cameras in the internal world.
-        source: cameras at the size of the incoming images, if the images are resized.
+        source: cameras at the size of the incoming images, or None if the images are not resized.
 
     Attributes:
         rig: cameras in the internal world.
@@ -52,11 +52,11 @@ class ViewFactory:
 
         Args:
             frame: frame with images at the size of the rig's cameras.
-            exposures: [3, 2] gain and offset of each camera; missing cameras get 1 and 0.
+            exposures: [3, 2] gain and offset of each camera, keyed by name; 1 and 0 for missing cameras.
             use_masks: whether the views include masks.
 
         Raises:
-            ValueError: if an image does not have its camera's size, or the frame has no camera of the rig.
+            ValueError: if an image or mask does not have its camera's size, or if no camera of the rig has an image.
         """
         views = []
         for name in self.rig.names:
@@ -79,7 +79,7 @@ class ViewFactory:
         return views
 
     def coarser(self, view: TrainingView, scale: float) -> TrainingView:
-        """Returns the view with its image resized by area averaging, and the matching camera."""
+        """Returns the view with its planes and camera scaled by ``scale``, using area averaging."""
         camera = self.posed[view.name].scaled(scale)
         target = np.moveaxis(view.target, 0, -1)
         rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
@@ -91,7 +91,7 @@ class ViewFactory:
         return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure)
 
     def retouched(self, view: TrainingView, target: Array) -> TrainingView:
-        """Returns the view with its planes replaced by ``target`` [C, H, W], which has the same size."""
+        """Returns the view with its planes replaced by ``target`` [C, H, W] of the same size."""
         return TrainingView(view.name, view.camera, target, view.exposure)
 
     def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:
@@ -106,7 +106,13 @@ class ViewFactory:
 def pictures_of(
     frame: Frame, name: str, size: tuple[int, int], use_masks: bool = True
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Returns a camera's image [H, W, 3] and mask [H, W] (or None), and checks their size (width, height).
+    """Returns the image [H, W, 3] of a camera, and its mask [H, W] or None.
+
+    Args:
+        frame: frame that contains the image.
+        name: name of the camera.
+        size: expected (width, height).
+        use_masks: whether to return the mask.
 
     Raises:
         ValueError: if the image or the mask has a different size.

@@ -1,7 +1,7 @@
-"""Warm start of an update: the motion of the previous frame is extrapolated (paper, Optimization Pipeline).
+"""Warm start of an update, which extrapolates the motion of the previous frame (paper, Optimization Pipeline).
 
-A cluster keeps its twist in its own axes: its displacement and rotation axis rotate with it. A point on a circle thus
-continues along the circle, and so do the clusters of finer layers inside it.
+A cluster keeps its twist in its own axes, so its displacement and rotation axis rotate with it. A cluster that moves on
+a circle thus continues along the circle, and so do the finer clusters inside it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LONGEST_PREDICTION = 3.0
 
 
 def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
-    """Rotates [K, 3] vectors by the quaternions (1, r)/|(1, r)|, with r [K, 3] = axis · tan(angle/2)."""
+    """Returns vectors [K, 3] rotated by the quaternions (1, r)/|(1, r)|, with r [K, 3] = axis · tan(angle/2)."""
     cross = np.cross(r, vectors)
     turned: Float = vectors + 2 * (cross + np.cross(r, cross)) / (1 + np.square(r).sum(axis=1, keepdims=True))
     return turned
@@ -46,7 +46,7 @@ class Motion:
         shifts: [K, 3] translations of the clusters in each layer relative to the layer above, in metres in the rotated
             axes of the cluster.
         own_shifts: [M, 3] displacements Δp minus the part that belongs to the finest clusters, in metres.
-        own_turns: [M, 3] rotations Δr.
+        own_turns: [M, 3] rotations ΔR of the Gaussians; see ``Tables.deltas``.
         seconds: duration of the motion, in seconds.
     """
 
@@ -58,11 +58,11 @@ class Motion:
 
     @property
     def finite(self) -> bool:
-        """Whether all values are finite; otherwise the motion cannot start an update."""
+        """Whether all values are finite. Otherwise, no update can start from the motion."""
         return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.own_shifts, self.own_turns))
 
     def after(self, first: Motion) -> Motion:
-        """Returns the composition of two motions within the same interval; small rotations are added."""
+        """Returns this motion composed with ``first`` within the same interval. Small rotations are added."""
         return replace(
             self,
             turns=[a + b for a, b in zip(first.turns, self.turns, strict=True)],
@@ -73,7 +73,7 @@ class Motion:
 
     @classmethod
     def of(cls, tables: Tables, hierarchy: Hierarchy, seconds: float) -> Motion:
-        """Returns the motion of a deformation; the mean Δp of a finest cluster becomes its own shift."""
+        """Returns the motion of a deformation. The mean Δp of a cluster in the finest layer is added to its shift."""
         turns = [values[:, :3].astype(np.float64) for values in tables.clusters]
         shifts = [values[:, 3:6].astype(np.float64) for values in tables.clusters]
         rest = tables.deltas[:, :3].astype(np.float64)
@@ -106,7 +106,7 @@ def motion_between(
         hierarchy: hierarchy of the moving Gaussians in ``after``.
         before: first state; its rows are the first rows of ``after``.
         after: second state.
-        known: [M] mask, in hierarchy order, of Gaussians whose motion is known. These have a row in ``before``; the
+        known: [M] mask, in hierarchy order, of Gaussians whose motion is known. These have a row in ``before``. The
             others follow their cluster.
         seconds: time between the states, in seconds.
     """
@@ -165,13 +165,13 @@ def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
 
 
 def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, momentum: float) -> Tables:
-    """Returns the initial deformation from the previous motion; scaling (c, s) and Δs start at the identity.
+    """Returns the initial deformation from the previous motion. Scaling (c, s) and Δs start at the identity.
 
     Args:
         hierarchy: hierarchy of the moving Gaussians.
         motion: motion of the previous update, or None for no motion.
         seconds: time since that motion was measured, in seconds.
-        momentum: share of the individual motion of Gaussians, beyond that of the layers, from which Δp and ΔR start.
+        momentum: share of the Gaussians' own motion, relative to the layers, from which Δp and ΔR start.
     """
     tables = Tables.identity(hierarchy)
     if motion is None:

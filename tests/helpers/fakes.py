@@ -200,7 +200,7 @@ class FakeReconstruction:
 
 
 class FakeCommitted:
-    def __init__(self, history, world, limits):
+    def __init__(self, history, world, limits, device="cpu"):
         from scas4d_core.query import tracks  # in the readers alone: it loads SciPy
 
         self.history = history

@@ -1,7 +1,7 @@
 """Camera gains: a fixed or drifting brightness factor per camera and channel.
 
 A gain is applied to linear light, before the sRGB curve. On the power part of the curve, s = 1.055 L^(1/2.4) − 0.055, a
-gain γ turns a value s into a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. One
+gain γ turns a value s into a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, it multiplies s + 0.055 by a. One
 number per channel is therefore estimated: the median over pixels of (image + 0.055) / (rendering + 0.055). Independent
 gains and offsets, as in frame 0, would trade off against each other.
 
@@ -26,7 +26,7 @@ from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, Update
 
 NAME = "camera_gain"
 POWER = 2.4
-"""Exponent of the sRGB curve: a gain in linear light is the gain of s + 0.055 raised to this power."""
+"""Exponent of the sRGB curve. A gain in linear light is the gain of s + 0.055, raised to this power."""
 # Measured spreads on which the thresholds are based: at most 0.011 on the five objects (on cloth) and 0.002 on stage,
 # whose cameras are identical; 0.025 on basketball, whose gains are known from frame 0 and which improves by 0.03 dB
 # with the effect; 0.078 to 0.094 on lamps.
@@ -76,11 +76,11 @@ def _centre(gains: Array) -> Array:
 
 
 def spread_of(seen: FrameObservation) -> float | None:
-    """Returns the standard deviation of colour gains over cameras, in linear light, or None if there are too few.
+    """Returns the standard deviation of colour gains over cameras, or None if too few cameras were measured.
 
-    The gains are estimated from the mean colours of images and renderings. The factor common to all channels of a
-    camera is removed, because glossy objects on a black background and objects that are rendered slightly too small
-    affect all channels equally.
+    The gains are in linear light, estimated from the mean colours of images and renderings. The factor common to all
+    channels of a camera is removed, because glossy objects on a black background and objects that are rendered slightly
+    too small affect all channels equally.
     """
     spreads = []
     for view in seen.views:
@@ -100,7 +100,7 @@ class CameraGain(Effect):
     """Estimates a gain per camera and channel from the renderings of an update."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns how much the gains differ between cameras, including gains that are already compensated for."""
+        """Returns how much colour gains differ between cameras, including differences that are already corrected."""
         spread = spread_of(seen)
         return (
             None
@@ -109,7 +109,7 @@ class CameraGain(Effect):
         )
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds gain estimation, which requires full images, to the plan."""
+        """Adds the estimation of gains, which requires full images, to the updates."""
         builder.plan.full_images = builder.plan.camera_gains = True
         builder.parts.append(CameraGains(builder))
 

@@ -33,8 +33,8 @@ FEW = 4
 def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
     """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
 
-    Normals are rotated with their neighbourhood instead of with their own Gaussian. A normal belongs to a surface, and
-    positions do not accumulate the errors of earlier frames. On `gloss`, both variants gave the same result.
+    Normals rotate with their neighbourhood instead of with their own Gaussian, because a normal belongs to a surface,
+    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants gave the same result.
 
     Args:
         before, after: [N, 3] positions of the Gaussians in the two states, in metres.
@@ -52,14 +52,14 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
 
 
 def neighbourhoods(means: Array) -> NDArray[np.int64]:
-    """Returns the [N, k] rows of the nearest neighbours of each Gaussian, starting with the Gaussian itself."""
+    """Returns the [N, k] rows of the k nearest neighbours of each Gaussian, starting with the Gaussian itself."""
     count = len(means)
     nearest: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
     return nearest.reshape(count, -1)
 
 
 class DirectionPart(UpdatePart):
-    """Rotates the gloss with the deformation, or does nothing if frame 0 has no gloss."""
+    """Rotates the gloss with the deformation. Does nothing in a scene without gloss."""
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._roots = builder.first.means
@@ -98,7 +98,10 @@ class Direction(Effect):
         return Evidence(share, f"view-dependent colour explains {100 * share:.0f} % of the residual")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part and requests full images, because static surfaces also look different in each frame."""
+        """Adds a ``DirectionPart`` and requests full images.
+
+        Static surfaces must be rendered too, because they also look different in each frame.
+        """
         builder.plan.full_images = builder.plan.gloss = True
         builder.parts.append(DirectionPart(builder))
 

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 # fastest and whose shading therefore changes under constant light), 0.012 on stage with its moving shadows, 0.023 to
 # 0.061 on lamps while the lamp moves.
 SAMPLE = 2000
-"""Approximate number of Gaussians used for the evidence (up to twice as many); enough for 7 unknowns per channel."""
+"""Approximate number of Gaussians used for the evidence, which is sufficient for 7 unknowns per channel. The actual
+number may be up to twice as large."""
 OPAQUE = 0.3
 """Minimum opacity at which a Gaussian's colour counts as the colour of a surface."""
 
@@ -36,9 +37,11 @@ Double = NDArray[np.float64]
 def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Double) -> Double:
     """Returns the [R, 7] regressors of the relative lighting change: 1, the normal, and the position.
 
-    The normal is the shortest axis, oriented towards the cameras. The position is in metres relative to the mean.
+    The normal is the shortest axis, oriented towards the cameras. The position is in metres, relative to the mean
+    position.
 
     Args:
+        state: state that contains the Gaussians.
         rows: [R] rows of the Gaussians.
         centre: [3] centre of the cameras, in metres.
     """
@@ -50,9 +53,10 @@ def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Dou
 
 
 def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> float:
-    """Returns the RMS relative colour change between two states, as explained by orientation and position.
+    """Returns the RMS relative colour change between two states that orientation and position explain.
 
     Args:
+        before, after: Θ_{t−1} and Θ_t, with the same Gaussians.
         centre: [3] centre of the cameras, in metres.
     """
     rows = np.flatnonzero(before.opacities > OPAQUE)
@@ -77,7 +81,7 @@ class Light(Effect):
     """Adapts colours faster while the lighting changes."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the colours of moving Gaussians are not learnt."""
+        """Returns a refusal if ``rate_colour`` is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:

@@ -17,7 +17,7 @@ class MovingColour(Effect):
     """Learns the RGB colours of moving Gaussians with the learning rate ``rate_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the rate is 0."""
+        """Returns a refusal if ``rate_colour`` is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:

@@ -1,6 +1,6 @@
 """Shading of moving Gaussians: their colours follow the images once per frame, in closed form, as objects turn.
 
-With a learning rate low enough not to absorb motion, Adam cannot follow the shading of turning objects, and the error
+With a learning rate low enough not to absorb motion, Adam cannot follow the shading of turning objects. The error then
 carries over to the next frame and grows. At the end of an update, the motion is known, so the remaining residual is a
 change of appearance (``closed_form``).
 """
@@ -41,11 +41,11 @@ class Shading(Effect):
     """Updates the colours of moving Gaussians in closed form."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the rate is 0."""
+        """Returns a refusal if ``rate_colour`` is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part to the update."""
+        """Adds a ``ShadingPart`` to the updates."""
         builder.parts.append(ShadingPart(builder))
 
 

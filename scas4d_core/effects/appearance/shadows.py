@@ -1,8 +1,8 @@
 """Moving shadows and light: the colours of static Gaussians follow the images once per frame, in closed form.
 
-At the end of an update, the colours of static Gaussians are updated as in ``closed_form``. This only happens in frames
-in which the static scene looks different from frame 0. In other frames, the update would fit noise and disagreement
-between cameras.
+At the end of an update, the colours of static Gaussians are updated as in ``closed_form``, but only in frames in which
+the static scene looks different from frame 0. In other frames, this step would fit noise and disagreement between
+cameras.
 """
 
 from __future__ import annotations
@@ -66,11 +66,14 @@ class Shadows(Effect):
     """Updates the colours of static Gaussians in closed form."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the rate is 0."""
+        """Returns a refusal if ``rate_static_colour`` is 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns a [h, w, 4] float16 array per view: each square's mean colour, and a flag for moving Gaussians."""
+        """Returns a [h, w, 4] float16 array per view, or None if only a few Gaussians are static.
+
+        An array contains the mean colour of each square of pixels, and 1 if moving Gaussians reach the square.
+        """
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:
@@ -106,7 +109,7 @@ class Shadows(Effect):
         return Evidence(share, f"{100 * share:.0f} % of the static scene looks different from frame 0")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part to the update."""
+        """Adds a ``ShadowsPart`` to the updates."""
         builder.parts.append(ShadowsPart(builder))
 
 
@@ -119,7 +122,7 @@ def _means(view: TrainingView) -> Array:
 def _compared(
     before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns [h, w] masks of changed squares, and of squares that moving Gaussians reach in neither frame."""
+    """Returns [h, w] masks of changed squares, and of squares without moving Gaussians both in frame 0 and now."""
     changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
     return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
 

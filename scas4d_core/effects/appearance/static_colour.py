@@ -17,11 +17,11 @@ class StaticColour(Effect):
     """Learns the RGB colours of static Gaussians with the learning rate ``rate_static_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the rate is 0."""
+        """Returns a refusal if ``rate_static_colour`` is 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Makes the colours of static Gaussians learnable."""
+        """Makes the colours of static Gaussians learnable, which requires full images."""
         builder.plan.learns_colours().static = True
         builder.plan.full_images = True
 

@@ -1,9 +1,9 @@
-"""Direct photometric alignment: finds the small pose twist of a camera that aligns a rendering with its image.
+"""Direct photometric alignment: finds the small twist of a camera's pose that aligns a rendering with the image.
 
-A twist is six numbers in camera axes, translation (metres) and rotation (radians), applied on the left of the pose:
-``world_to_camera' = exp(twist) world_to_camera``. It displaces the content of a pixel by ``flow``, and the rendering
-changes by −gradient · flow. Gauss-Newton uses the mean gradient of image and rendering (Benhimane and Malis 2004) and
-Cauchy weights. Each frame takes a single step; later frames continue from it.
+A twist consists of a translation (metres) and a rotation (radians) in camera axes. It is applied on the left of the
+pose: ``world_to_camera' = exp(twist) world_to_camera``. It displaces the content of a pixel by ``flow``, which changes
+the rendering by −gradient · flow. Gauss-Newton uses the mean gradient of image and rendering (Benhimane and Malis 2004)
+and Cauchy weights. Each frame takes a single step, and later frames continue from its result.
 """
 
 from __future__ import annotations
@@ -23,18 +23,17 @@ MOST = 1000
 STEEP = 0.02
 """Minimum gradient magnitude of an informative pixel, for values in 0…1; flatter pixels mostly show noise."""
 CAUCHY = 2.4
-"""Residual, as a multiple of its usual size, at which the Cauchy weight is one half (95 % efficiency for Gaussian
-noise).
-"""
+"""Residual, as a multiple of the usual residual, at which the Cauchy weight is one half. It has 95 % efficiency for
+Gaussian noise."""
 QUIETEST = 1 / 255
 """Lower bound on the usual residual, for values in 0…1: the quantization step of 8-bit images."""
 FEW = 50
 """Minimum number of informative pixels for an estimate."""
 TURNED, SHIFTED = 4.0, 0.25
 """Prior standard deviations, in pixels, of a rotation and of a translation (at the depth of the image centre). Tripods
-sag or are knocked, which rotates a camera more than it translates it. The prior decides when the two look alike. With 1
-pixel for translations, and a prior on each step instead of on the total, rotations of 0.5° were compensated by
-translations of 1 cm."""
+sag or are knocked, which rotates a camera more than it translates it. The prior decides where the two look alike. With
+1 pixel for translations, and a prior on each step instead of on the total, translations of 1 cm compensated for
+rotations of 0.5°."""
 SMALLEST = 1e-9
 """Regularization, relative to the trace, of equations that may be singular."""
 RESIDUAL_SCALE = 0.02
@@ -46,7 +45,7 @@ class AlignedPixels(NamedTuple):
 
     Attributes:
         target, shown: [3, P] RGB of the image and of the rendering in 0…1, with the camera's exposure applied.
-        slopes: [3, 2, P] image gradients per pixel, along x and y.
+        slopes: [3, 2, P] gradients along x and y, per pixel; see ``align_pixels``.
         places: [2, P] pixel positions u, v.
         pixels: [P] flat pixel indices in the image.
     """
@@ -62,10 +61,10 @@ class Equations(NamedTuple):
     """The normal equations of one image in K unknowns.
 
     Attributes:
-        matrix: [K, K] matrix. After a twist ξ, the weighted squared error is ``energy − 2 vector·ξ + ξ·matrix·ξ``,
-            in units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``.
+        matrix: [K, K] matrix. For unknowns ξ, the weighted squared error is ``energy − 2 vector·ξ + ξ·matrix·ξ``, in
+            units of ``FEW * RESIDUAL_SCALE**2``. Translations are in units of ``depth``.
         vector: [K] right-hand side.
-        energy: weighted squared error without a twist.
+        energy: weighted squared error for ξ = 0.
         depth: depth of the image centre, in metres.
     """
 
@@ -76,12 +75,13 @@ class Equations(NamedTuple):
 
 
 def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels | None:
-    """Samples an image and its rendering at informative pixels, or returns None if there are too few such pixels.
+    """Returns an image and its rendering at informative pixels, or None if there are too few such pixels.
+
+    The gradients are averaged over both, unless the rendering is subsampled.
 
     Args:
         target: [3, H, W] image.
-        shown: [3, H, W] rendering, or [3, h, w] with only every ``every``-th row and column. In the latter case, only
-            the gradients of the image are used.
+        shown: [3, H, W] rendering, or [3, h, w] with only every ``every``-th row and column.
         every: stride of the rows and columns in ``shown``.
     """
     _, height, width = target.shape
@@ -111,10 +111,10 @@ def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels |
 
 
 def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> Double:
-    """Returns the [2, 6, ...] first-order displacement of pixels per unit of each twist component.
+    """Returns the [2, 6, ...] first-order displacement of pixels, in pixels per unit of each twist component.
 
     Args:
-        lens: camera parameters fx, fy, cx, cy, …
+        lens: camera parameters fx, fy, cx, cy, followed by width and height, which are ignored.
         places: [2, ...] pixel positions u, v.
         depth: [...] depth along z, in the unit of the twist's translations.
 
@@ -133,8 +133,8 @@ def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> D
 def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equations:
     """Returns the normal equations for given displacement fields.
 
-    The weights are computed twice: weights from the initial residual alone would treat residuals that a shift explains
-    as outliers.
+    The weights are computed twice, because weights from the initial residual alone would treat residuals that a shift
+    explains as outliers.
 
     Args:
         seen: image and rendering at the informative pixels.
@@ -175,7 +175,7 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
 def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
     """Returns the normal equations of a rotation in three unknowns, in pixels: horizontal, vertical, and roll.
 
-    Roll is the displacement at a quarter of the image width. The equations do not depend on depth.
+    Roll is the displacement at a quarter of the image width from the centre. The equations do not depend on depth.
     """
     return equations(seen, np.einsum("dkp,kl->dlp", flow(lens, seen.places)[:, 3:], turn_from_pixels(lens)))
 
@@ -187,9 +187,11 @@ def turn_from_pixels(lens: Array) -> Double:
 
 
 def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
-    """Returns the [3] displacement (horizontal, vertical, roll) of the image centre under a twist, in pixels.
+    """Returns the [3] horizontal and vertical displacement of the image centre and the roll of a twist, in pixels.
 
     Args:
+        lens: camera parameters fx, fy, cx, cy, width, height.
+        twist: [6] twist, with its translation in metres.
         depth: depth of the image centre, in metres.
     """
     middle = np.array([lens[4] / 2, lens[5] / 2], np.float64)
@@ -197,13 +199,15 @@ def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
 
 
 def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
-    """Returns the [6] increment of a twist. A prior keeps the total twist small if the image constrains it weakly.
+    """Returns the [6] increment of a twist.
+
+    A prior keeps the total twist small if the image constrains it weakly.
 
     Args:
         one: normal equations of the camera.
         lens: camera parameters; see ``flow``.
         twist: [6] current twist of the camera, with its translation in metres.
-        vector: [6] right-hand side to use in place of ``one.vector``, or None to use ``one.vector``.
+        vector: [6] right-hand side that replaces ``one.vector``, or None to use ``one.vector``.
     """
     focal, units = float(lens[0] + lens[1]) / 2, np.array([one.depth] * 3 + [1.0] * 3)
     before = np.array([(focal / SHIFTED) ** 2] * 3 + [(focal / TURNED) ** 2] * 3)
@@ -216,13 +220,14 @@ def to_camera_twist(one: Equations, pose: Double) -> Double:
     """Returns the [6, 6] matrix that maps a twist in world axes to the unknowns of a camera's equations.
 
     Args:
+        one: normal equations of the camera.
         pose: [4, 4] world-to-camera matrix.
     """
     return np.diag([1 / one.depth] * 3 + [1.0] * 3) @ adjoint(pose)
 
 
 def adjoint(pose: Double) -> Double:
-    """Returns the [6, 6] matrix that maps a twist from the axes before a pose [4, 4] to the axes after it.
+    """Returns the [6, 6] matrix that transforms a twist by a pose [4, 4], for example from world to camera axes.
 
     >>> beside = np.eye(4)
     >>> beside[0, 3] = 2.0  # the origin is 2 m to the right of the camera

@@ -7,11 +7,13 @@ the offset is at least ``LEAST`` pixels. Its pose is then corrected by half of t
 all other cameras stay bit-identical.
 
 Later frames use these poses for their training views: masks move with their camera, and probe views and new Gaussians
-use the current pose. Views requested by users are rendered with the given camera, so "as camera 7" means as calibrated.
-Exclusion of cameras is decided earlier (``robust.outliers``). A misaligned camera is still excluded, but its offset is
-measured. It is accepted again once its pose is found, and stays excluded if the correction exceeds the limit. Camera
-gains are medians over pixels and are hardly affected by small shifts. ``shadows`` may learn in such frames, but from
-all cameras.
+use the current pose. Views requested by users are rendered with the given camera, so "as camera 7" refers to its
+calibrated pose.
+
+Cameras are excluded earlier (``robust.outliers``). A misaligned camera is still excluded, but its offset is measured.
+It is accepted again once its pose is found, and stays excluded if the correction exceeds the limit. Camera gains are
+medians over pixels, so small shifts hardly affect them. ``shadows`` may update colours in such frames, but it uses all
+cameras.
 """
 
 from __future__ import annotations
@@ -51,15 +53,15 @@ if TYPE_CHECKING:
 
 NAME = "pose_drift"
 CAMERAS = 4
-"""Minimum number of cameras to detect a misaligned one; with fewer, moving Gaussians could explain the difference.
-"""
+"""Minimum number of cameras for detecting a misaligned one. With fewer, moving Gaussians could explain the
+difference."""
 ENOUGH = 0.5
 """Minimum share of the rig's cameras that a frame must contain to be used."""
 LEAST = 0.25
-"""Minimum offset of a suspect camera, in pixels. Fixed cameras reach at most 0.15 on captures, 0.4 on shaken cloth."""
+"""Minimum offset of a suspect camera, in pixels. Fixed cameras reach 0.15 on captures, and 0.4 on shaken cloth."""
 TIMES = 4.0
-"""Minimum ratio of a suspect camera's offset to the median offset; if many cameras seem to be off, the tracking
-is lagging."""
+"""Minimum ratio of a suspect camera's offset to the median offset. If many cameras seem to be off, the tracking
+lags."""
 # Measurements on which the effect's threshold is based: at half size, captures with fixed cameras have shares of at
 # most 0.14 on cloth played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
 SHARE = 0.5
@@ -69,8 +71,8 @@ STANDING = 6
 """Number of fixed cameras that are rendered while the effect is on (different cameras in each frame). They show which
 part of a twist is scene motion."""
 LARGEST, TURN = 0.02, radians(1)
-"""Maximum pose correction, as a share of the image width and as an angle. A camera that is off by more has been moved
-and stays excluded."""
+"""Maximum pose correction, as a share of the image width and as an angle in radians. A camera that is off by more has
+been moved and stays excluded."""
 COVERED = 0.1
 """Minimum alpha at which a pixel has a depth."""
 SMALLEST = 1e-3
@@ -116,7 +118,7 @@ class Poses:
 
     @classmethod
     def of(cls, arrays: Arrays, count: int) -> Poses:
-        """Creates poses from ``arrays``; missing arrays are filled with zeros."""
+        """Creates the poses of ``count`` cameras from ``arrays``; missing arrays are filled with zeros."""
         shapes = {"twists": (count, 6), "moved": (count, 3), "offsets": (count, 3), "shares": (count,)}
         blank: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
         blank["observations"] = np.zeros(count, np.int64)
@@ -146,7 +148,7 @@ class Poses:
         self.observations[row] += 1
 
     def suspects(self) -> NDArray[np.bool_]:
-        """Returns the [C] mask of cameras that may have moved; they are rendered and measured again."""
+        """Returns the [C] mask of cameras that may have moved and are therefore rendered and measured again."""
         sizes, looked = np.linalg.norm(self.offsets, axis=1), self.observations > 0
         usual = float(np.median(sizes[looked])) if looked.any() else 0.0
         off: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
@@ -197,7 +199,7 @@ def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
 
 
 def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
-    """Returns the [C, 6] twists with the motion shared by most cameras removed, because it is scene motion.
+    """Returns the [C, 6] twists without the motion that most cameras share, which is scene motion.
 
     The shared twist is the median of each component, in world axes, over the accepted cameras. With a mean, a camera
     that is off by 3 pixels would move the other cameras, and the world with them.
@@ -205,7 +207,7 @@ def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) 
     Args:
         twists: [C, 6] twists of all cameras.
         rig: rig as calibrated or with current poses; both give the same result.
-        believed: [C] mask of the accepted cameras.
+        believed: [C] mask of the accepted cameras; the twists of all others are unchanged.
     """
     worlds = [
         np.linalg.solve(adjoint(rig.cameras[row].world_to_camera), twists[row]) for row in np.flatnonzero(believed)
@@ -252,7 +254,7 @@ class PoseDrift(Effect):
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the largest share of any camera's residual explained by its offsets from earlier frames."""
+        """Returns the largest share of a suspect camera's residual that its offsets from earlier frames explain."""
         arrays = seen.result.carried.get(NAME)
         if arrays is None or not _says(seen):
             return None
@@ -273,7 +275,7 @@ def _says(seen: FrameObservation) -> bool:
 
 
 def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
-    """Returns the views to align: all drifted or excluded cameras, and a few fixed ones that vary between frames."""
+    """Returns the views of all drifted or excluded cameras, and of a few fixed ones that vary between frames."""
     off = poses.drifted()
     standing = [view for view in seen.views if not off[rows[view.name]]]
     count = len(standing)
@@ -305,7 +307,7 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
 
 
 def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]:
-    """Returns a view's rendering [3, H, W] without exposure, and depths [H, W] in metres along z, NaN where empty."""
+    """Returns a view's rendering [3, H, W] without exposure, and its depth [H, W] along z in metres, NaN if empty."""
     state = seen.result.gaussians
     planes, rest = seen.renderer.render(state, view.camera, depth_channel=LABEL)
     alpha = 1 - rest

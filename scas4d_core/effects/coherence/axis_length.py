@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AxisLength(Effect):
-    """The loss term weighted by ``weights.scale``."""
+    """The axis length term of the loss, weighted by ``weights.scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the weight is 0."""
+        """Returns a refusal if ``weights.scale`` is 0."""
         return refusal_at_zero(settings, "weights.scale")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the loss term with its weight."""
+        """Adds the loss term to the plan, with its weight from the settings."""
         builder.plan.axis_length = builder.update.weights.scale
 
 

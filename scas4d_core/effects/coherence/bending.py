@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 SAMPLE = 4000
-"""Approximate number of sampled Gaussians (up to twice as many); patches then have a similar extent in all states.
-"""
+"""Approximate number of sampled Gaussians, which gives patches a similar extent in all states. The actual number may
+be up to twice as large."""
 PATCH = 40
 """Number of Gaussians in a patch in addition to its centre; with fewer, the rotation is too noisy."""
 PATCHES = 400
-"""Approximate number of patches (up to twice as many); the evidence is the median over patches."""
+"""Approximate number of patches, over which the median is taken. The actual number may be up to twice as large."""
 AROUND = 19
 """Number of nearest patches that each patch is compared with; together they cover a twentieth of the object."""
 REST = 1e-3
-"""Minimum motion relative to the extent of the moving Gaussians; if 90 % move less, the frame provides no evidence."""
+"""Motion relative to the extent of the moving Gaussians. If 90 % of them move less, a frame provides no evidence."""
 
 # Measurements on which the thresholds are based, in radians: on swinging `cloth`, at least 0.030 while the effect is
 # off (also when played backwards or with half of the cameras), and at least 0.037 while it is on. All other captures

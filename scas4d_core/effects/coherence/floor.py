@@ -26,7 +26,12 @@ FLOOR_WEIGHT = 2.0
 def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
     """Converts a plane (a, b, c, d) from the user's world to the internal world.
 
-    Points with a·x + b·y + c·z + d > 0 are below the floor; in the internal world, the value is that depth in metres.
+    Points with a·x + b·y + c·z + d > 0 are below the floor. In the internal world, this value is the depth below the
+    floor in metres.
+
+    Args:
+        plane: plane (a, b, c, d) in the user's world.
+        world: position and scale of the internal world.
 
     Raises:
         ValueError: if (a, b, c) has zero length.
@@ -42,7 +47,7 @@ def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
 
 @dataclass(frozen=True)
 class Floor(Effect):
-    """The loss term for the plane ``scene.floor``."""
+    """The floor term of the loss, for the plane ``scene.floor``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Returns a refusal if the scene has no floor plane."""
@@ -51,7 +56,7 @@ class Floor(Effect):
         return None
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the loss term."""
+        """Adds the floor term to the plan."""
         assert builder.scene.floor is not None
         builder.plan.floor, builder.plan.floor_weight = builder.scene.floor, FLOOR_WEIGHT
 

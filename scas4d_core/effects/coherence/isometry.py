@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Isometry(Effect):
-    """The loss term weighted by ``weights.isometry``."""
+    """The isometry term of the loss, weighted by ``weights.isometry``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the weight is 0."""
+        """Returns a refusal if ``weights.isometry`` is 0."""
         return refusal_at_zero(settings, "weights.isometry")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the loss term with its weight."""
+        """Adds the loss term to the plan, with its weight from the settings."""
         builder.plan.neighbour_terms = True
         builder.plan.isometry = builder.update.weights.isometry
 

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rigidity(Effect):
-    """The loss term weighted by ``weights.rigidity``."""
+    """The rigidity term of the loss, weighted by ``weights.rigidity``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the weight is 0."""
+        """Returns a refusal if ``weights.rigidity`` is 0."""
         return refusal_at_zero(settings, "weights.rigidity")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the loss term with its weight."""
+        """Adds the loss term to the plan, with its weight from the settings."""
         builder.plan.neighbour_terms = True
         builder.plan.rigidity = builder.update.weights.rigidity
 

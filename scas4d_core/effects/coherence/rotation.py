@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rotation(Effect):
-    """The loss term weighted by ``weights.rotation``."""
+    """The rotation term of the loss, weighted by ``weights.rotation``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the weight is 0."""
+        """Returns a refusal if ``weights.rotation`` is 0."""
         return refusal_at_zero(settings, "weights.rotation")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the loss term with its weight."""
+        """Adds the loss term to the plan, with its weight from the settings."""
         builder.plan.neighbour_terms = True
         builder.plan.rotation = builder.update.weights.rotation
 

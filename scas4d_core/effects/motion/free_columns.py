@@ -32,13 +32,13 @@ class FreeColumns(Effect):
     """An effect that enables the parameters of the same name (``engines.freedom.Freedom``)."""
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a requirement if nothing could move without this effect."""
+        """Returns a requirement if no effect could move anything without this one."""
         if any(may_be_on(name, settings) for name in MOVES):
             return None
         return "no effect could move clusters or Gaussians", f"set at least one of {', '.join(MOVES)} to 'auto'"
 
     def register(self, builder: PlanBuilder) -> None:
-        """Enables the parameters."""
+        """Enables the parameters in the plan."""
         builder.plan.freedom = replace(builder.plan.freedom, **{self.name: True})
 
 
@@ -47,7 +47,7 @@ class ClusterColumns(FreeColumns):
     """An effect that enables parameters of the clusters."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if there are no clusters."""
+        """Returns a refusal if ``update.clusters`` is empty."""
         if settings.update.clusters:
             return None
         return "update.clusters is empty", "set the number of clusters per layer, such as (64, 320, 1280)"

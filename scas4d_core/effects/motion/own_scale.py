@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OwnScale(FreeColumns):
-    """Log scale Δs, learnt with the learning rate ``rate_scale``."""
+    """Enables the log scale Δs, which is learnt with the learning rate ``rate_scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if the rate is 0."""
+        """Returns a refusal if ``rate_scale`` is 0."""
         return refusal_at_zero(settings, "rate_scale")
 
 

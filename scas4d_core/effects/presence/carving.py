@@ -1,7 +1,7 @@
 """Hull of new objects: voxels that several cameras see as new and that few cameras see through.
 
-The hull is carved from an octree, like the visual hull of frame 0. Each camera contributes a silhouette. It is ignored
-at pixels in which a moving object of the state may hide the new one.
+The hull is carved from an octree, like the visual hull of frame 0. Each camera contributes a silhouette, which is
+ignored at pixels in which a moving object of the state may hide the new one.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 AGREE = 4
-"""Minimum number of cameras that see a voxel as new; in a rig of twenty cameras, three can agree on a ghost."""
+"""Minimum number of cameras that see a voxel as new. In a rig of twenty cameras, three can agree on a ghost."""
 MISSES = 0.1
-"""Maximum share of the counted cameras that see a voxel as free; outlines can be off by a pixel."""
+"""Maximum share of cameras that see a voxel as free, among the cameras that see it as free or new. Outlines can be off
+by a pixel."""
 COARSE = 32
 """Number of voxels along an edge of the first grid."""
 VOXEL_PIXELS = 1.5
 """Maximum edge of the smallest voxel, in pixels at the centre of the scene."""
 MAX_CELLS = 1 << 24
-"""Maximum number of grid cells for separating new objects; voxels that need a larger grid are not treated as an
-object."""
+"""Maximum number of grid cells for separating new objects. Voxels that need a larger grid are discarded."""
 MAX_VOXELS = 1_000_000
 """Maximum number of voxels in a level; refinement stops before this limit is exceeded."""
 AT_ONCE = 1 << 16
@@ -64,7 +64,7 @@ class Hull:
 
 
 def carve_new(seen: Sequence[Novelty]) -> Hull:
-    """Carves new objects from a cube around the scene centre that contains all cameras.
+    """Returns the hull of new objects, carved from a cube around the scene centre that contains all cameras.
 
     Args:
         seen: novelty map of each camera.
@@ -147,7 +147,7 @@ def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
 
 
 def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Renumbers positions along an axis from 1, with one empty position per gap.
+    """Returns positions along an axis, renumbered from 1 with one empty position per gap.
 
     >>> _without_gaps(np.array([7, -900, 8, 30]))
     array([3, 1, 4, 6])

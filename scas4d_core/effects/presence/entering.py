@@ -34,11 +34,11 @@ SMALLEST = 0.003
 """Minimum share of new pixels in an image for a camera to count (200 of 256 x 256). Moving objects that are tracked
 with a lag leave fewer new pixels."""
 SHARE = 0.05
-"""Minimum share of all images' squared error that an object must explain to switch the effect on."""
+"""Minimum share of the squared error of all images that an object must explain to switch the effect on."""
 WORTH = 0.01
-"""Minimum share of the error that an object must explain for Gaussians to be added while the effect is on."""
+"""Minimum share of the squared error that an object must explain for adding Gaussians while the effect is on."""
 SURPLUS = 0.5
-"""Minimum surplus of new over stale pixels, relative to the object's pixels; otherwise the object has only moved."""
+"""Minimum surplus of new over stale pixels, relative to the object's pixels. Otherwise, the object has only moved."""
 BORDER, SUDDEN = 0.5, 0.2
 """New objects enter across the image border. The first value is the minimum share of cameras in which an object touches
 the border. The second is the minimum share of the error for an object that appears elsewhere. A limb that is tracked
@@ -64,7 +64,7 @@ NO_NEWBORNS: Arrays = {
 }
 """Initial carried arrays, before any Gaussian is added."""
 NEWBORN_ARRAYS = ("newborn", "thing", "centres", "volumes", "places")
-"""Arrays that only describe the last frame; see ``NewbornTracking``."""
+"""Names of the arrays that describe only the last frame; see ``NewbornTracking``."""
 BUDGET = 0.1
 """Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
@@ -77,7 +77,7 @@ class EnteredThings:
         seen: novelty map of each camera.
         hull: hull of the accepted objects.
         share: share of the squared error that the objects explain.
-        cameras: number of cameras that see the object seen by the most cameras.
+        cameras: largest number of cameras that see the same object.
     """
 
     seen: Sequence[Novelty]
@@ -120,7 +120,7 @@ def _says(one: Novelty) -> bool:
 
 
 def _find_denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
-    """Returns the [P] mask of means at which most cameras see no object."""
+    """Returns the [P] mask of means [P, 3] at which most cameras see no object."""
     against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
     for one in seen:
         column, row, _, inside = pixels_inside(one.camera, means)
@@ -159,7 +159,7 @@ class Entering(Effect):
     """Adds Gaussians in frames that show objects missing from the state."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of the error explained by new objects, or the recorded share if added Gaussians exist."""
+        """Returns the share of the error that new objects explain, or the recorded share if added Gaussians exist."""
         if not seen.views:
             return None
         left = seen.result.carried.get(NAME)
@@ -169,7 +169,7 @@ class Entering(Effect):
         return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """Adds Gaussians for new objects, and refines Gaussians added in recent frames."""
+        """Adds or revives Gaussians for new objects, and refines or retires Gaussians added in recent frames."""
         from scas4d_core.effects.presence.newborn_fit import fit_newborns, refine_newborns, sample_seeds
 
         result, things = seen.result, find_entered(seen)

@@ -24,16 +24,15 @@ if TYPE_CHECKING:
 
 NAME = "leaving"
 SHARE, IDLE_SHARE = 0.02, 0.002
-"""Shares of moving Gaussians outside all images: at the first the effect is switched on, below the second it may be
-switched off.
-"""
+"""Share of moving Gaussians outside all images from which the effect is switched on, and share below which it may be
+switched off."""
 FRAMES = 2
-"""Number of consecutive frames outside all images before a Gaussian is retired; objects at the border come and go."""
+"""Number of consecutive frames outside all images before a Gaussian is retired. Objects at the border come and go."""
 ABOUT = 0.1
 """Distance, relative to the moving extent, within which a visible Gaussian keeps its neighbours from being retired. The
 visible half of an object still guides the other half."""
 WIDTHS = 3.0
-"""Extent of a Gaussian in standard deviations; the entire extent must be outside the image."""
+"""Extent of a Gaussian in standard deviations. The entire extent must be outside an image."""
 
 
 def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaskTerm(Effect):
-    """The loss term weighted by ``weights.mask`` or ``weights.mask_alone``, in frames with masks."""
+    """The mask term of the loss in frames with masks, weighted by ``weights.mask`` or ``weights.mask_alone``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Returns a refusal if masks are not used, or if both weights are 0."""
@@ -29,7 +29,7 @@ class MaskTerm(Effect):
         return "update.weights.mask and update.weights.mask_alone are 0", "set at least one of them above 0"
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the loss term with its weight."""
+        """Adds the loss term to the plan, with its weight from the settings."""
         from scas4d_core.update.schedule import mask_weight  # deferred import, because it loads the kernels
 
         builder.plan.mask = mask_weight(builder.update, len(builder.hierarchy.rows), int(builder.first.present.sum()))

@@ -16,7 +16,7 @@ class MotionLabels(Effect):
     """Learns labels from motion, in scenes without masks."""
 
     def register(self, builder: PlanBuilder) -> None:
-        """Enables learning of the labels."""
+        """Enables the learning of labels between updates."""
         builder.plan.learns_labels = True
 
 

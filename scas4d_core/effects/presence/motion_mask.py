@@ -1,4 +1,4 @@
-"""Labels of moving Gaussians: from the masks of frame 0 or, without masks, learnt from the images of two frames.
+"""Labels of moving Gaussians, derived from the masks of frame 0 or, without masks, from the images of two frames.
 
 A static Gaussian inside the silhouettes of nearly all cameras is inside a moving object and moves with it. The fit
 learns labels only on the outside of an object. A static Gaussian left inside becomes a ghost when the object leaves.
@@ -25,11 +25,11 @@ from scas4d_core.posed_pictures import pixels_inside
 Array = NDArray[np.float32]
 
 CHANGE = 0.04
-"""Difference of a colour channel (0…1) above which a pixel has changed; it exceeds sensor and JPEG noise."""
+"""Difference of a colour channel (0…1) above which a pixel has changed. Sensor and JPEG noise are smaller."""
 REACH_PIXELS = 5
-"""Side of the square marked around a changed pixel, because the inside of a plain surface moves without changing."""
+"""Side of the square marked around a changed pixel. The inside of a plain surface can move without changing."""
 SEEN_PIXELS = 0.02
-"""Blending weight of a Gaussian, in pixels, above which a camera may vote on it."""
+"""Blending weight of a Gaussian, in pixels, above which a camera votes on whether the Gaussian moves."""
 IN_CHANGE = 0.5
 """Share of a Gaussian's weight in changed pixels above which a camera votes that it moves."""
 MAJORITY = 0.5
@@ -40,16 +40,15 @@ STANDING_SHARE = 0.1
 
 INSIDE_SHARE = 0.8
 """A Gaussian counts as inside a moving object if at least this share of the masks contains its mean. Only cameras with
-a mask and with the Gaussian in view are considered. Automatic masks are ragged; 0.7 to 0.9 fades the ghosts of
-`basketball` equally well.
-"""
+a mask and with the Gaussian in view are considered. Automatic masks are ragged. Values from 0.7 to 0.9 fade the ghosts
+of `basketball` equally well."""
 INSIDE_CAMERAS = 3
-"""Minimum number of cameras for ``INSIDE_SHARE``; the intersection of two silhouettes contains much empty space."""
+"""Minimum number of cameras for ``INSIDE_SHARE``. The intersection of two silhouettes contains much empty space."""
 
 FIRST_LABELS = 32
 """Minimum number of moving Gaussians for learning the first labels. A mouse in a room makes up only a few hundredths of
-a percent of the scene. Before that, frames that the state already explains are skipped (``robust.solve_frame``); in
-other frames all Gaussians may move."""
+a percent of the scene. Until then, frames that the state already explains are skipped (``robust.solve_frame``). In
+other frames, all Gaussians may move."""
 NEW_LABELS = 0.01
 """Share of all Gaussians that must be newly detected as moving before the hierarchy is rebuilt."""
 MORE_LABELS = 0.2
@@ -68,7 +67,7 @@ def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.
 
 
 def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
-    """Labels all Gaussians in the visual hull of the masks (Laurentini 1994) as moving, and returns the new state.
+    """Returns the state with all Gaussians in the visual hull of the masks (Laurentini 1994) labelled as moving.
 
     If no Gaussian is static, or none moves, the labels cannot be extended and are unchanged.
 
@@ -99,8 +98,8 @@ def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
     """Returns the Gaussians of frame 0, all labelled as moving if only a few are static.
 
     These few static Gaussians belong to an object, but no mask determined their label. They would stay behind and hide
-    the object when it moves.
-    If all Gaussians may move, a static background forms clusters that do not move.
+    the object when it moves. A static background may safely be labelled as moving, because it forms clusters that do
+    not move.
 
     >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
     >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
@@ -114,7 +113,7 @@ def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
 
 
 def changed_pixels(before: Array, now: Array) -> Array:
-    """Returns an [H, W] map: 1 in and around pixels that differ between two images [3, H, W], 0 elsewhere.
+    """Returns an [H, W] map that is 1 in and around pixels that differ between two images [3, H, W], and 0 elsewhere.
 
     >>> before = np.zeros((3, 7, 7), np.float32)
     >>> now = before.copy()
@@ -160,7 +159,9 @@ def learn_labels_from_motion(
     now: Sequence[TrainingView],
     renderer: Renderer,
 ) -> NDArray[np.bool_] | None:
-    """Returns the [N] mask of Gaussians that have moved so far, or None if too few are new or too few have moved.
+    """Returns the [N] mask of Gaussians that have moved so far, or None to keep the previous labels.
+
+    The labels change only once enough Gaussians have been newly detected as moving.
 
     Args:
         gaussians: state Θ_{t−1}.
@@ -176,5 +177,5 @@ def learn_labels_from_motion(
 
 
 def with_labels(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
-    """Returns the Gaussians with the labels [N] learnt from motion; unchanged if ``labels`` is None."""
+    """Returns the Gaussians with the labels [N] learnt from motion, or unchanged if ``labels`` is None."""
     return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))

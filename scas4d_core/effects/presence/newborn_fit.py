@@ -35,7 +35,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 ITERATIONS = 400
-"""Number of iterations of a fit; on image crops, they take less time than an update of 100 iterations."""
+"""Number of iterations of a fit. On image crops, they take less time than an update of 100 iterations."""
 SETTLING = 150
 """Number of iterations for refining recently added Gaussians after each update."""
 FEWEST = 0.25
@@ -57,7 +57,7 @@ RATE_POSITION, RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION = 3.2e-4, 1e
 """Adam learning rates of means (per metre of the rig's radius), RGB, opacity logits, log scales and quaternions. They
 are one to four times those of frame 0, which has eight times as many iterations."""
 END = 0.05
-"""Fraction to which the rates decay by the end of the half-cosine schedule."""
+"""Fraction to which the learning rates decay on a half-cosine by the end of a fit."""
 BETA1, BETA2 = np.float32(0.8), np.float32(0.95)
 """Decay rates of Adam, as in the update, which has similarly few iterations."""
 
@@ -84,7 +84,7 @@ def fit_newborns(
     moves: bool,
     time: FitTime,
 ) -> Gaussians | None:
-    """Returns Gaussians at the given points, fitted to the views next to the fixed state, or None if time is too short.
+    """Returns new Gaussians at the given points, fitted to the views with a fixed state, or None if time is too short.
 
     Args:
         state: state Θ_t; its Gaussians are not changed.
@@ -115,7 +115,7 @@ def refine_newborns(
     rng: np.random.Generator,
     time: FitTime,
 ) -> Gaussians:
-    """Returns the state with means, factors and colours of some rows fitted to the views; opacities are fixed.
+    """Returns the state with the means, factors and colours of some rows fitted to the views. Opacities are fixed.
 
     Args:
         state: state Θ_t.
@@ -155,10 +155,17 @@ def refine_newborns(
 
 
 class _Schedule:
-    """Schedule of a fit: as many iterations as planned, or as time allows; rates follow a half-cosine.
+    """Schedule of a fit, which runs the planned number of iterations, or as many as time allows.
+
+    The learning rates follow a half-cosine.
+
+    Args:
+        iterations: planned number of iterations.
+        end: ``perf_counter`` value at which the fit must end, or None for no limit.
+        rates: initial learning rate of each column of the parameters.
 
     Attributes:
-        whole: whether there was time for enough steps; otherwise, the result is discarded.
+        whole: whether there was time for enough iterations; otherwise, the result is discarded.
     """
 
     def __init__(self, iterations: int, end: float | None, rates: Array) -> None:
@@ -194,10 +201,9 @@ def _fit_crops(
     iterations: int,
     opacities: bool = True,
 ) -> Gaussians | None:
-    """Fits parameters next to a fixed state, each step on a crop of one view; returns None if time is too short.
+    """Returns Gaussians fitted next to a fixed state, or None if time is too short.
 
-    Args:
-        opacities: whether opacities are fitted.
+    Each step uses a crop of one view. Opacities are fitted only if ``opacities`` is true.
     """
     fit = _beside(state, parameters, views, rig, renderer)
     rates = np.zeros(COLUMNS, np.float32)
@@ -217,7 +223,7 @@ def _fit_crops(
 def _beside(
     state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, renderer: Renderer
 ) -> GaussianFit:
-    """Returns a fit on crops that show the new Gaussians, with the state's Gaussians that reach into the crops."""
+    """Returns a fit on crops around the new Gaussians, with the state's Gaussians that reach into the crops."""
     factory, crops, fixed = ViewFactory(rig), [], []
     for view in views:
         camera = rig[view.name]
@@ -229,7 +235,10 @@ def _beside(
 
 
 def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:
-    """Returns left, top, right and bottom of a box around points [P, 3] with a margin, or None if it is too small."""
+    """Returns (left, top, right, bottom) of a box around points [P, 3] in an image, with a margin.
+
+    Returns None if the box is too small or a point is behind the camera.
+    """
     uv, depth = camera.project(points)
     if not (depth > 0).all():
         return None
@@ -239,7 +248,7 @@ def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:
 
 
 def _reaching(state: Gaussians, camera: Camera, box: tuple[int, int, int, int]) -> Int:
-    """Returns the rows of the Gaussians that may reach into a crop."""
+    """Returns the rows of the Gaussians that may reach into a box (left, top, right, bottom) of an image."""
     uv, depth = camera.project(state.means.astype(np.float64))
     width = np.sqrt(np.square(state.factors).sum(axis=(1, 2)))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Tracks objects that were added in the previous frame, whose motion is unknown and may exceed their width.
+"""Tracking of objects that were added in the previous frame. Their motion is unknown and may exceed their width.
 
 The object is removed from the state, and its hull is carved again from the images of the frame. The displacement
 between the two hulls initializes the translation of its clusters.
@@ -24,8 +24,8 @@ Float = NDArray[np.float64]
 SAME = 2.5
 """Maximum ratio between the volumes of two hulls of the same object, which may enter gradually."""
 OWN = 0.5
-"""Minimum share of a cluster's Gaussians that must belong to an object for the cluster to start with its displacement.
-"""
+"""Minimum share of a cluster's Gaussians that must belong to an object. Only then does the cluster start with the
+displacement of the object."""
 
 
 class NewbornTracking(UpdatePart):
@@ -33,9 +33,9 @@ class NewbornTracking(UpdatePart):
 
     Args:
         builder: builder of the update plan.
-        name: name of the effect whose arrays describe the added objects: the row ("newborn") and the object number
-            ("thing") of each added Gaussian. For each of the T objects, they contain the centre of its hull
-            ("centres", [T, 3], metres), its volume ("volumes", [T], cubic metres), and the mean position of its
+        name: name of the effect whose arrays describe the added objects. The arrays contain the row ("newborn") and the
+            object number ("thing") of each added Gaussian. For each of the T objects, they contain the centre of its
+            hull ("centres", [T, 3], metres), its volume ("volumes", [T], cubic metres), and the mean position of its
             Gaussians ("places", [T, 3], metres).
     """
 
@@ -43,7 +43,7 @@ class NewbornTracking(UpdatePart):
         self._hierarchy, self._factory, self._name = builder.hierarchy, builder.factory, name
 
     def begin(self, attempt: Attempt) -> None:
-        """Locates each object added in the previous frame in the images of this frame."""
+        """Starts the clusters of objects added in the previous frame with the displacements found in the images."""
         arrays = attempt.carried.get(self._name)
         if arrays is None or not len(arrays["newborn"]) or not attempt.tables.clusters:
             return
@@ -60,7 +60,10 @@ class NewbornTracking(UpdatePart):
 
 
 def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
-    """Returns an object's [3] displacement since it was added, non-zero if a retry starts where an attempt ended."""
+    """Returns an object's [3] displacement since it was added, in metres.
+
+    It is non-zero if an attempt starts from the end of another attempt.
+    """
     rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):
         return np.zeros(3)
@@ -69,7 +72,7 @@ def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
 
 
 def _displacements(hull: Hull, arrays: Arrays) -> dict[int, Float]:
-    """Returns the [3] displacement of each added object to the nearest hull of similar volume, in metres."""
+    """Returns the [3] displacement of each object to the nearest hull of similar volume, in metres, if there is one."""
     displacements: dict[int, Float] = {}
     numbers = np.unique(hull.things)
     centres = np.array([hull.points[hull.things == number].mean(axis=0) for number in numbers]).reshape(-1, 3)

@@ -33,12 +33,12 @@ Array = NDArray[np.float32]
 THERE, ABSENT = 0.5, 0.3
 """Rendered label above which a pixel shows a moving Gaussian, and label below which it shows none."""
 RIM = 3
-"""Minimum width of a region, in pixels; narrower regions are outlines that are off by a pixel."""
+"""Minimum width of a region, in pixels. Narrower regions are outlines that are off by a pixel."""
 BARE = 0.5
 """Transmittance above which the state is empty at a pixel."""
 DIFFERENT, TIMES_USUAL = 0.1, 3.0
-"""Minimum mean channel difference, 0…1, in a square of ``RIM`` pixels; without masks, also its minimum ratio to the
-median over the image."""
+"""Minimum channel difference, 0…1, averaged over a square of ``RIM`` pixels. Without masks, the second value is the
+minimum ratio of this difference to its median over the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +78,7 @@ class CoarseNovelty(NamedTuple):
 
     Attributes:
         view: training view of the frame.
-        new, bare: shares of new and bare pixels (see ``Novelty``); regions appear smaller, because outlines are
-            removed.
+        new, bare: shares of new and bare pixels; see ``Novelty``. Regions appear smaller, because outlines are removed.
     """
 
     view: TrainingView
@@ -101,7 +100,10 @@ _coarse_cache: WeakKeyDictionary[UpdateTrace, list[CoarseNovelty]] = WeakKeyDict
 
 
 def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
-    """Returns novelty maps of some cameras, or an empty list if too few cameras may see something new or bare.
+    """Returns novelty maps of the cameras that may see something new or bare, according to coarse estimates.
+
+    The list is empty if there are fewer than ``least`` such cameras. Without enough coarse estimates, the list
+    contains a few cameras that vary between frames.
 
     Args:
         seen: the learnt frame.
@@ -128,7 +130,7 @@ def _coarse_novelties(seen: FrameObservation) -> list[CoarseNovelty]:
 
 
 def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
-    """Returns a coarse estimate from a view and its rendering; all four pixels of a 2 × 2 square must agree."""
+    """Returns a coarse estimate from a view and its rendering. All four pixels of a 2 × 2 square must agree."""
     every, shown = thinned
     target = view.target[:, ::every, ::every]
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
@@ -158,7 +160,10 @@ def _all_corners(plane: Bool) -> Bool:
 
 
 def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
-    """Returns novelty maps rendered in the previous frame's colours; static colours may have absorbed a new object."""
+    """Returns the novelty map of each view, rendered with the colours of the previous frame.
+
+    In the current state, static colours may have absorbed a new object.
+    """
     state = seen.result.gaussians
     known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
@@ -181,7 +186,7 @@ def measure_novelty(
 
     Args:
         state: state Θ_t, updated to the frame.
-        colours: [N, 3] RGB to render; the colours of the previous frame have not absorbed new objects.
+        colours: [N, 3] RGB to render, usually from the previous frame, whose colours have not absorbed new objects.
         views: training views of the frame.
         rig: cameras in the internal world.
         renderer: renderer for the state.

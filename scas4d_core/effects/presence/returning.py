@@ -44,12 +44,12 @@ class ReturnedThing(NamedTuple):
 
 
 def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[ReturnedThing]:
-    """Returns the retired Gaussians that explain new objects when simply moved to the hull's centre.
+    """Returns the retired Gaussians that explain new objects when they are moved to the centre of the hull.
 
     Args:
         seen: novelty map of each camera.
         hull: hull of the new objects.
-        state: state Θ_t.
+        state: state Θ_t, including the retired Gaussians.
         renderer: renderer for the state.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
@@ -106,7 +106,7 @@ def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
 
 
 def _left(seen: Sequence[Novelty], points: Float, voxel: float, state: Gaussians, renderer: Renderer) -> float:
-    """Returns the share of the squared error at an object that remains when a state is rendered."""
+    """Returns the share of the squared error in an object's new pixels that remains when a state is rendered."""
     before = after = 0.0
     for one in seen:
         where = one.new & footprint(one, points, voxel)

@@ -23,24 +23,29 @@ if TYPE_CHECKING:
 NAME = "uncovered"
 MIN_CAMERAS, MIN_CAMERAS_WHILE_ON = 3, 1
 """Minimum number of screened cameras that must see a bare region before all cameras are checked, while the effect is
-off and while it is on. Continued motion keeps uncovering background, and few cameras see the hole at first."""
+off and while it is on. Continued motion keeps uncovering background, and at first only few cameras see a hole."""
 SMALLEST = 0.0004
 """Minimum share of bare pixels in an image for a camera to count (26 of 256 x 256, about five by five pixels)."""
 SHARE = 0.03
-"""Minimum share of all images' squared error that must be in bare regions to switch the effect on."""
+"""Minimum share of the squared error of all images that must be in bare regions to switch the effect on."""
 WORTH = 0.005
-"""Minimum share of the error in bare regions for Gaussians to be added while the effect is on."""
+"""Minimum share of the squared error in bare regions for adding Gaussians while the effect is on."""
 BUDGET = 0.05
 """Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
 
 Found = tuple[UncoveredPoints, float]
 _points_cache: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
-"""Cached results for each state and minimum number of screened cameras; used for evidence and to add Gaussians."""
+"""Results for each state and minimum number of screened cameras, used both as evidence and for adding Gaussians."""
 
 
 def _find_points(seen: FrameObservation, glanced: int) -> Found | None:
-    """Returns points on uncovered surfaces, and the share of the squared error that they explain."""
+    """Returns points on uncovered surfaces and the share of the squared error that they explain, or None.
+
+    Args:
+        seen: the learnt frame.
+        glanced: minimum number of screened cameras that must see a bare region.
+    """
     known = _points_cache.setdefault(seen.result.gaussians, {})
     if glanced not in known:
         known[glanced] = _looked_for(seen, glanced)
@@ -68,7 +73,10 @@ class UncoveredEffect(Effect):
     """Adds static Gaussians behind moving objects."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of the error in bare regions. Once Gaussians are added, fewer cameras must see a region."""
+        """Returns the share of the squared error in bare regions.
+
+        Once Gaussians have been added, fewer cameras need to see a region.
+        """
         if not seen.views:
             return None
         points = _find_points(seen, MIN_CAMERAS_WHILE_ON if NAME in seen.result.carried else MIN_CAMERAS)

@@ -1,7 +1,7 @@
 """Points on uncovered surfaces: the surface around a bare region is extended across it.
 
-In an image, the inverse depth of a plane is linear in pixel coordinates. It is fitted to the static scene around the
-region. The resulting points are accepted if the cameras agree on their colour.
+In an image, the inverse depth of a plane is linear in pixel coordinates. Such a plane is fitted to the static scene
+around the region. Its points are accepted if the cameras agree on their colour.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FEWEST = 24
 OPAQUE = 0.1
 """Maximum transmittance at which a pixel has a depth."""
 ROUNDS = 5
-"""Number of iterations of reweighted least squares; pixels of other surfaces around the region are outliers."""
+"""Number of iterations of reweighted least squares. Pixels of other surfaces around the region are outliers."""
 NEAR = 0.02
 """Approximate relative deviation of an inlier from the plane, in inverse depth."""
 CAMERAS, SPREAD = 3, 0.08
@@ -82,7 +82,7 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
 
 
 def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
-    """Returns the [P, 3] points of a camera's bare pixels."""
+    """Returns the [P, 3] surface points in the bare pixels of a camera."""
     planes, rest = renderer.render(standing, one.view.camera, depth_channel=LABEL)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = (1 - rest) / planes[LABEL]
@@ -99,7 +99,7 @@ def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
 
 
 def _plane(at: NDArray[np.int64], values: Array, wanted: NDArray[np.int64]) -> Float:
-    """Fits a plane to values at pixels [P, 2] and returns its values at pixels [Q, 2], bounded from below."""
+    """Returns the [Q] values, bounded from below, at ``wanted`` pixels [Q, 2] of a plane fitted to pixels [P, 2]."""
     design = np.column_stack([at, np.ones(len(at))]).astype(np.float64)
     weights = np.ones(len(at))
     middle = max(float(np.median(values)), 1e-6)
@@ -112,7 +112,7 @@ def _plane(at: NDArray[np.int64], values: Array, wanted: NDArray[np.int64]) -> F
 
 
 def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:
-    """Lifts pixels (row, column) at depths to [P, 3] world points."""
+    """Returns the [P, 3] world points at pixels [P, 2] (row, column) and depths [P]."""
     camera = one.camera
     x = (pixels[:, 1] + 0.5 - camera.cx) / camera.fx * depth
     y = (pixels[:, 0] + 0.5 - camera.cy) / camera.fy * depth
@@ -121,7 +121,10 @@ def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:
 
 
 def _agreed(seen: Sequence[Novelty], points: Float) -> tuple[Array, Bool]:
-    """Returns the median colour [P, 3] over the cameras that see static background, and a mask [P] of agreement."""
+    """Returns the median colour [P, 3] over the cameras that see static background, and a mask [P].
+
+    The mask selects the points that enough cameras see and on whose colour they agree.
+    """
     samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
     bare = np.zeros(len(points), np.int64)
     for sample, one in zip(samples, seen, strict=True):
