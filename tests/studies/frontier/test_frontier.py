@@ -78,7 +78,7 @@ def test_every_setting_is_another_and_the_default_comes_first():
     assert {len(v.settings.update.clusters) for v in AXES["layers"]} == {1, 2, 4, 5}  # the default has three
     assert [v.settings.update.clusters[0] for v in AXES["clusters"]] == [16, 32, 48]
     assert [(v.settings.update.iterations, v.settings.update.views) for v in (DEFAULT, *AXES["views"])] == [
-        (100, 1), (100, 2), (100, 4), (50, 2),
+        (100, 1), (100, 2), (100, 4), (50, 2), (50, 4), (25, 4),
     ]  # fmt: skip
     assert [(v.settings.update.covariance, v.settings.update.deltas_start) for v in (DEFAULT, *AXES["covariance"])] == [
         ("entangled", 0.4), ("separate", 0.0),
