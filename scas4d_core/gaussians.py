@@ -74,6 +74,8 @@ class Gaussians:
         retired = np.zeros(len(self.means), np.bool_) if self.retired is None else self.retired
         own = self.opacities if self.own_opacities is None else self.own_opacities
         shown = np.where(retired, np.float32(0), own) if retired.any() else own
+        if shown is not own and np.array_equal(shown, self.opacities):
+            shown = self.opacities  # the same array, so that a device copy of it remains usable
         for name, array in (("retired", retired), ("own_opacities", own), ("opacities", shown)):
             object.__setattr__(self, name, array)
 

@@ -48,11 +48,6 @@ class CommittedScene:
         self._limits = limits
         self._view = ViewRenderer(world, limits, device)
 
-    @property
-    def view_device(self) -> Device:
-        """Device that currently renders views."""
-        return self._view.device
-
     def render(
         self,
         camera: Camera,

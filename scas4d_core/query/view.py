@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.engines.choose import Device, renderer_of
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import CHANNELS
+from scas4d_core.engines.renderer import CHANNELS, Renderer
 from scas4d_core.engines.views import LABEL, CameraArrays
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
@@ -73,11 +73,15 @@ class ViewRenderer:
     def __init__(self, world: WorldFrame, limits: Limits = DEFAULT, device: Device = "cpu") -> None:
         self.world = world
         self._limits = limits
-        self._use(device)
-
-    def _use(self, device: Device) -> None:
         self.device = device
-        self._renderer = renderer_of(device, (0.0, 0.0, 0.0), self._limits)
+        self._made: Renderer | None = None
+
+    @property
+    def _renderer(self) -> Renderer:
+        """Renderer on the current device, created on first use."""
+        if self._made is None:
+            self._made = renderer_of(self.device, (0.0, 0.0, 0.0), self._limits)
+        return self._made
 
     def render(
         self,
@@ -107,7 +111,7 @@ class ViewRenderer:
             if self.device == "cpu":
                 raise
             log.warning("the GPU could not render a view; views are now rendered on the CPU: %s", error)
-            self._use("cpu")
+            self.device, self._made = "cpu", None
             return self._render(gaussians, camera, background, colours, labels)
 
     def _render(

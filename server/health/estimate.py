@@ -37,13 +37,15 @@ READ_GAUSSIAN = 500
 GPU_CONTEXT = 500e6
 """Bytes of GPU memory for the CUDA context and kernels of a process."""
 GPU_BASE = 40e6
-"""Bytes of GPU memory for buffers whose size depends neither on the images nor on the Gaussians."""
+"""Bytes of GPU memory in the worker that depend neither on the images nor on the Gaussians."""
 GPU_PIXEL = 120
 """Bytes of GPU memory per scaled pixel: the training images, SSIM's moments and buffers for the gradients."""
 GPU_GAUSSIAN = 4000
 """Bytes of GPU memory per Gaussian in the worker, including frame 0."""
-GPU_READ_GAUSSIAN = 600
+GPU_READ_GAUSSIAN = 1100
 """Bytes of GPU memory per Gaussian in the reader that renders views."""
+GPU_VIEW = 125e6
+"""Bytes of GPU memory for a view of 1920×1080 pixels in the reader; 60 per pixel."""
 STATE = 81
 """Bytes on disk per Gaussian and frame."""
 HISTORY = 28
@@ -79,7 +81,7 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
     pictures = pixels * PIXEL + scaled * (SCALED_PIXEL + NOVEL_PIXEL * bears)
     worker = PROCESS + pictures + gaussians * GAUSSIAN + VOXELS * bears
     readers = 2 * (PROCESS + gaussians * READ_GAUSSIAN)
-    gpu = 2 * (GPU_CONTEXT + GPU_BASE) + scaled * GPU_PIXEL + gaussians * (GPU_GAUSSIAN + GPU_READ_GAUSSIAN)
+    gpu = 2 * GPU_CONTEXT + GPU_BASE + GPU_VIEW + scaled * GPU_PIXEL + gaussians * (GPU_GAUSSIAN + GPU_READ_GAUSSIAN)
     limit = machine_mb() if server.max_scene_memory_mb is None else server.max_scene_memory_mb
     in_mb = {
         "pictures_mb": pictures,

@@ -75,7 +75,7 @@ def run_bulk_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     os.nice(BULK_NICE)
     for left in spec.folder.path.glob(f"{EXPORT}.*"):  # files left by a process that was killed during a query
         left.unlink(missing_ok=True)
-    _serve(spec, connection, "cpu")  # renders too rarely to occupy memory on a GPU
+    _serve(spec, connection, "cpu")  # renders too rarely to justify GPU memory
 
 
 def view_device(spec: SceneSpec) -> Device:

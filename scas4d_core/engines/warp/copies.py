@@ -21,7 +21,7 @@ class DeviceCopies:
     """The most recently used device copies of host arrays, so that an array is uploaded only once.
 
     A host array becomes read-only when a copy of it is stored, because the copy would not follow changes. Writable
-    views of other arrays are uploaded on each call. Callers must not modify the copies.
+    views of parts of other arrays are uploaded on each call. Callers must not modify the copies.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -59,11 +59,12 @@ class DeviceCopies:
 
     def store(self, copy: wp.array, *sources: NDArray[Any]) -> None:
         """Stores a device array as the copy of an array, or of the array derived from several sources."""
-        for source in sources:
-            if source.base is not None and source.flags.writeable:
-                return
+        if not all(_can_freeze(source) for source in sources):
+            return
         for source in sources:
             source.flags.writeable = False
+            if isinstance(source.base, np.ndarray):
+                source.base.flags.writeable = False
         self._copies[self._key(copy.dtype, sources)] = sources, copy  # the reference keeps the identity unique
         while len(self._copies) > MOST:
             self._copies.popitem(last=False)
@@ -71,6 +72,14 @@ class DeviceCopies:
     @staticmethod
     def _key(dtype: object, sources: tuple[NDArray[Any], ...]) -> tuple[Any, ...]:
         return (dtype, *(id(source) for source in sources))
+
+
+def _can_freeze(array: NDArray[Any]) -> bool:
+    """Returns whether an array is read-only or can become so, because no larger array shares its memory."""
+    base = array.base
+    if base is None or not array.flags.writeable:
+        return True
+    return isinstance(base, np.ndarray) and base.base is None and base.nbytes == array.nbytes
 
 
 @cache

@@ -481,12 +481,13 @@ class PictureLoss:
         elif self._sent is not None:  # a pending upload must not be overwritten
             wp.synchronize_event(self._sent)
         floats, levels, copied = list[int](), list[int](), list[int]()
+        taken: dict[int, Array] = {}
         for index, view in enumerate(views):
             channels, height, width = view.target.shape
             self._host_channels[index] = channels
             self._host_exposures[index, :channels] = view.exposure
             if self._taken[index] is not view.target:
-                self._taken[index] = view.target
+                taken[index] = view.target
                 if view.source is None:
                     if index not in self._staged_floats:
                         self._staged_floats[index] = self._pinned()
@@ -520,6 +521,8 @@ class PictureLoss:
             wp.launch(target_moments, (len(changed), *self.targets.shape[1:]), inputs, device=self._device)
             inputs = [places, self.cameras, self.targets, self._blank]
             wp.launch(find_blank, (len(changed), *self._blank.shape[1:]), inputs, device=self._device)
+        for index, target in taken.items():  # only now, because an upload may fail if memory is full
+            self._taken[index] = target
         if wp.get_device(self._device).is_cuda:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced

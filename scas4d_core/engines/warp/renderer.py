@@ -139,9 +139,9 @@ def extrapolate_numbers(
 
 
 class WarpRenderer:
-    """The ``Renderer`` implementation in NVIDIA Warp. Each call waits for the result.
+    """The ``Renderer`` implementation in NVIDIA Warp. Calls that return pixels or numbers wait for the device.
 
-    States that were used last stay on the device (``DeviceCopies``), as do the images that an engine has loaded.
+    The most recently used states stay on the device (``DeviceCopies``), as do the images that an engine has loaded.
 
     Args:
         background: background colour, RGB in 0…1.
@@ -163,7 +163,8 @@ class WarpRenderer:
         self.device, self.limits, self.background = device, limits, background
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
-        self._copies, self._downloads = copies_on(device), Downloads(device)
+        self._copies = copies_on(device)
+        self._downloads, self._log_downloads = Downloads(device), Downloads(device)  # each reuses one buffer
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
@@ -203,7 +204,7 @@ class WarpRenderer:
         """See ``Renderer.compare``."""
         self._render_view(state, view)
         self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
-        log = self._downloads.read(self._log)[0][0].astype(float)
+        log = self._log_downloads.read(self._log)[0][0].astype(float)
         red, green, blue = log[SHIFT : SHIFT + 3].tolist()
         psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
         return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
@@ -276,8 +277,9 @@ class WarpRenderer:
         features = np.asarray(features, np.float32)
         groups = [features[:, first : first + CHANNELS] for first in range(0, features.shape[1], CHANNELS)]
         uploaded = [wp.array(np.ascontiguousarray(group), dtype=wp.vec4, device=self.device) for group in groups]
-        sound = np.asarray(np.abs(features) <= FEATURE_CEILING).all(axis=1)
-        return uploaded, np.asarray(sound)
+        if len(uploaded) == 1:
+            return uploaded, None
+        return uploaded, np.asarray((np.abs(features) <= FEATURE_CEILING).all(axis=1))
 
     def _project(
         self,
@@ -298,7 +300,7 @@ class WarpRenderer:
         shapes = copies.of(state.means, wp.vec3), copies.of(state.factors, wp.mat33), opacities
         given = (cameras, self._first, *shapes, features, self._first, self._log)
         self._rasterizer.project(*given)
-        while self._rasterizer.grow(self._downloads.read(self._log)[0][0, PAIRS]):
+        while self._rasterizer.grow(self._log_downloads.read(self._log)[0][0, PAIRS]):
             self._rasterizer.project(*given)
 
     def _draw(self, cameras: wp.array, features: wp.array, background: Array) -> None:

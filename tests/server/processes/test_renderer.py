@@ -88,6 +88,6 @@ def test_a_gpu_and_the_cpu_render_the_same_image(renderer, monkeypatch):
         found = reader.answer(NumberedQuery(1, query))
         assert isinstance(found, Answer), found
         images.append(imageio.imread(found.body).astype(int))
-        assert reader.reader.view_device == reader.device
+        assert reader.reader._view.device == reader.device
     assert images[0].std() > 5
     assert np.abs(images[0] - images[1]).max() <= 1
