@@ -6,7 +6,7 @@ The retry policy is the same as over HTTP. If the connection is lost, the client
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 from urllib.parse import quote
@@ -16,10 +16,11 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from client.calls import Call
+from client.calls.frames import RETRIED, NewFrame, SendingBatch
 from client.errors import ServiceError, error_of
 from client.retries import Retries
 from client.sdk import Client
-from client.wire import CameraReceipt, FrameReceipt, IngestAnswer, frame_chunks
+from client.wire import CameraReceipt, FrameBatch, FrameReceipt, IngestAnswer, frame_chunks
 
 ANSWER_S = 130.0
 """Maximum time in seconds to wait for an acknowledgement."""
@@ -68,27 +69,47 @@ class IngestSocket:
         time: float | None = None,
     ) -> FrameReceipt:
         """Sends a frame with the images of all cameras; see `Client.put_frame`."""
-        receipt = self._send(frame_chunks(index, images, masks, time))
+        receipt = self._send_one(frame_chunks(index, images, masks, time))
         assert isinstance(receipt, FrameReceipt)
         return receipt
+
+    def put_frames(self, frames: Sequence[NewFrame]) -> list[IngestAnswer]:
+        """Sends a batch of frames in one message and returns one answer per frame; see `Client.put_frames`."""
+        sending = SendingBatch(frames)
+        while sending.left:
+            chunks = [chunk for frame in sending.left for chunk in frame.chunks()]
+            answers = self._send(chunks, len(sending.left), refusals=True)
+            time.sleep(sending.record(FrameBatch(answers=answers)))
+        return sending.answers
 
     def put_camera(
         self, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
     ) -> CameraReceipt:
         """Sends one camera's image of a frame; see `Client.put_camera`."""
         masks = {} if mask is None else {camera: mask}
-        receipt = self._send(frame_chunks(index, {camera: image}, masks, time, part=True))
+        receipt = self._send_one(frame_chunks(index, {camera: image}, masks, time, part=True))
         assert isinstance(receipt, CameraReceipt)
         return receipt
 
-    def _send(self, chunks: list[bytes]) -> FrameReceipt | CameraReceipt:
+    def _send_one(self, chunks: list[bytes]) -> FrameReceipt | CameraReceipt:
+        receipt = self._send(chunks, 1)[0].receipt
+        assert receipt is not None
+        return receipt
+
+    def _send(self, chunks: list[bytes], count: int, *, refusals: bool = False) -> list[IngestAnswer]:
+        """Sends a message, again if its first frame must be retried, and returns its `count` answers.
+
+        Raises:
+            ServiceError: the first frame was refused. With `refusals`, this applies only to refusals that are retried.
+            ServiceUnreachable: the service did not respond.
+        """
         call: Call[Any] = Call("PUT", self._address, lambda response: None)
         client = self._client
         retries = Retries(call, client.url, busy=client.busy_timeout, outage=client.outage, on_retry=client.on_retry)
         while True:
             wait: float | None
             try:
-                answer = self._exchange(chunks)
+                answers = self._exchange(chunks, count)
             except InvalidStatus as error:
                 refusal = error.response
                 wait = retries.after_response(
@@ -100,14 +121,15 @@ class IngestSocket:
                 self.close()
                 wait = retries.after_connection_error(httpx.ReadError(str(error)))
             else:
-                if answer.receipt is not None:
-                    return answer.receipt
-                wait = retries.after_response(_as_response(answer))
+                first = answers[0]
+                if first.receipt is not None or (refusals and first.status not in RETRIED):
+                    return answers
+                wait = retries.after_response(_as_response(first))
             if wait is None:
-                raise ServiceError(error_of(_as_response(answer)).problem)
+                raise ServiceError(error_of(_as_response(answers[0])).problem)
             time.sleep(wait)
 
-    def _exchange(self, chunks: list[bytes]) -> IngestAnswer:
+    def _exchange(self, chunks: list[bytes], count: int) -> list[IngestAnswer]:
         if self._connection is None:
             token = self._client.token
             self._connection = self._stack.enter_context(
@@ -119,7 +141,7 @@ class IngestSocket:
                 )
             )
         self._connection.send(iter(chunks))
-        return IngestAnswer.model_validate_json(self._connection.recv(timeout=ANSWER_S))
+        return [IngestAnswer.model_validate_json(self._connection.recv(timeout=ANSWER_S)) for _ in range(count)]
 
 
 def _as_response(answer: IngestAnswer) -> httpx.Response:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -17,9 +17,10 @@ import httpx
 
 from client import calls
 from client.calls import Call
+from client.calls.frames import NewFrame, Numbering, SendingBatch
 from client.errors import ServiceError
 from client.retries import BUSY_S, OUTAGE_S, OnRetry, Retries
-from client.wire import FINISHED, FrameReportModel, SceneState, SceneStatus
+from client.wire import FINISHED, FrameReportModel, IngestAnswer, SceneState, SceneStatus
 
 __all__ = ["DEFAULT_URL", "AsyncClient", "Client", "ServiceError"]
 
@@ -196,6 +197,23 @@ class Client(_ClientBase):
     replay = _sends(calls.replay)
     end_replay = _sends(calls.end_replay)
 
+    def put_frames(self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given") -> list[IngestAnswer]:
+        """Sends a batch of frames and returns one answer per frame, in order.
+
+        Frames for which the queue has no room are sent again. The other arguments and the errors are those of
+        `calls.put_frames`.
+
+        >>> n = client.scene(open_scene).next_frame
+        >>> answers = client.put_frames(open_scene, [calls.NewFrame(n, pictures), calls.NewFrame(n + 1, pictures)])
+        >>> [answer.receipt.index - n for answer in answers]
+        [0, 1]
+        """
+        sending = SendingBatch(frames)
+        while sending.left:
+            batch = self.send(calls.put_frames(id, sending.left, numbering))
+            time.sleep(sending.record(batch))
+        return sending.answers
+
     def watch(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> Iterator[SceneStatus]:
         """Yields the scene's status periodically until a frame is finished or the scene has failed.
 
@@ -335,6 +353,25 @@ class AsyncClient(_ClientBase):
     tradeoff = _sends_async(calls.tradeoff)
     replay = _sends_async(calls.replay)
     end_replay = _sends_async(calls.end_replay)
+
+    async def put_frames(
+        self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given"
+    ) -> list[IngestAnswer]:
+        """Sends a batch of frames and returns one answer per frame, in order.
+
+        Frames for which the queue has no room are sent again. The other arguments and the errors are those of
+        `calls.put_frames`.
+
+        >>> n = client.scene(open_scene).next_frame
+        >>> answers = client.put_frames(open_scene, [calls.NewFrame(n, pictures), calls.NewFrame(n + 1, pictures)])
+        >>> [answer.receipt.index - n for answer in answers]
+        [0, 1]
+        """
+        sending = SendingBatch(frames)
+        while sending.left:
+            batch = await self.send(calls.put_frames(id, sending.left, numbering))
+            await asyncio.sleep(sending.record(batch))
+        return sending.answers
 
     async def watch(
         self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2

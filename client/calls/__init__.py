@@ -2,13 +2,25 @@
 
 In the examples, `client` is a `client.sdk.Client`, and `scene` is the id of a scene with frames 0 to 2 committed. `rig`
 is its two-camera rig. `open_scene` is the id of a scene that still accepts frames, and `pictures` maps camera names to
-PNG files. `np` is NumPy, and `time` is the standard library module.
+PNG files. `calls` is this package, `np` is NumPy, and `time` is the standard library module.
 """
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
 from client.calls.exports import begin_export, delete_export, export, export_file, exports
-from client.calls.frames import close_frame, declare_missing, frame, frames, picture, ply, put_camera, put_frame, states
+from client.calls.frames import (
+    NewFrame,
+    close_frame,
+    declare_missing,
+    frame,
+    frames,
+    picture,
+    ply,
+    put_camera,
+    put_frame,
+    put_frames,
+    states,
+)
 from client.calls.gaussians import gaussians
 from client.calls.parts import parts
 from client.calls.scenes import (
@@ -31,6 +43,7 @@ from client.calls.views import render, render_arrays, render_file
 
 __all__ = [
     "Call",
+    "NewFrame",
     "begin_again",
     "begin_export",
     "budget",
@@ -58,6 +71,7 @@ __all__ = [
     "ply",
     "put_camera",
     "put_frame",
+    "put_frames",
     "put_points",
     "put_to_sleep",
     "ready",

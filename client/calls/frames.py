@@ -2,20 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from client.calls.call import Call, body, json_reader, path
 from client.wire import (
     FRAME_MEDIA_TYPE,
     CameraReceipt,
     FileKind,
+    FrameBatch,
     FrameReceipt,
     FrameReportModel,
+    IngestAnswer,
     MissingRequest,
     frame_chunks,
 )
 from client.wire.frames import FrameList
+
+RETRIED = (429, 502, 503, 504, 507)
+"""Status codes of frames that are sent again, as in `client.retries`."""
+Numbering = Literal["given", "next"]
+
+
+@dataclass(frozen=True)
+class NewFrame:
+    """A frame to send in a batch.
+
+    Attributes:
+        index: frame index; with `numbering="next"`, only a name for the frame in answers.
+        images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
+        masks: PNG mask of each camera, keyed by camera name; empty for no masks.
+        time: timestamp in seconds; index / frames_per_second if None.
+    """
+
+    index: int
+    images: Mapping[str, bytes]
+    masks: Mapping[str, bytes] = field(default_factory=dict)
+    time: float | None = None
+
+    def chunks(self) -> list[bytes]:
+        """Returns the frame as S4DF, without copying the files."""
+        return frame_chunks(self.index, self.images, self.masks, self.time)
+
+
+class SendingBatch:
+    """Frames of a batch that are not answered yet, and the answers to the others.
+
+    Args:
+        frames: the frames, in order.
+
+    Attributes:
+        left: frames that must be sent (again).
+        answers: final answers to the frames before them.
+    """
+
+    def __init__(self, frames: Sequence[NewFrame]) -> None:
+        self.left = list(frames)
+        self.answers: list[IngestAnswer] = []
+
+    def record(self, batch: FrameBatch) -> float:
+        """Records the answers to `left` and returns the seconds to wait before the rest is sent again."""
+        for answer in batch.answers:
+            if answer.status in RETRIED:
+                return float(answer.retry_after or 1)
+            self.answers.append(answer)
+            del self.left[0]
+        return 0.0
 
 
 def put_frame(
@@ -46,6 +99,40 @@ def put_frame(
     """
     arguments = _framed(index, images, masks or {}, time)
     return Call("PUT", path(id, "frames", index), json_reader(FrameReceipt), arguments=arguments)
+
+
+def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "given") -> Call[FrameBatch]:
+    """Sends a batch of frames in one request and returns one answer per frame, in order.
+
+    A frame that is refused because of its content does not stop the batch; its answer contains the problem. With
+    `numbering="given"`, such a frame is declared missing if the batch continues with the next index.
+
+    The clients send frames again for which the queue had no room. A batch should therefore be smaller than the scene's
+    `ingest.queue_frames`; otherwise, its last frames are transferred several times.
+
+    Args:
+        id: scene id.
+        frames: the frames, in order.
+        numbering: "given" if the frames have their own indices; "next" to give them the next free indices, which
+            requires a time for each frame.
+
+    Raises:
+        Busy: the queue has no room for the first frame.
+
+    >>> n = client.scene(open_scene).next_frame
+    >>> batch = [
+    ...     calls.NewFrame(n, pictures),
+    ...     calls.NewFrame(n + 1, {"c0": b"damaged", "c1": b"damaged"}),
+    ...     calls.NewFrame(n + 2, pictures),
+    ... ]
+    >>> [answer.status for answer in client.put_frames(open_scene, batch)]
+    [202, 422, 202]
+    >>> client.frame(open_scene, n + 1).state
+    <FrameState.MISSING: 'missing'>
+    """
+    content = b"".join(chunk for frame in frames for chunk in frame.chunks())
+    arguments = {"content": content, "headers": {"Content-Type": FRAME_MEDIA_TYPE}, "params": {"numbering": numbering}}
+    return Call("POST", path(id, "frames"), json_reader(FrameBatch), arguments=arguments)
 
 
 def put_camera(

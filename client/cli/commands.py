@@ -83,6 +83,9 @@ def push(
     websocket: Annotated[
         bool, typer.Option("--websocket", help="Send over a WebSocket instead of HTTP requests.")
     ] = False,
+    batch: Annotated[
+        int, typer.Option(min=1, max=100, help="Send up to this many frames in one request; not with --per-camera.")
+    ] = 1,
     when_full: Annotated[
         WhenFull,
         typer.Option(help="refuse: wait while the queue is full; skip: replace the queued frames with the newest."),
@@ -113,6 +116,7 @@ def push(
             loop=loop,
             per_camera=per_camera,
             websocket=websocket,
+            batch=batch,
             preset=preset,
             settings=settings,
             ingest=IngestSettings(when_full=when_full.value),

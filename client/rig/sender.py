@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
-from client.errors import FrameGap
+from client.calls import NewFrame
+from client.errors import FrameGap, error_of_problem
 from client.ingest import IngestSocket
 from client.rig.delivery import Delivery
 from client.rig.pace import Pace
 from client.rig.sequence import EncodedFrame, Sequence
 from client.sdk import Client
+from client.wire import IngestAnswer
 
 OnMessage = Callable[[str], None]
 
@@ -26,6 +28,10 @@ class Requests:
     def frame(self, index: int, files: EncodedFrame) -> None:
         """Sends a whole frame."""
         self._client.put_frame(self._scene, index, files.images, files.masks, time=files.time)
+
+    def batch(self, frames: list[NewFrame]) -> list[IngestAnswer]:
+        """Sends several frames in one request."""
+        return self._client.put_frames(self._scene, frames)
 
     def camera(self, index: int, name: str, files: EncodedFrame) -> None:
         """Sends one camera's image and mask."""
@@ -47,6 +53,10 @@ class Sockets:
     def frame(self, index: int, files: EncodedFrame) -> None:
         """Sends a whole frame."""
         self._of("").put_frame(index, files.images, files.masks, time=files.time)
+
+    def batch(self, frames: list[NewFrame]) -> list[IngestAnswer]:
+        """Sends several frames in one message."""
+        return self._of("").put_frames(frames)
 
     def camera(self, index: int, name: str, files: EncodedFrame) -> None:
         """Sends one camera's image and mask over the camera's own socket."""
@@ -76,6 +86,7 @@ class Sender:
         delivery: Delivery,
         on_message: OnMessage,
         per_camera: bool,
+        batch: int = 1,
     ) -> None:
         self._client = client
         self._way = way
@@ -83,6 +94,7 @@ class Sender:
         self._pace = pace
         self._delivery = delivery
         self._on_message = on_message
+        self._batch = batch
         names = sequence.source.full_rig.names
         self._cameras = ThreadPoolExecutor(max_workers=len(names), thread_name_prefix="camera") if per_camera else None
         self.start_clock()
@@ -101,22 +113,46 @@ class Sender:
         """
         index = first
         while index < count:
-            due = self._await(index)
+            last = self._last_of_batch(index, count)
+            due = [self._await(frame) for frame in range(index, last + 1)]
             try:
-                self._send(index)
+                if last > index:
+                    self._send_batch(index, last)
+                else:
+                    self._send(index)
             except FrameGap as gap:
                 if gap.expected == index:
                     raise
                 self._on_message(f"the service expects frame {gap.expected} next, not {index}; continuing from there")
                 index = gap.expected
                 continue
-            if due is not None:
-                period = 1 / self._pace.fps if self._pace.fps else 0.0
-                self._delivery.lateness.late.append(time.monotonic() - due - period)
-            yield index
-            index += 1
+            period = 1 / self._pace.fps if self._pace.fps else 0.0
+            self._delivery.lateness.late += [time.monotonic() - moment - period for moment in due]
+            yield from range(index, last + 1)
+            index = last + 1
 
-    def _await(self, index: int) -> float | None:
+    def _last_of_batch(self, index: int, count: int) -> int:
+        """Returns the last frame to send together with frame `index`; frame 0 and lost frames are on their own."""
+        last = index
+        if index > 0 and self._cameras is None and not self._pace.drops(index):
+            while last + 1 < min(index + self._batch, count) and not self._pace.drops(last + 1):
+                last += 1
+        return last
+
+    def _send_batch(self, first: int, last: int) -> None:
+        frames = []
+        for index in range(first, last + 1):
+            files = self._sequence.files(index)
+            frames.append(NewFrame(index, files.images, files.masks, files.time))
+        for frame, answer in zip(frames, self._way.batch(frames), strict=True):
+            if answer.missing and answer.problem is not None:
+                self._delivery.lost.append(frame.index)
+                self._on_message(f"frame {frame.index}: refused ({answer.problem.detail}), declared missing")
+            elif answer.problem is not None:
+                raise error_of_problem(answer.problem)
+
+    def _await(self, index: int) -> float:
+        """Waits until the frame is due and returns its due time."""
         due = self._began + (self._sent / self._pace.fps if self._pace.fps else 0.0)
         self._sent += 1
         time.sleep(max(0.0, due + self._pace.delay(index) - time.monotonic()))

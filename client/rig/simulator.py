@@ -33,6 +33,7 @@ def push(
     loop: bool = False,
     per_camera: bool = False,
     websocket: bool = False,
+    batch: int = 1,
     preset: str = "scas4d",
     settings: Mapping[str, Any] | None = None,
     ingest: IngestSettings | None = None,
@@ -58,6 +59,8 @@ def push(
         loop: whether to run back and forth through the capture until `frames` is reached or the push is interrupted.
         per_camera: whether each camera sends its own images over its own connection.
         websocket: whether to use a WebSocket (one per camera with `per_camera`) instead of HTTP requests.
+        batch: maximum number of frames per request; each frame is captured at its time, then all are sent. Not with
+            `per_camera`.
         preset: settings preset name.
         settings: nested settings that override the preset.
         ingest: rules for accepting frames in a new scene; None for the defaults.
@@ -69,6 +72,7 @@ def push(
         The id and status of the scene, the delays and the lost frames.
 
     Raises:
+        ValueError: `batch` is invalid.
         ServiceError, ServiceUnreachable: a request failed.
         RuntimeError: the scene failed, or its cameras differ from the capture's.
 
@@ -78,6 +82,8 @@ def push(
     2
     >>> client.delete_scene(delivery.scene)
     """
+    if batch < 1 or (batch > 1 and per_camera):
+        raise ValueError(f"batch must be at least 1, and 1 with per_camera; got {batch}")
     on_progress = on_progress or (lambda stage, done, total: None)
     on_message = on_message or (lambda sentence: None)
     sequence = Sequence(source, start=start, loop=loop)
@@ -103,7 +109,7 @@ def push(
         delivery = Delivery(status.id)
         way = Sockets(client, status.id) if websocket else Requests(client, status.id)
         stack.callback(way.close)
-        sender = Sender(client, way, sequence, pace or Pace(), delivery, on_message, per_camera)
+        sender = Sender(client, way, sequence, pace or Pace(), delivery, on_message, per_camera, batch)
         stack.callback(sender.close)
         stack.enter_context(_record_retries(client, delivery.lateness, on_message))
         try:

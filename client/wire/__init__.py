@@ -23,6 +23,7 @@ from client.wire.frames import (
 from client.wire.framing import (
     FRAME_MEDIA_TYPE,
     FileKind,
+    FrameBatch,
     FrameFile,
     FrameHead,
     FramingError,
@@ -88,6 +89,7 @@ __all__ = [
     "ExportState",
     "FileKind",
     "FirstCloudModel",
+    "FrameBatch",
     "FrameFile",
     "FrameHead",
     "FrameReceipt",

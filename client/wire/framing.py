@@ -69,15 +69,27 @@ class FrameHead(Model):
 
 
 class IngestAnswer(Model):
-    """The response to one binary message of `WS …/ingest`, sent as JSON text in message order."""
+    """The response to one frame of a batch, or to one binary message of `WS …/ingest`."""
 
-    index: int | None = Field(description="Index of the frame; null if the message could not be read.")
-    status: int = Field(description="The same status code as over HTTP: 202, 409, 422, 429, 507 …")
+    index: int | None = Field(description="Index of the frame; null if its header could not be read.")
+    status: int = Field(description="Status code, as for a frame that is sent alone: 202, 409, 413, 422, 429, 507 …")
     retry_after: int | None = Field(default=None, description="Seconds to wait; the same as Retry-After over HTTP.")
     receipt: FrameReceipt | CameraReceipt | None = Field(
         default=None, description="Receipt, which confirms that the files are on disk; only with status 202."
     )
     problem: ProblemDetails | None = Field(default=None, description="Problem document; only with other statuses.")
+    missing: bool = Field(
+        default=False,
+        description=(
+            "Whether the refused frame was declared missing, so that later frames of its batch could be accepted."
+        ),
+    )
+
+
+class FrameBatch(Model):
+    """The response to a batch: one answer per frame, in order."""
+
+    answers: list[IngestAnswer]
 
 
 def frame_chunks(

@@ -223,6 +223,23 @@ class Ingest:
         """Returns `time` if given, otherwise the frame's time in seconds computed from the scene's frame rate."""
         return index / self.rules.frames_per_second if time is None else time
 
+    def index_at(self, time: float | None) -> int:
+        """Returns the index of the known frame with this time, or the next free index.
+
+        Raises:
+            Problem: 422 if there is no time, without which a repeated frame cannot be recognised.
+        """
+        if time is None:
+            raise Problem(
+                422,
+                "a frame without its own index needs a time",
+                field="time",
+                value="null",
+                remedy="send the time of every frame in seconds, or use numbering=given",
+            )
+        known = self.ledger.index_at(time)
+        return self.ledger.next_frame if known is None else known
+
     def admit(self, index: int, seconds: float) -> None:
         """Raises `Problem` if a frame cannot be accepted as the next one."""
         self.refuse_if_stopped()

@@ -13,53 +13,78 @@ from scas4d_core.cameras import Camera, Rig
 from server.ingest.acknowledge import Ingest
 from server.ingest.open_frames import OpenFrames
 from server.ingest.pictures import MASK, check_files, check_size
-from server.ingest.receive import FrameReceiver, accept_or_remove, check_index, drain, frame_receiver, read_framed
+from server.ingest.receive import (
+    BodyReader,
+    accept_or_remove,
+    check_index,
+    check_length,
+    drain,
+    frame_receiver,
+    read_files,
+    read_head,
+    receive_files,
+)
 from server.problems import Problem, count_noun
-from server.storage.disk import full_disk, no_room
+
+FormFields = list[tuple[str, UploadFile | str]]
+"""Names and values of the fields of a form, in order."""
 
 
 async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameReceipt:
     """Receives a complete frame as multipart/form-data, which is easy to send but slow to parse."""
-    # An image sent as a plain field (without a file name) would be parsed as text, so plain fields have a size limit.
-    async with request.form(max_files=2 * len(ingest.rules.rig) + 8, max_fields=8, max_part_size=4096) as form:
-        given: dict[str, UploadFile] = {}
-        time: float | None = None
-        for name, value in form.multi_items():
-            if name == "time" and isinstance(value, str):
-                time = _seconds(value)
-            elif isinstance(value, UploadFile):
-                if name in given:
-                    raise Problem(
-                        422,
-                        f"duplicate file {name!r}",
-                        field=name,
-                        value=value.filename,
-                        remedy="send one image and at most one mask per camera",
-                    )
-                given[name] = value
-            else:
+    async with request.form(**form_limits(ingest.rules.rig, frames=1)) as form:
+        head, uploads = form_frame(ingest.rules.rig, index, form.multi_items())
+        return await receive_files(ingest, head, BodyReader(contents(uploads)), ends_body=False)
+
+
+def form_limits(rig: Rig, frames: int) -> dict[str, int]:
+    """Returns the limits of a form with up to `frames` frames, as keyword arguments of `Request.form`.
+
+    An image sent as a plain field (without a file name) would be parsed as text, so plain fields have a size limit.
+    """
+    return {"max_files": frames * (2 * len(rig) + 8), "max_fields": 8 * frames, "max_part_size": 4096}
+
+
+def form_frame(rig: Rig, index: int, fields: FormFields) -> tuple[FrameHead, list[UploadFile]]:
+    """Returns the header and the files of a frame that is sent as form fields.
+
+    Raises:
+        Problem: 422 if a field is not the time, an image or a mask of one of the rig's cameras.
+    """
+    given: dict[str, UploadFile] = {}
+    time: float | None = None
+    for name, value in fields:
+        if name == "time" and isinstance(value, str):
+            time = _seconds(value)
+        elif isinstance(value, UploadFile):
+            if name in given:
                 raise Problem(
                     422,
-                    f"{name!r} must be a file",
+                    f"duplicate file {name!r}",
                     field=name,
-                    value=value,
-                    remedy="send it as a form field with a file name",
+                    value=value.filename,
+                    remedy="send one image and at most one mask per camera",
                 )
-        # Checked before creating a `FrameFile`, whose validation would raise for an invalid camera name.
-        for name in given:
-            _check_camera(ingest.rules.rig, name.removeprefix(MASK), name)
-        head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
-        check_files(ingest.rules.rig, head.files, whole=True)
-        keep = ingest.needs_files(head)
-        if keep:
-            ingest.begin_receiving(index)
-        try:
-            receiving = frame_receiver(ingest, head, ingest.time_of(index, time), keep=keep)
-            await _receive_files(receiving, [await upload.read() for upload in given.values()])
-            return await accept_or_remove(receiving, lambda received: ingest.accept(head, received))
-        finally:
-            if keep:
-                ingest.end_receiving(index)
+            given[name] = value
+        else:
+            raise Problem(
+                422,
+                f"{name!r} must be a file",
+                field=name,
+                value=value,
+                remedy="send it as a form field with a file name",
+            )
+    # Checked before creating a `FrameFile`, whose validation would raise for an invalid camera name.
+    for name in given:
+        _check_camera(rig, name.removeprefix(MASK), name)
+    head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
+    return head, list(given.values())
+
+
+async def contents(uploads: Sequence[UploadFile]) -> AsyncIterator[bytes]:
+    """Yields the contents of uploaded files."""
+    for upload in uploads:
+        yield await upload.read()
 
 
 async def receive_camera(
@@ -69,22 +94,20 @@ async def receive_camera(
 
     `index` and `camera` are taken from the URL and are None if the URL does not contain them.
     """
-    ingest = frames.ingest
-    names: list[str] = []
-
-    def begin(head: FrameHead) -> FrameReceiver:
+    ingest, reader = frames.ingest, BodyReader(body)
+    try:
+        head = await read_head(reader)
+        check_length(head, reader.position, length)
         check_index(head, index)
         check_files(ingest.rules.rig, head.files, whole=False)
-        names.append(_only_camera(head, camera))
-        frames.check_head(head, names[0])
+        name = _only_camera(head, camera)
+        frames.check_head(head, name)
         keep = head.index >= ingest.ledger.next_frame
-        return frame_receiver(ingest, head.model_copy(update={"single_camera": True}), head.time, keep=keep)
-
-    try:
-        head, receiving = await read_framed(body, begin, length)
-        return await accept_or_remove(receiving, lambda received: frames.accept(head, names[0], received))
+        receiving = frame_receiver(ingest, head.model_copy(update={"single_camera": True}), head.time, keep=keep)
+        await read_files(reader, receiving, ends_body=True)
+        return await accept_or_remove(receiving, lambda received: frames.accept(head, name, received))
     finally:
-        await drain(body)
+        await reader.drain()
 
 
 async def receive_file(
@@ -103,7 +126,7 @@ async def receive_file(
     head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
     frames.check_head(head, camera)
     receiving = frame_receiver(ingest, head, time, keep=index >= ingest.ledger.next_frame)
-    await _receive_files(receiving, [data])
+    await read_files(BodyReader(_one(data)), receiving, ends_body=True)
     return await accept_or_remove(receiving, lambda received: frames.accept(head, camera, received))
 
 
@@ -149,15 +172,8 @@ def _file(field: str, size: int) -> FrameFile:
     return FrameFile(camera=field.removeprefix(MASK), kind=kind, size=size)
 
 
-async def _receive_files(receiving: FrameReceiver, files: Sequence[bytes | bytearray]) -> None:
-    try:
-        for data in files:
-            await receiving.take(memoryview(data))
-    except BaseException as error:
-        await receiving.abort()
-        if no_room(error) and isinstance(error, OSError):
-            raise full_disk(error) from None
-        raise
+async def _one(data: bytearray) -> AsyncIterator[bytes]:
+    yield bytes(data)
 
 
 def _only_camera(head: FrameHead, camera: str | None) -> str:

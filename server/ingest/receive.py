@@ -143,63 +143,102 @@ class FrameReceiver:
         self._buffers = []
 
 
-async def read_framed(
-    chunks: AsyncIterator[bytes], begin: Callable[[FrameHead], FrameReceiver], total: int | None
-) -> tuple[FrameHead, FrameReceiver]:
-    """Reads a frame in the format of `client.wire.framing`, buffering at most two batches.
+class BodyReader:
+    """Reader of a request body that arrives in chunks.
 
     Args:
-        chunks: chunks of the body as they arrive.
-        begin: function called with the header; returns the receiver or raises `Problem`.
-        total: announced number of bytes, or None.
+        chunks: the body.
+
+    Attributes:
+        position: number of bytes read so far.
+    """
+
+    def __init__(self, chunks: AsyncIterator[bytes]) -> None:
+        self._chunks = chunks
+        self._chunk = memoryview(b"")
+        self.position = 0
+
+    async def at_end(self) -> bool:
+        """Returns whether all bytes of the body have been read; waits for the next chunk if necessary."""
+        while not self._chunk:
+            try:
+                self._chunk = memoryview(await anext(self._chunks))
+            except StopAsyncIteration:
+                return True
+        return False
+
+    async def pieces(self, size: int) -> AsyncIterator[memoryview]:
+        """Yields the next `size` bytes piece by piece; fewer if the body ends before."""
+        while size and not await self.at_end():
+            piece, self._chunk = self._chunk[:size], self._chunk[size:]
+            size -= len(piece)
+            self.position += len(piece)
+            yield piece
+
+    async def read(self, size: int) -> bytes:
+        """Returns the next `size` bytes; fewer if the body ends before."""
+        return b"".join([bytes(piece) async for piece in self.pieces(size)])
+
+    async def skip(self, size: int) -> None:
+        """Discards the next `size` bytes."""
+        async for _ in self.pieces(size):
+            pass
+
+    async def drain(self) -> None:
+        """Discards the rest of a refused body, because a client reads the response only after sending it."""
+        self._chunk = memoryview(b"")
+        await drain(self._chunks)
+
+
+async def read_head(reader: BodyReader) -> FrameHead:
+    """Reads the prefix and the header of a frame in the format of `client.wire.framing`.
 
     Raises:
-        Problem: 422 if the body is not a frame or contradicts its header; also any problem raised by `begin` or the
-            checks.
+        Problem: 422 if the body does not continue with a valid header.
     """
-    start = bytearray()
-    head: FrameHead | None = None
-    receiving: FrameReceiver | None = None
+    begin = reader.position
     try:
-        async for chunk in chunks:
-            view = memoryview(chunk)
-            if head is None or receiving is None:
-                view = _fill(start, view, PREFIX.size)
-                if len(start) < PREFIX.size:
-                    continue
-                end = PREFIX.size + head_length(start)
-                view = _fill(start, view, end)
-                if len(start) < end:
-                    continue
-                head = parse_head(start[PREFIX.size :])
-                _check_length(head, end, total)
-                receiving = begin(head)
-            if len(view) > receiving.missing:
-                over = len(view) - receiving.missing
-                raise FramingError(
-                    f"has at least {over} extra bytes after its last file", "end the body after the last file"
-                )
-            await receiving.take(view)
-        if head is None or receiving is None:
-            raise FramingError(f"ends after {len(start)} bytes, before the end of its header", "send the whole frame")
+        prefix = await reader.read(PREFIX.size)
+        if len(prefix) == PREFIX.size:
+            size = head_length(prefix)
+            data = await reader.read(size)
+            if len(data) == size:
+                return parse_head(data)
+        length = reader.position - begin
+        raise FramingError(f"ends after {length} bytes, before the end of its header", "send the whole frame")
+    except FramingError as error:
+        raise framing_problem(error) from None
+
+
+async def read_files(reader: BodyReader, receiving: FrameReceiver, *, ends_body: bool) -> None:
+    """Passes the files of a frame to its receiver, which buffers at most two batches.
+
+    The record is removed if the files are refused.
+
+    Args:
+        reader: reader of the body, at the first file.
+        receiving: receiver of the frame.
+        ends_body: whether the body must end with the last file.
+
+    Raises:
+        Problem: 422 if the body ends too early or too late, 507 if the disk is full; also any problem raised by the
+            receiver's checks.
+    """
+    try:
+        await receiving.take(memoryview(b""))  # files without content are checked, too
+        async for piece in reader.pieces(receiving.missing):
+            await receiving.take(piece)
         if receiving.missing:
-            raise FramingError(f"ends {receiving.missing} bytes before the end of its files", "send the whole frame")
-        return head, receiving
+            fault = f"ends {receiving.missing} bytes before the end of its files"
+            raise framing_problem(FramingError(fault, "send the whole frame"))
+        if ends_body and not await reader.at_end():
+            fault = "has extra bytes after its last file"
+            raise framing_problem(FramingError(fault, "end the body after the last file"))
     except BaseException as error:
-        if receiving is not None:
-            await receiving.abort()
-        if isinstance(error, FramingError):
-            raise framing_problem(error) from None
+        await receiving.abort()
         if isinstance(error, OSError) and no_room(error):
             raise full_disk(error) from None
         raise
-
-
-def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
-    """Appends bytes from `view` to `start` until it has `size` bytes, and returns the rest of `view`."""
-    missing = max(0, size - len(start))
-    start += view[:missing]
-    return view[missing:]
 
 
 def framing_problem(error: FramingError) -> Problem:
@@ -207,12 +246,23 @@ def framing_problem(error: FramingError) -> Problem:
     return Problem(422, f"the frame {error.fault}", field="body", value=error.fault, remedy=error.remedy)
 
 
-def _check_length(head: FrameHead, start: int, total: int | None) -> None:
-    expected = start + sum(file.size for file in head.files)
+def check_length(head: FrameHead, start: int, total: int | None) -> None:
+    """Raises `Problem` (422) if the announced length of a body contradicts its header.
+
+    Args:
+        head: header of the only frame in the body.
+        start: number of bytes before the first file.
+        total: announced number of bytes, or None.
+    """
+    expected = start + files_size(head)
     if total is not None and total != expected:
-        raise FramingError(
-            f"has {total} bytes, but its header declares {expected}", "send the files that the header lists"
-        )
+        fault = f"has {total} bytes, but its header declares {expected}"
+        raise framing_problem(FramingError(fault, "send the files that the header lists"))
+
+
+def files_size(head: FrameHead) -> int:
+    """Returns the total size in bytes of the files that a header lists."""
+    return _bytes(head.files)
 
 
 def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
@@ -253,25 +303,40 @@ async def receive_frame(
     Raises:
         Problem: the frame is refused; see `Ingest.accept`.
     """
-    begun: list[int] = []
-
-    def begin(head: FrameHead) -> FrameReceiver:
-        check_index(head, index)
-        check_files(ingest.rules.rig, head.files, whole=True)
-        keep = ingest.needs_files(head)
-        if keep:
-            ingest.begin_receiving(head.index)
-            begun.append(head.index)
-        whole = head.model_copy(update={"single_camera": False})  # the URL takes precedence over the header
-        return frame_receiver(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
-
+    reader = BodyReader(body)
     try:
-        head, receiving = await read_framed(body, begin, length)
+        head = await read_head(reader)
+        check_length(head, reader.position, length)
+        check_index(head, index)
+        return await receive_files(ingest, head, reader, ends_body=True)
+    finally:
+        await reader.drain()
+
+
+async def receive_files(ingest: Ingest, head: FrameHead, reader: BodyReader, *, ends_body: bool) -> FrameReceipt:
+    """Receives the files of a complete frame and acknowledges the frame.
+
+    Args:
+        ingest: the scene's frame ingest.
+        head: header of the frame.
+        reader: reader of the body, at the first file.
+        ends_body: whether the body must end with the last file.
+
+    Raises:
+        Problem: the frame is refused; see `Ingest.accept`.
+    """
+    check_files(ingest.rules.rig, head.files, whole=True)
+    keep = ingest.needs_files(head)
+    if keep:
+        ingest.begin_receiving(head.index)
+    try:
+        whole = head.model_copy(update={"single_camera": False})  # the URL takes precedence over the header
+        receiving = frame_receiver(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
+        await read_files(reader, receiving, ends_body=ends_body)
         return await accept_or_remove(receiving, lambda received: ingest.accept(head, received))
     finally:
-        for number in begun:
-            ingest.end_receiving(number)
-        await drain(body)
+        if keep:
+            ingest.end_receiving(head.index)
 
 
 def frame_receiver(ingest: Ingest, head: FrameHead, seconds: float | None, *, keep: bool) -> FrameReceiver:

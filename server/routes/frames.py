@@ -14,11 +14,13 @@ from client.wire import (
     FRAME_MEDIA_TYPE,
     CameraReceipt,
     FileKind,
+    FrameBatch,
     FrameReceipt,
     FrameReportModel,
     MissingRequest,
 )
 from server.http.immutable import immutable_response
+from server.ingest.batch import Batch, Numbering, receive_batch, receive_form_batch
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
 from server.ingest.receive import receive_frame
 from server.problems import Problem
@@ -47,6 +49,31 @@ BODY: dict[str, Any] = {
             },
         },
     }
+}
+BATCH_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            FRAME_MEDIA_TYPE: {
+                "schema": {**BINARY, "description": "S4DF frames, one after another, as described in docs/api.md."}
+            },
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "additionalProperties": {
+                        **BINARY,
+                        "description": (
+                            "A field as for a single frame, with the frame index before its name: `0/<camera>`, "
+                            "`0/mask.<camera>`, `0/time`."
+                        ),
+                    },
+                }
+            },
+        },
+    }
+}
+ANSWERS: dict[int | str, dict[str, Any]] = {
+    207: {"model": FrameBatch, "description": "At least one frame was refused; see its `problem`."}
 }
 PICTURE: dict[str, Any] = {
     "requestBody": {
@@ -88,13 +115,46 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
             return await receive_form(scene.ingest, n, request)
     except ClientDisconnect:
         raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
-    raise Problem(
-        415,
-        f"the body of a frame must be {FRAME_MEDIA_TYPE} or multipart/form-data",
-        field="Content-Type",
-        value=request.headers.get("content-type", ""),
-        remedy="send one file per camera, named after the camera",
-    )
+    raise _media_type_problem(request)
+
+
+@router.post("/{id}/frames", status_code=202, responses=ANSWERS, openapi_extra=BATCH_BODY)
+async def post(
+    scene: TheScene,
+    request: Request,
+    response: Response,
+    numbering: Annotated[
+        Numbering,
+        Query(description="given: the frames have their own indices; next: they get the next ones, and need a time."),
+    ] = Numbering.GIVEN,
+) -> FrameBatch:
+    """Accepts a batch of one or more frames and returns one answer per frame, in order.
+
+    The status is 202 if all frames were accepted and 207 otherwise. A frame that is refused because of its content does
+    not stop the batch. Its answer contains the problem; if the batch continues with the next index, the refused frame
+    is declared missing. If no frame can be accepted at present, the response is 429, 503 or 507. If that happens after
+    the first frames, all further frames get this answer. Sending a batch again returns the same answers for frames
+    that were accepted before.
+    """
+    kind = _media_type(request)
+    try:
+        if kind == FRAME_MEDIA_TYPE:
+            batch = await receive_batch(scene.open_frames, numbering, _body(request))
+        elif kind == "multipart/form-data":
+            batch = await receive_form_batch(scene.open_frames, numbering, request)
+        else:
+            raise _media_type_problem(request)
+    except ClientDisconnect:
+        raise Problem(400, "the sender closed the connection", field="body", remedy="send the batch again") from None
+    return _answer(batch, response)
+
+
+def _answer(batch: Batch, response: Response) -> FrameBatch:
+    statuses = {answer.status for answer in batch.answers}
+    if batch.stopped is not None and statuses == {batch.stopped.status_code}:
+        raise batch.stopped
+    response.status_code = 202 if statuses == {202} else 207
+    return FrameBatch(answers=batch.answers)
 
 
 @router.put("/{id}/frames/{n}/cameras/{c}", status_code=202, openapi_extra=PICTURE)
@@ -257,6 +317,16 @@ async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
 
 def _media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def _media_type_problem(request: Request) -> Problem:
+    return Problem(
+        415,
+        f"the body of a frame must be {FRAME_MEDIA_TYPE} or multipart/form-data",
+        field="Content-Type",
+        value=request.headers.get("content-type", ""),
+        remedy="send one file per camera, named after the camera",
+    )
 
 
 def _body(request: Request) -> AsyncIterator[bytes]:

@@ -22,9 +22,10 @@ from client.wire.framing import PREFIX
 from client.wire.stream import SCENE_GONE, SCENE_RESTARTS
 from server import problems
 from server.connections.websocket import limit_messages
+from server.ingest.batch import Numbering, receive_batch, refusal
 from server.ingest.camera_files import receive_camera
 from server.ingest.pictures import largest_frame
-from server.ingest.receive import framing_problem, receive_frame
+from server.ingest.receive import files_size, framing_problem, receive_frame
 from server.problems import SERVICE_FAULT, Problem
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
@@ -39,15 +40,21 @@ UNSUPPORTED = 1003
 AHEAD = 1
 """Number of messages queued while one is being processed; uvicorn buffers one more."""
 
+SMALL_BATCH = 64_000_000
+"""Maximum size in bytes of a message with several frames, unless one frame of the rig can be larger."""
+
 
 @router.websocket("/{id}/ingest")
-async def ingest(socket: WebSocket, id: str) -> None:
-    """Accepts binary messages in the `client.wire.framing` format and answers each with an `IngestAnswer` as text.
+async def ingest(socket: WebSocket, id: str, numbering: Numbering = Numbering.GIVEN) -> None:
+    """Accepts binary messages in the `client.wire.framing` format and answers each frame with JSON text.
 
-    The sender may pipeline messages: one is received while the previous one is synced to disk. Answers are sent in the
-    order of the messages. A rejected message is also answered, and the socket stays open. A message with `part`
-    corresponds to PUT …/cameras/{c}. The handshake is refused if the scene does not exist (404) or has too many senders
-    (429). A message that is larger than any possible frame of the rig closes the connection (1009).
+    A message contains one frame, one camera's files of a frame (`single_camera`, as PUT …/cameras/{c}), or a batch of
+    frames (as POST …/frames). `numbering=next` in the URL gives whole frames the next indices.
+
+    The sender may pipeline messages: one is received while the previous one is synced to disk. Each frame is answered
+    with an `IngestAnswer`, in order. A rejected frame is also answered, and the socket stays open. The handshake is
+    refused if the scene does not exist (404) or has too many senders (429). A message that is larger than any possible
+    frame of the rig, and larger than 64 MB, closes the connection (1009).
     """
     scenes: Scenes = socket.app.state.scenes
     server: ServerSettings = socket.app.state.settings
@@ -58,17 +65,18 @@ async def ingest(socket: WebSocket, id: str) -> None:
         except Problem as problem:  # an HTTP response refuses the handshake
             await socket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
-        limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
+        largest = max(largest_frame(scene.rig), SMALL_BATCH)
+        limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest))
         try:
             await socket.accept()
-            await _serve(socket, scenes, id)
+            await _serve(socket, scenes, id, numbering)
         finally:
             scene.ingest.remove_socket()
 
 
-async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
+async def _serve(socket: WebSocket, scenes: Scenes, id: str, numbering: Numbering) -> None:
     """Processes messages until the sender closes the socket or sends text, or the scene becomes unavailable."""
-    taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
+    taking: asyncio.Queue[asyncio.Task[list[IngestAnswer]]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
     whole_before = True
     try:
@@ -85,17 +93,17 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
                 scene = scenes[id]
             except Problem as problem:
                 await taking.join()
-                await socket.send_text(_refusal(None, problem).model_dump_json())
+                await socket.send_text(refusal(None, problem).model_dump_json())
                 away = problem.status_code == 503
                 await socket.close(SCENE_RESTARTS if away else SCENE_GONE, "the scene is not available")
                 return
             head = _head(data)
-            whole = isinstance(head, FrameHead) and not head.single_camera
+            whole = isinstance(head, FrameHead) and _is_one_frame(head, data) and numbering is Numbering.GIVEN
             if not (whole and whole_before):
-                await taking.join()  # single-camera messages and whole frames depend on each other's outcome
+                await taking.join()  # the outcome of other messages and of whole frames depends on each other
             whole_before = whole
             # Tasks start in the order of the messages, so frames are accepted in that order.
-            await taking.put(asyncio.create_task(_take(scene, head, data)))
+            await taking.put(asyncio.create_task(_take(scene, numbering, head, data)))
     except WebSocketDisconnect:
         return
     finally:
@@ -103,11 +111,12 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
         answering.cancel()
 
 
-async def _answer(socket: WebSocket, taking: asyncio.Queue[asyncio.Task[IngestAnswer]]) -> None:
+async def _answer(socket: WebSocket, taking: asyncio.Queue[asyncio.Task[list[IngestAnswer]]]) -> None:
     while True:
-        answer = await asyncio.shield(await taking.get())
+        answers = await asyncio.shield(await taking.get())
         try:
-            await socket.send_text(answer.model_dump_json())
+            for answer in answers:
+                await socket.send_text(answer.model_dump_json())
         except (WebSocketDisconnect, RuntimeError):  # the sender has disconnected
             pass
         finally:
@@ -121,32 +130,32 @@ def _head(data: bytes) -> FrameHead | Problem:
         return framing_problem(error)
 
 
-async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestAnswer:
+def _is_one_frame(head: FrameHead, data: bytes) -> bool:
+    """Returns whether a message contains one whole frame, rather than a single camera or a batch."""
+    return not head.single_camera and len(data) <= PREFIX.size + head_length(data) + files_size(head)
+
+
+async def _take(scene: Scene, numbering: Numbering, head: FrameHead | Problem, data: bytes) -> list[IngestAnswer]:
     if isinstance(head, Problem):
-        return _refusal(None, head)
+        return [refusal(None, head)]
     body, size = _one(data), len(data)
     try:
         receipt: FrameReceipt | CameraReceipt
         if head.single_camera:
             receipt = await receive_camera(scene.open_frames, None, None, body, size)
-        else:
+        elif numbering is Numbering.GIVEN and _is_one_frame(head, data):
             receipt = await receive_frame(scene.ingest, None, body, size)
-        return IngestAnswer(index=head.index, status=202, receipt=receipt)
+        else:
+            return (await receive_batch(scene.open_frames, numbering, body)).answers
+        return [IngestAnswer(index=head.index, status=202, receipt=receipt)]
     except Problem as problem:
-        return _refusal(head.index, problem)
+        return [refusal(head.index, problem)]
     except asyncio.CancelledError:
         raise
     except Exception as error:
         log.exception("scene %s: receiving a frame over the WebSocket failed", scene.id)
         detail = f"internal error: {type(error).__name__}"
-        return _refusal(head.index, Problem(500, detail, remedy=SERVICE_FAULT))
-
-
-def _refusal(index: int | None, problem: Problem) -> IngestAnswer:
-    """Returns the answer that rejects a message; `retry_after` corresponds to the Retry-After header of HTTP."""
-    seconds = (problem.headers or {}).get("Retry-After")
-    wait = None if seconds is None else int(seconds)
-    return IngestAnswer(index=index, status=problem.status_code, retry_after=wait, problem=problem.document)
+        return [refusal(head.index, Problem(500, detail, remedy=SERVICE_FAULT))]
 
 
 async def _one(data: bytes) -> AsyncIterator[bytes]:

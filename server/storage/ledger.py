@@ -259,6 +259,14 @@ class Ledger:
                 return time
         return None
 
+    def index_at(self, seconds: float) -> int | None:
+        """Returns the index of the closed frame with this time in seconds, or None."""
+        for index in range(self.next_frame - 1, -1, -1):
+            time = self.frames[index].time
+            if time is not None and time <= seconds:
+                return index if time == seconds else None
+        return None
+
     def _grow_to(self, index: int) -> None:
         """Grows the table up to a frame; unknown frames before it are marked as failed."""
         if index >= self.next_frame:

@@ -10,7 +10,7 @@ from pathlib import Path
 import fakes
 import pytest
 from running import Running, fake_settings, make_rig, picture, pictures
-from waiting import HANG_S
+from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from server.storage.frame_store import read_pictures
@@ -118,9 +118,60 @@ def test_a_full_queue_is_waited_out(guarded_service, sdk, scene, begin):
     status, out, err = ended(begin(guarded_service.url, scene, 3, pictures(7)))
     assert status == 0, err
     assert err.startswith("429 ")
-    assert "sending frame 3 again in" in err
+    assert "sending again in" in err
     assert out.startswith("202 ")
     assert bytes(stored(guarded_service, scene)[3].images["c0"]) == pictures(7)["c0"]
+
+
+def test_several_frames_are_sent_in_one_request(guarded_service, sdk, scene, begin, tmp_path):
+    sent = {index: pictures(index + 5) for index in (0, 1, 2)}
+    more = []
+    for index in (1, 2):
+        more.append(str(index))
+        for camera, data in sent[index].items():
+            (tmp_path / f"next-{index}-{camera}.png").write_bytes(data)
+            more.append(f"{camera}={tmp_path / f'next-{index}-{camera}.png'}")
+    status, out, err = ended(begin(guarded_service.url, scene, 0, sent[0], None, *more))
+    assert status == 0, err
+    assert out.count('"status":202') == 3
+    assert {index: found.images for index, found in stored(guarded_service, scene).items()} == sent
+
+
+def test_frames_without_room_are_sent_again_and_a_refused_frame_is_reported(
+    guarded_service, sdk, scene, begin, tmp_path
+):
+    sdk.put_frame(scene, 0, pictures())
+    sdk.wait(scene, 0)
+    sdk.pause(scene)
+    (tmp_path / "next.png").write_bytes(picture(9))
+    (tmp_path / "damaged.png").write_bytes(b"damaged")
+    more = [
+        part
+        for index in (2, 3, 4, 5, 6)
+        for part in (str(index), f"c0={tmp_path / 'next.png'}", f"c1={tmp_path / 'next.png'}")
+    ]
+    process = begin(guarded_service.url, scene, 1, pictures(3), None, *more)
+    wait_for(lambda: sdk.scene(scene).queued == 2)
+    sdk.resume(scene)
+    status, out, err = ended(process)
+    assert status == 0, err
+    assert "sending again in" in err
+    assert out.count('"status":202') == 6
+    process = begin(
+        guarded_service.url,
+        scene,
+        7,
+        pictures(3),
+        None,
+        "8",
+        f"c0={tmp_path / 'damaged.png'}",
+        f"c1={tmp_path / 'next.png'}",
+    )
+    status, out, err = ended(process)
+    assert (status, out) == (1, "")
+    last = err.splitlines()[-1]
+    assert last.startswith("207 ")
+    assert ('"index":7,"status":202' in last, '"index":8,"status":422' in last) == (True, True)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from sending import FRAMED, create, finished, framed, put_framed, status
 from waiting import HANG_S
 
 from client.wire.framing import MAX_HEAD, PREFIX
-from server.ingest.receive import FrameReceiver, read_framed
+from server.ingest.receive import BodyReader, FrameReceiver, read_files, read_head
 
 
 def with_head(head, *files):
@@ -91,11 +91,11 @@ def test_a_body_is_read_in_whatever_pieces_it_arrives(tmp_path, cuts):
         for begin, end in pairwise((0, *cuts, len(body))):
             yield body[begin:end]
 
-    def begin(head):
-        return FrameReceiver(tmp_path, head, None, lambda file, data: None, keep=False)
-
     async def read():
-        head, receiving = await read_framed(pieces(), begin, len(body))
+        reader = BodyReader(pieces())
+        head = await read_head(reader)
+        receiving = FrameReceiver(tmp_path, head, None, lambda file, data: None, keep=False)
+        await read_files(reader, receiving, ends_body=True)
         return head, await receiving.finish()
 
     head, received = asyncio.run(read())
