@@ -1,16 +1,22 @@
-"""Checkpoints of all update state except Θ_{t−1}, and selection of the commit from which a scene is resumed.
+"""Checkpoints, from which an interrupted scene continues.
 
-After a crash, a resumed scene produces bit-identical results.
+A checkpoint contains everything that the next update needs in addition to the committed state. On
+the CPU, a scene that is resumed after a crash therefore produces bit-identical results.
 
-Each of the newest commits in a ``History`` has a file ``checkpoint_<index>.npz`` next to its frame. The file is
-written, synced and renamed *before* the frame itself is renamed, which is the commit. Every committed frame therefore
-has a checkpoint, and a checkpoint without a frame is ignored. The second newest checkpoint is kept in case the newest
-state or checkpoint is damaged. Constant data (exposures, presence of masks) is stored in the report of the first frame.
-Clusters and neighbours are rebuilt from the first frame, and a digest shows whether they changed.
+The newest commits in a ``History`` each have a file ``checkpoint_<index>.npz`` next to the file of
+the frame. A frame is committed when its file is renamed. The checkpoint is written, synced and
+renamed before. Every newly committed frame therefore has a checkpoint, and a checkpoint without a
+frame is ignored. The second newest checkpoint is kept in case the newest state or checkpoint is
+damaged.
+
+Some data is not stored in checkpoints. Constant data (exposures, presence of masks) is in the
+report of the first frame. Clusters and neighbours are rebuilt, and a digest shows whether they have
+changed.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -36,23 +42,25 @@ from scas4d_core.update.warm_start import Motion
 
 
 class CheckpointError(ValueError):
-    """Raised if a checkpoint is missing or damaged; the message names the file and the problem."""
+    """Raised if a checkpoint is missing or damaged. The message names the file and the problem."""
 
 
 @dataclass(frozen=True, eq=False)
 class CarryOver:
-    """State, in addition to Θ, that one update passes to the next.
+    """State that one update passes to the next, in addition to the Gaussians Θ.
 
     Attributes:
         motion: motion of the last update, or None if the next update is a cold start.
-        labels: [N] bool, true for Gaussians that have moved at least once; None in scenes with masks, and before the
-            first motion.
-        seen: views with which the next frame is compared, in scenes without masks. These are the views of the last
-            accepted frame. Until the first motion is detected, the views of the first frame are kept, so that slow
-            motion accumulates.
+        labels: [N] bool, true for Gaussians that have moved at least once; None in scenes with
+            masks, and before the first motion.
+        seen: views with which the images of the next frame are compared to detect motion, in scenes
+            without masks. These are the views of the last accepted frame in unchanged lighting.
+            Until the first motion, the views are kept while frames are skipped, so that slow
+            motion accumulates. Empty in other scenes.
         structure: digest of the clusters and neighbours for which ``motion`` is valid.
         past: statistics of the scene and its cameras over the previous frames.
-        shown: fingerprint of each camera's image in the last accepted frame (``robust.checks``).
+        shown: checksum of each camera's image in the last accepted frame
+            (``robust.checks.fingerprints``).
         switches: on/off state of each effect for the next update.
         effects: arrays that each effect carries over, keyed by effect name.
     """
@@ -66,6 +74,13 @@ class CarryOver:
     switches: Switches = field(default_factory=dict)
     effects: Mapping[str, Arrays] = field(default_factory=dict)
 
+    def snapshot(self) -> CarryOver:
+        """Returns a copy that later updates do not change.
+
+        The views in ``seen`` are shared, because images never change.
+        """
+        return replace(copy.deepcopy(replace(self, seen=())), seen=self.seen)
+
     def after(
         self,
         result: UpdateResult,
@@ -74,14 +89,17 @@ class CarryOver:
         views: Sequence[TrainingView] | None,
         shown: Mapping[str, int],
     ) -> CarryOver:
-        """Returns the carry-over for the next frame; the images of a rejected frame are not kept.
+        """Returns the carry-over for the next frame.
+
+        If the current frame was rejected, ``seen`` and ``shown`` do not change.
 
         Args:
             result: update result of the current frame.
             past: statistics that include the current frame.
             time: time of the current frame in seconds.
-            views: views used by the update, or None in scenes with masks.
-            shown: fingerprint of each camera's image.
+            views: views of the cameras that are not excluded, or None if the scene does not detect
+                motion from images.
+            shown: checksum of each camera's image in the current frame.
         """
         carried = replace(
             self,
@@ -91,8 +109,8 @@ class CarryOver:
         )
         if result.outcome.rejected:
             return carried
-        # A lighting change is not motion. Motion too small to detect between two frames accumulates if the reference
-        # views are kept.
+        # Images under a changed lighting are no reference for motion. If nothing has moved yet, the
+        # reference views are kept, because slow motion is only visible over several frames.
         resting = self.labels is None and result.outcome is FrameOutcome.UNCHANGED and bool(self.seen)
         if views is not None and result.exposure == 1.0 and not resting:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
@@ -100,7 +118,12 @@ class CarryOver:
 
 
 class Checkpoints:
-    """Writes and reads the checkpoints in a history directory; used by the process that appends to the history.
+    """The checkpoints in the directory of a history.
+
+    Only the process that appends to the history may use this class.
+
+    Args:
+        directory: directory of the history.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -116,9 +139,10 @@ class Checkpoints:
         self.directory = directory
 
     def save(self, index: int, carry_over: CarryOver) -> None:
-        """Writes the state that frame ``index`` passes to the next frame; call it before the frame is committed.
+        """Writes the state that frame ``index`` passes to the next frame.
 
-        In scenes without masks, the file includes the frame's images at 3 bytes per pixel.
+        This method must be called before the frame is committed. The file includes the images of
+        ``carry_over.seen``, which take 3 bytes per pixel.
         """
         arrays: dict[str, Any] = {"structure": np.int64(carry_over.structure)}
         if carry_over.motion is not None:
@@ -137,7 +161,7 @@ class Checkpoints:
         for view in carry_over.seen:
             levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # exact: the source images are 8 bit
             arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
-        # The list of names distinguishes an array that was lost from one that was never written.
+        # The list of names distinguishes arrays that were lost from arrays that were never written.
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)
 
@@ -172,7 +196,9 @@ class Checkpoints:
             raise CheckpointError(message_of(error)) from error
 
     def clean(self, committed: Sequence[int]) -> None:
-        """Removes all checkpoints except those of the newest commits; call it after a commit.
+        """Removes all checkpoints except those of the newest commits.
+
+        This method must be called after a commit.
 
         Args:
             committed: indices of the committed frames, in ascending order.
@@ -192,7 +218,10 @@ class Checkpoints:
 
 
 def _packed(motion: Motion) -> dict[str, Any]:
-    """Returns the fields of a motion (numbers, arrays and lists of arrays) as named arrays."""
+    """Returns the fields of a motion as arrays and numbers, keyed by name.
+
+    A field that is a list is stored as its length and one entry per element.
+    """
     packed: dict[str, Any] = {}
     for item in fields(motion):
         value = getattr(motion, item.name)
@@ -205,7 +234,7 @@ def _packed(motion: Motion) -> dict[str, Any]:
 
 
 def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
-    """Returns the effect arrays in a checkpoint, keyed by effect and array name."""
+    """Returns the arrays of effects in a checkpoint, keyed by effect name and array name."""
     effects: dict[str, Arrays] = {}
     for key, array in arrays.items():
         kind, _, rest = key.partition(".")
@@ -228,7 +257,10 @@ def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
 
 
 def cold_start(history: History, index: int, masked: bool) -> CarryOver:
-    """Returns the carry-over that can be rebuilt from a committed frame: learnt labels, switches and effect arrays.
+    """Returns the carry-over of a committed frame without its checkpoint.
+
+    Labels, switches and committed arrays of effects are rebuilt from the state and its report. The
+    other fields have their default values.
 
     Args:
         history: history of the scene.
@@ -258,10 +290,11 @@ class ResumePoint:
 
     Attributes:
         index: frame index of the commit.
-        undone: indices of later committed frames that were rolled back; they are lost unless they are sent again.
-        faults: one sentence per file that could not be used; empty after a normal shutdown.
-        cold: whether the state is intact, but its checkpoint is missing or damaged. The next update then starts without
-            motion, and the results are no longer bit-identical to those of an uninterrupted scene.
+        undone: indices of later committed frames that were rolled back. These frames are lost
+            unless they are sent again.
+        faults: one sentence per problem that was found; empty after a normal shutdown.
+        cold: whether the next update starts without motion, because the checkpoint is not usable.
+            The results are then not bit-identical to those of an uninterrupted scene.
     """
 
     index: int
@@ -273,7 +306,11 @@ class ResumePoint:
 def find_commit(
     history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
 ) -> tuple[int, CarryOver | None, list[str]]:
-    """Finds the commit to resume from.
+    """Finds the commit from which an interrupted scene continues.
+
+    The result is the newest commit whose state and checkpoint are intact, if the images of all
+    later frames can be sent again. Otherwise, the result is the newest commit whose state is
+    intact, without its checkpoint.
 
     Args:
         history: history of the scene.
@@ -282,7 +319,8 @@ def find_commit(
         held: function that returns whether the images of a committed frame can be sent again.
 
     Returns:
-        The index of the commit, its carry-over (None for a cold start), and one sentence per fault that was found.
+        The index of the commit, its carry-over (None for a cold start), and one sentence per fault
+        that was found.
 
     Raises:
         ResumeError: if no state can be read.
@@ -300,7 +338,7 @@ def find_commit(
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
             if index not in checkpoints.indices() and whole:
-                break  # older commits have no checkpoint
+                break  # older commits have no checkpoints either
     if not whole:
         raise ResumeError("no state can be read: " + "; ".join(faults))
     later = sorted({*history.indices, *history.damaged})

@@ -1,7 +1,12 @@
-"""Reconstruction of a scene: ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises an error and changes nothing.
+"""Reconstruction of a scene, frame by frame.
 
-A commit is a single rename, because the state and the report of a frame are in one file. The checkpoint for the next
-update is written first. Therefore ``resume`` can continue after any crash, with bit-identical results on the CPU.
+``Reconstruction.start`` fits the Gaussians Θ_0 to the first frame. ``Reconstruction.step`` deforms
+Θ_{t−1} to fit the next frame, and commits the result Θ_t. If ``step`` raises an error, the scene
+does not change.
+
+The state and the report of a frame are in one file, so a commit is a single rename. The checkpoint
+for the next update is written before. ``Reconstruction.resume`` can therefore continue after any
+crash, with bit-identical results on the CPU.
 """
 
 from __future__ import annotations
@@ -56,7 +61,7 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import RESTING, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.history import History, HistoryError
+from scas4d_core.storage.history import Defer, History, HistoryError, run_now
 from scas4d_core.update.result import Stopwatch
 from scas4d_core.update.schedule import TimeBudget
 from scas4d_core.update.view_factory import ViewFactory
@@ -65,12 +70,15 @@ __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePo
 
 
 class Reconstruction(CommittedScene):
-    """Reconstruction of one scene from frame 0 onward; created by ``start``, or from an existing history by ``resume``.
+    """Reconstruction of one scene from its first frame onward.
 
-    A process should call ``warm_up.compile_in_processes`` first; otherwise kernels may be compiled in this process.
+    Objects are created by ``start``, or from the history of an existing scene by ``resume`` or
+    ``fork``. A process should call ``warm_up.compile_in_processes`` before. Otherwise, kernels may
+    be compiled in this process.
 
     Attributes:
-        calibrated: training cameras in the user's world, either as given or as refined in frame 0.
+        calibrated: training cameras in the user's world, as given by the user or as refined in
+            frame 0.
         rig: training cameras in the internal world, at the scaled image size.
         settings: settings of the scene.
         device: device that fits and updates the scene.
@@ -93,13 +101,14 @@ class Reconstruction(CommittedScene):
     """
 
     def __init__(self, rig: Rig, settings: Settings, history: History, found: CalibrationReport | None = None) -> None:
-        """Creates a scene without frames.
+        """Creates an object without a current state; callers use ``start``, ``resume`` or ``fork``.
 
         Args:
             rig: training cameras in the user's world, at the size of the images.
             settings: settings of the scene.
             history: history to commit to.
-            found: calibration found in frame 0, or None to use the calibration in the history.
+            found: result of the calibration check of frame 0, or None to use the result in the
+                history, if there is one.
         """
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
@@ -136,24 +145,30 @@ class Reconstruction(CommittedScene):
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
         started: float | None = None,
+        defer: Defer = run_now,
     ) -> Reconstruction:
         """Reconstructs the first frame and commits it.
 
         Args:
             rig: training cameras in the user's world and units, at the size of the frame's images.
-            frame: first frame, with images of all, or at least most, cameras; with masks if available.
+            frame: first frame. It should have images of all or nearly all cameras, and masks if
+                masks are available.
             settings: settings of the scene.
-            points: initial point cloud in the user's world, or None to compute it from the images.
+            points: initial point cloud in the user's world, or None to compute one from the images.
             progress: function called with the progress of each stage.
-            history: history to commit to, or None for a new one in memory.
-            static: existing fit of frame 0, used unchanged.
-            dropped: maps each camera excluded by the caller to the reason; committed with the report.
+            history: history to commit to, or None for a new history in memory.
+            static: existing fit of frame 0 to use, or None to fit the frame.
+            dropped: maps each camera excluded by the caller to the reason; committed with the
+                report.
             notes: additional JSON data to commit.
-            started: ``perf_counter`` value at which decoding and loading of kernels began, for the stage "load".
+            started: ``perf_counter`` value at which the caller began to decode images and load
+                kernels, or None. The time since then is reported as the stage "load".
+            defer: see ``step``.
 
         Raises:
             RigError: if the rig is unusable with these settings.
-            ValueError: if the time is not finite, or the images have a different size.
+            ValueError: if the time of the frame is not finite, or an image does not have the size
+                of its camera.
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time must be finite; got {frame.time} s")
@@ -187,18 +202,19 @@ class Reconstruction(CommittedScene):
             with_first_figures(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time
         )
         prepared = self._prepared.with_carry_over(seen=seen, past=past, shown=shown, effects=effects)
-        self._commit(report, result.gaussians, prepared, {**self._fixed.record(), **(notes or {})})
+        self._commit(report, result.gaussians, prepared, {**self._fixed.record(), **(notes or {})}, defer)
         return self
 
     @classmethod
     def resume(
         cls, rig: Rig, settings: Settings, history: History, *, held: Callable[[int], bool] = lambda index: True
     ) -> Reconstruction:
-        """Resumes a scene from its last commit; on the CPU, it continues with bit-identical results.
+        """Resumes a scene from its last commit. On the CPU, later results are bit-identical.
 
-        If the newest state or its checkpoint is damaged, the scene resumes from the previous one. Later frames are
-        rolled back, and ``resumed.undone`` lists the frames to send again. If one of them cannot be sent again, an
-        intact newest state is preferred to bit-identical results: the scene resumes from that state with a cold start.
+        If the newest state or its checkpoint is damaged, the scene resumes from an earlier commit.
+        Later frames are rolled back, and ``resumed.undone`` lists the frames to send again. If one
+        of these frames cannot be sent again, the scene resumes from the newest intact state with a
+        cold start instead. The results are then not bit-identical.
 
         Args:
             rig: training cameras that were passed to ``start``.
@@ -226,12 +242,20 @@ class Reconstruction(CommittedScene):
         self.resumed = ResumePoint(index, history.truncate(index), faults, cold=left is None or not same)
         self._checkpoints.clean(history.indices)
         if self.resumed.cold:
-            with suppress(OSError):  # no disk space: the next resume is also a cold start
+            with suppress(OSError):  # without disk space, the next resume is also a cold start
                 self.write_checkpoint(index)
         return self
 
     def write_checkpoint(self, index: int) -> bool:
-        """Rewrites the checkpoint of the newest commit; returns False for older commits, which are not in memory."""
+        """Rewrites the checkpoint of a commit, if its content is in memory.
+
+        Args:
+            index: frame index of the commit.
+
+        Returns:
+            Whether the checkpoint was written. It is not written for any commit except the newest
+            one, or if the history is not on disk.
+        """
         if self._checkpoints is None or index != self.history.indices[-1]:
             return False
         self._checkpoints.save(index, self._prepared.carried)
@@ -239,7 +263,9 @@ class Reconstruction(CommittedScene):
 
     @classmethod
     def fork(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:
-        """Returns an in-memory copy that continues from a committed frame with a cold start; ``history`` is only read.
+        """Returns a copy of a scene that continues from a committed frame with a cold start.
+
+        The copy has its own history in memory. ``history`` is only read.
 
         Args:
             rig: training cameras that were passed to ``start``.
@@ -257,7 +283,16 @@ class Reconstruction(CommittedScene):
         return self
 
     def _prepare_from_commit(self, index: int, carried: CarryOver) -> bool:
-        """Prepares the updates after a commit, and returns whether its stored motion fits the current clusters."""
+        """Prepares the update that follows a commit.
+
+        Args:
+            index: frame index of the commit.
+            carried: state carried over from the commit.
+
+        Returns:
+            Whether the clusters and neighbours are those for which the motion in ``carried`` is
+            valid.
+        """
         roots = self.history.roots(index)
         self._fixed = replace(self._fixed, lengths=axis_lengths(roots))
         self._prepared = self._preparation.rebuild(roots, carried)
@@ -270,19 +305,27 @@ class Reconstruction(CommittedScene):
         dropped: Mapping[str, str] | None = None,
         notes: Mapping[str, Any] | None = None,
         started: float | None = None,
+        defer: Defer = run_now,
     ) -> FrameReport:
-        """Updates the state to fit a frame and commits it; a frame that does not fit is rejected entirely or in part.
+        """Updates the state to fit a frame, and commits the result.
+
+        Cameras whose images do not fit are excluded. If the whole frame does not fit, the frame is
+        rejected, and the previous state is committed unchanged.
 
         Args:
-            frame: next frame, later than the last one, with an image of at least one camera.
-            dropped: maps each camera excluded by the caller to the reason; committed with the report.
+            frame: frame after the last committed one, with an image of at least one camera.
+            dropped: maps each camera excluded by the caller to the reason; committed with the
+                report.
             notes: additional JSON data to commit.
-            started: ``perf_counter`` value at which work on the frame began and its time budget starts, or None for the
-                current time.
+            started: ``perf_counter`` value at which work on the frame began, or None for the
+                current time. The time budget of the frame starts at this time.
+            defer: function that receives each function that writes files of the commit, in order.
+                By default, each of these functions is called immediately. They may also be called
+                after the next frame was updated.
 
         Raises:
-            StepError: if the frame is not later than the last one, has no image of a camera of the rig, or an image has
-                a different size.
+            StepError: if the frame is not later than the last committed one. Also if the frame has
+                no image of any camera of the rig, or an image does not have the size of its camera.
         """
         seconds, watch = self._seconds_to(frame), Stopwatch(started)
         frame = replace(frame, images=dict(frame.images))  # a capture decodes images on every access
@@ -292,11 +335,11 @@ class Reconstruction(CommittedScene):
         self._solve(context)
         self._populate(context)
         report = self._report(context)
-        self._commit_update(context, report)
+        self._commit_update(context, report, defer)
         return report
 
     def _observe(self, context: FrameContext, seconds: float) -> None:
-        """Decodes the images and checks their brightness and the lighting."""
+        """Decodes the images, and checks their brightness and the lighting."""
         frame, watch, past = context.frame, context.watch, self._prepared.carried.past
         views = self._views(frame)
         watch.lap("decode")
@@ -340,7 +383,10 @@ class Reconstruction(CommittedScene):
         )
 
     def _solve(self, context: FrameContext) -> None:
-        """Updates Θ_{t−1} to fit the frame; a rejected frame changes nothing."""
+        """Updates Θ_{t−1} to fit the frame.
+
+        If the frame is rejected, the state, motion and labels of the previous frame are kept.
+        """
         solver = FrameSolver(context.prepared.updater, self._factory, self._renderer, self._update)
         result, context.past = solver.run(context.update_input)
         context.check_seconds = solver.check_seconds
@@ -353,7 +399,7 @@ class Reconstruction(CommittedScene):
         context.result = result
 
     def _populate(self, context: FrameContext) -> None:
-        """Passes the frame to the effects, adds and retires Gaussians, and prepares the next update."""
+        """Adds and retires Gaussians, switches effects on or off, and prepares the next update."""
         observed, result, believed = context.frame_input, context.result, context.frame_input.believed
         learnt_from = believed if self._learns_labels else None
         carried = context.prepared.carried.after(
@@ -389,23 +435,30 @@ class Reconstruction(CommittedScene):
             context.watch, context.dropped, context.birth_fit_time.postponed,
         )  # fmt: skip
 
-    def _commit_update(self, context: FrameContext, report: FrameReport) -> None:
-        """Commits the frame and the Gaussians added in it, and records its time for the budget."""
+    def _commit_update(self, context: FrameContext, report: FrameReport, defer: Defer) -> None:
+        """Commits the frame with the Gaussians added in it, and updates the time budget."""
         result, prepared, watch = context.result, context.prepared, context.watch
         grown = prepared.roots is not self._prepared.roots
         birth = {"roots": prepared.roots, "parents": result.parents} if grown else {}
-        self._commit(report, result.gaussians, prepared, context.notes, **birth)
+        self._commit(report, result.gaussians, prepared, context.notes, defer, **birth)
         after = context.check_seconds + watch.seconds.get("presence", 0.0) - context.birth_fit_time.spent
         after += perf_counter() - watch.began - watch.total
         self._budget.record_frame(result.trace.iteration_ends, result.trace.seconds, after)
 
     @property
     def _learns_labels(self) -> bool:
-        """Whether moving Gaussians are detected from motion, because there are no masks and an effect requires it."""
+        """Whether moving Gaussians are detected by comparing the images of successive frames.
+
+        This is necessary if the scene has no masks and an effect needs the labels.
+        """
         return self._prepared.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
-        """Returns the time in seconds from the last committed frame to a later frame."""
+        """Returns the time in seconds from the last committed frame to a later frame.
+
+        Raises:
+            StepError: if the frame is not later than the last committed one.
+        """
         last = self.history.indices[-1]
         if frame.index <= last:
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
@@ -417,7 +470,11 @@ class Reconstruction(CommittedScene):
         return seconds
 
     def _views(self, frame: Frame) -> list[TrainingView]:
-        """Returns the views of a frame, with the current camera estimates."""
+        """Returns the views of a frame, with current estimates of camera poses and exposures.
+
+        Raises:
+            StepError: if the images do not match the rig.
+        """
         try:
             return self._preparation.views(frame, self._fixed.exposures, self._prepared)
         except ValueError as error:
@@ -431,7 +488,9 @@ class Reconstruction(CommittedScene):
         stop_gain: float | None = None,
         skip_tolerance: float | None = None,
     ) -> None:
-        """Changes the budget of later updates. Each value that is None is reset to the settings.
+        """Changes the time and iteration budget of later updates.
+
+        A value that is None is reset to the value in the settings.
 
         Args:
             iterations: number of iterations per frame.
@@ -453,25 +512,37 @@ class Reconstruction(CommittedScene):
         self._budget.milliseconds = self._update.budget_ms
 
     def _commit(
-        self, report: FrameReport, gaussians: Gaussians, prepared: PreparedUpdate, more: Mapping[str, Any], **birth: Any
-    ) -> None:
-        """Writes the checkpoint, then commits state and report; see ``History.append`` for ``birth``."""
-        carried = prepared.carried
-        if self._checkpoints is not None:
-            self._checkpoints.save(report.index, carried)
+        self, report: FrameReport, gaussians: Gaussians, prepared: PreparedUpdate, more: Mapping[str, Any],
+        defer: Defer = run_now, **birth: Any,
+    ) -> None:  # fmt: skip
+        """Writes the checkpoint, and then commits the state and the report.
+
+        Args:
+            report: report of the frame.
+            gaussians: state of the frame.
+            prepared: input of the next update.
+            more: additional JSON data to commit.
+            defer, birth: see ``History.append``.
+        """
+        carried, checkpoints = prepared.carried, self._checkpoints
+        if checkpoints is not None:
+            checkpoint = carried if defer is run_now else carried.snapshot()
+            defer(lambda: checkpoints.save(report.index, checkpoint))
         began = perf_counter()
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
         effects = encode_switches(carried.switches)
         computed = {"device": self.device, "threads": get_num_threads()}
         record = {**report.record(), "effects": effects, **computed, "resumed": resumed, **more}
-        seconds = report.seconds  # a record cannot time its own write, so it includes the previous one
+        # A record cannot contain the time of its own write. It contains that of the previous write.
+        seconds = report.seconds
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
         kept = committed_arrays(carried.effects) if self.history.indices else carried.effects
-        self.history.append(report.index, report.time, gaussians, record, effects=kept, **birth)
+        self.history.append(report.index, report.time, gaussians, record, effects=kept, defer=defer, **birth)
         if birth:
             prepared = replace(prepared, roots=self.history.roots())
             self._fixed = replace(self._fixed, lengths=axis_lengths(prepared.roots))
         self._prepared, self.report = prepared, report
-        if self._checkpoints is not None:
-            self._checkpoints.clean(self.history.indices)
+        if checkpoints is not None:
+            committed = self.history.indices
+            defer(lambda: checkpoints.clean(committed))

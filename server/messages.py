@@ -60,6 +60,13 @@ class FrameReady:
 
 
 @dataclass(frozen=True)
+class DecodeAhead:
+    """Notification of the frame that will probably be sent next, which the worker may decode in advance."""
+
+    frame: FrameReady
+
+
+@dataclass(frozen=True)
 class RepairFiles:
     """Request to the worker to check damaged or missing files in the states folder and rewrite them if possible.
 
@@ -141,6 +148,16 @@ class StatesRetained:
     """Notification that new retention rules are in effect; `deleted` lists the frames whose states were deleted."""
 
     deleted: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class FrameSolved:
+    """Notification that a frame's state is in memory and being written; the worker accepts the next frame.
+
+    `FrameCommitted` follows once the state is on disk.
+    """
+
+    index: int
 
 
 @dataclass(frozen=True)

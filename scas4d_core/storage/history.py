@@ -9,7 +9,7 @@ only read, and see changes after calling ``refresh``.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
@@ -35,11 +35,18 @@ __all__ = [
     "UnreadableFrameError",
 ]  # fmt: skip
 
+Defer = Callable[[Callable[[], None]], None]
+"""Function that receives each function that writes or deletes files of a commit, and calls it now or later."""
 NEWEST_KEPT = 2
 """Number of newest states that retention never deletes.
 
 If the newest state is damaged, the scene resumes from the one before it.
 """
+
+
+def run_now(write: Callable[[], None]) -> None:
+    """Calls the function immediately, so that a commit is on disk when it returns."""
+    write()
 
 
 class History(HistoryReader):
@@ -127,10 +134,11 @@ class History(HistoryReader):
         parents: Int | None = None,
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
+        defer: Defer = run_now,
     ) -> None:
         """Commits the state and the report of one frame.
 
-        In a history with a directory, they are on disk when this method returns.
+        In a history with a directory, they are on disk when this method returns, unless their writing is deferred.
 
         Args:
             index: frame index, greater than all previous indices.
@@ -141,6 +149,9 @@ class History(HistoryReader):
             parents: [B] row of each newborn Gaussian's parent, or None if no newborn Gaussian has a parent.
             roots: roots of all Gaussians (``births.extend_roots``), or None if newborn Gaussians are their own roots.
             effects: arrays that effects need for a cold start, keyed by effect and array name.
+            defer: function that is called with a function that writes the files; by default, it calls it immediately.
+                The state is in memory when this method returns, but the frame is committed only after the function was
+                called, which must happen once, in the order of the frames.
 
         Raises:
             HistoryError: if the index is not greater than the last index, Gaussians are missing, ids or opacities
@@ -188,7 +199,7 @@ class History(HistoryReader):
             ]
         )
         log = log if len(log) > len(before) else before
-        self._write(index, time, frame, text, log, births, self._fixed or fixed, pack_effects(effects))
+        self._write(index, time, frame, text, log, births, self._fixed or fixed, pack_effects(effects), defer)
 
     def _birth(self, index: int, born: Gaussians, parents: Int | None, roots: Gaussians | None) -> Arrays:
         """Returns the arrays to store for the Gaussians born in a frame.
@@ -216,7 +227,7 @@ class History(HistoryReader):
 
     def _write(
         self, index: int, time: float, frame: Arrays, text: str, log: Int, births: Mapping[int, Arrays], fixed: Arrays,
-        left: NDArray[np.uint8] | None,
+        left: NDArray[np.uint8] | None, defer: Defer = run_now,
     ) -> None:  # fmt: skip
         """Commits a validated frame.
 
@@ -229,22 +240,25 @@ class History(HistoryReader):
             births: arrays of births that may not have been written yet, keyed by frame.
             fixed: fixed arrays of the first frame.
             left: packed effect arrays, or None if there are none.
+            defer: see ``append``.
         """
-        if self._files is not None:
-            encoded = text.encode()
+        encoded, files, first = text.encode(), self._files, not self._fixed
+        new_births = {born_in: births[born_in] for born_in in births if born_in not in self._births or born_in == index}
+
+        def write_files(files: FrameFiles) -> None:
             written = frame_file_arrays(frame, time, encoded, log, left)
-            if not self._fixed:
-                self._files.write_fixed(fixed, index, written)
-            for born_in, arrays in births.items():
-                if born_in not in self._births or born_in == index:
-                    self._files.write_born(born_in, arrays)
+            if first:
+                files.write_fixed(fixed, index, written)
+            for born_in, arrays in new_births.items():
+                files.write_born(born_in, arrays)
             began = perf_counter()
-            self._stamps[index] = self._files.write(index, written)
-            self.record_seconds += (perf_counter() - began) * len(text) / self._stamps[index][0]
-            self._texts[index] = encoded
-        else:
-            self._stamps[index] = (sum(array.nbytes for array in frame.values()), 0)
-            self._texts[index] = text.encode()
+            stamp = self._stamps[index] = files.write(index, written)
+            self.record_seconds += (perf_counter() - began) * len(text) / stamp[0]
+
+        if files is not None:
+            defer(lambda: write_files(files))
+        self._stamps.setdefault(index, (sum(array.nbytes for array in frame.values()), 0))
+        self._texts[index] = encoded
         self._births.update(births)
         if left is not None:
             self._packed[index] = left
@@ -256,7 +270,7 @@ class History(HistoryReader):
         if self._files is None and len(self._times) > IN_MEMORY:
             self.move_to_scratch(None, IN_MEMORY)
 
-    def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
+    def retain(self, *, last: int | None = None, size_bytes: int | None = None, defer: Defer = run_now) -> list[int]:
         """Deletes the oldest states until the limits are met. Without a limit, all states are kept.
 
         The first frame is always kept because every update needs it. The ``NEWEST_KEPT`` newest frames are kept because
@@ -266,6 +280,7 @@ class History(HistoryReader):
         Args:
             last: number of states to keep in addition to the first, or None for no limit.
             size_bytes: maximum total size of the frame files in bytes, or None for no limit.
+            defer: function that is called with a function that deletes the files; see ``append``.
 
         Returns:
             The indices of the deleted frames, in increasing order.
@@ -282,8 +297,9 @@ class History(HistoryReader):
         deleted = surplus(self.indices, lambda index: self._stamps[index][0], NEWEST_KEPT, last, size_bytes, with_it)
         for index in deleted:
             self._forget(index)
-        if self._files is not None and deleted:
-            self._files.remove_oldest(deleted, self._times)
+        if (files := self._files) is not None and deleted:
+            left = frozenset(self._times)
+            defer(lambda: files.remove_oldest(deleted, left))
         return deleted
 
     def move_to_scratch(self, folder: Path | None, keep_newest: int = 1) -> None:

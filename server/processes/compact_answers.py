@@ -17,7 +17,10 @@ from server.processes.part_labels import resize_labels
 
 
 def compact_head(spec: SceneSpec, history: History) -> FileHeader:
-    """Returns the file header for all states of a scene: world frame, effective rig, background, frame rate."""
+    """Returns the header of compact files of a scene: world frame, rig, background and frame rate.
+
+    If the calibration was refined in the first frame, the rig has the refined calibration.
+    """
     return FileHeader(
         spec.rig.world_frame(spec.settings.scene.metres_per_unit),
         background=history.background,
@@ -66,9 +69,11 @@ def write_compact(
 
 
 def _copied(file: Path, history: History, frames: Sequence[int]) -> int | None:
-    """Copies frames from the stored compact file that contains the first one, and returns the index of the last copied.
+    """Copies frames from the scene's own compact file that contains the first requested frame.
 
-    Returns None if there is no such file or it is damaged.
+    Returns:
+        The index of the last frame that was copied, or None if there is no such compact file or the
+        file is damaged.
     """
     if history.files is None or not history.is_compacted(frames[0]):
         return None

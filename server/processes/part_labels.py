@@ -1,6 +1,7 @@
-"""Part labels of a scene for each number of parts, stored next to the states so that labels stay stable.
+"""Part labels of a scene, stored next to the states so that each part keeps its label over time.
 
-The labels can be recomputed: if a file is lost or damaged, parts are renumbered by size.
+A part is a group of Gaussians that move together. There is one file per requested number of parts.
+If a file is lost or damaged, the labels are recomputed and the parts are renumbered by size.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ log = logging.getLogger("scas4d.renderer")
 
 
 def resize_labels(labels: NDArray[Any], count: int) -> NDArray[Any]:
-    """Returns labels resized to `count` Gaussians; new Gaussians are always appended and get the label -1."""
+    """Returns labels that are truncated or extended to `count` Gaussians.
+
+    Gaussians without a label get the label -1. New Gaussians are always appended to the existing
+    ones, so the labels of the existing Gaussians keep their positions.
+    """
     return np.concatenate([labels, np.full(max(0, count - len(labels)), -1, labels.dtype)])[:count]
 
 
@@ -38,7 +43,9 @@ class StoredLabels:
 
 
 class PartLabels:
-    """Part labels of one scene for each number of parts; None means that the number is chosen automatically.
+    """Part labels of one scene for each requested number of parts.
+
+    The number None stands for a number of parts that is chosen automatically.
 
     Args:
         folder: folder of the label files; created on demand.
@@ -49,7 +56,9 @@ class PartLabels:
         self._known: dict[int | None, StoredLabels] = {}
 
     def of(self, reader: CommittedScene, history: History, count: int | None) -> NDArray[np.int64]:
-        """Returns labels [N] from all committed states; they are recomputed only when a new frame is committed.
+        """Returns the part label of each Gaussian [N], computed from all committed states.
+
+        The labels are recomputed only after a new frame has been committed.
 
         Raises:
             ValueError: see ``CommittedScene.parts``.

@@ -62,7 +62,10 @@ class ProcessExit(str):
 
 
 def end_with_parent() -> None:
-    """Makes this process exit soon after its parent does; for processes that may be busy for a long time."""
+    """Makes this process exit soon after its parent has exited.
+
+    Call this function in processes that may be busy for a long time.
+    """
     starter = multiprocessing.parent_process()
     parent = os.getppid() if starter is None else starter.pid  # the parent may have exited already
 

@@ -59,7 +59,10 @@ class PartsQuery:
 
 @dataclass(frozen=True)
 class LabelsQuery:
-    """Query for the part labels of all Gaussians as little-endian int16, in the order of the states."""
+    """Query for the part labels of all Gaussians as little-endian int16 values.
+
+    The labels have the same order as the Gaussians in the committed states.
+    """
 
     kind: ClassVar[str] = "labels"
     count: int | None

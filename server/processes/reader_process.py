@@ -1,6 +1,6 @@
 """Reader processes of a scene: one renders views, the other answers queries for tracks, parts and files.
 
-Neither ever waits for an update. ``server.processes.readers`` queues their queries.
+The processes never wait for an update. ``server.processes.readers`` queues their queries.
 """
 
 from __future__ import annotations
@@ -146,7 +146,10 @@ class QueryReader:
         return self._reader
 
     def labels(self, count: int | None) -> NDArray[np.int64]:
-        """Returns part labels [N], computed from all committed states."""
+        """Returns the part label of each Gaussian [N], computed from all committed states.
+
+        `count` is the number of parts, or None to choose the number automatically.
+        """
         return self._parts.of(self.reader, self.history, count)
 
     def pop_faults(self) -> dict[str, str]:
@@ -154,7 +157,10 @@ class QueryReader:
         return {} if self._history is None else self._history.pop_faults()
 
     def _note_missing(self, query: Query) -> None:
-        """Records the missing files of frames that the service considers committed."""
+        """Records the missing files of frames that the service considers committed.
+
+        Only the frames of the query are checked.
+        """
         frames = query.frames if isinstance(query, TracksQuery | CompactQuery) else (getattr(query, "frame", None),)
         history = self._history
         if history is not None and history.files is not None:
@@ -232,7 +238,10 @@ class QueryReader:
                 )
 
     def _file(self, number: int, write: Callable[[Path], dict[str, str] | None]) -> Answer:
-        """Returns an answer with the contents of a temporary file written by `write`, which may also return headers."""
+        """Returns an answer with the contents of a temporary file.
+
+        `write` writes the file and may return headers of the answer.
+        """
         file = self.spec.folder.export(secrets.token_hex(4))
         try:
             headers = write(file) or {}
@@ -242,10 +251,14 @@ class QueryReader:
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
-    """Concatenates [H, W] or [H, W, 3] arrays along the channel axis; returns little-endian float32 bytes and headers.
+    """Concatenates arrays along the channel axis and returns them as raw bytes, with headers.
 
-    X-Shape is "H,W,C", X-Channels lists the names of the C channels, and X-Dtype is "<f4". Rows are stored from top to
-    bottom, and channels vary fastest.
+    The bytes are little-endian float32 values. Rows are stored from top to bottom, and channels
+    vary fastest. The header X-Shape is "H,W,C", X-Channels lists the names of the C channels, and
+    X-Dtype is "<f4".
+
+    Args:
+        arrays: [H, W] or [H, W, 3] arrays, keyed by kind.
     """
     names = [channel for kind in arrays for channel in CHANNELS[kind]]
     stack = np.concatenate([array[..., None] if array.ndim == 2 else array for array in arrays.values()], axis=-1)
@@ -290,7 +303,10 @@ def encode_view(
 
 
 def part_colours() -> list[int]:
-    """Returns a palette of 256 RGB colours: black at index 0, followed by the colour of each label."""
+    """Returns a palette of 256 RGB colours as a flat list of 768 values.
+
+    The palette starts with black, followed by the colour of each part label.
+    """
     return [0, 0, 0, *(channel for label in range(255) for channel in part_colour(label))]
 
 

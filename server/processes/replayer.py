@@ -10,8 +10,8 @@ from typing import Any
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
 from server.messages import DamageFound, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.processes.decoder import FrameDecoder, read
 from server.processes.placement import enter_background, finish_background, use_one_thread
-from server.processes.worker import decode, read
 
 NICE = 15
 """Niceness increment of the process, which leaves it about a tenth of a core shared with a scene's worker."""
@@ -36,7 +36,8 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
 def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     scene = spec.scene
     # Read everything first, because the scene's retention may delete records and states during the replay.
-    frames = [partial(decode, scene.rig, message, read(scene.folder.frames, message)) for message in spec.frames]
+    decoder = FrameDecoder(scene.rig, scene.folder.frames)
+    frames = [partial(decoder.decode_images, message, read(scene.folder.frames, message)) for message in spec.frames]
     history = History.load(scene.folder.states, only=(spec.first, spec.base))
     try:
         for index in (spec.first, spec.base):

@@ -41,7 +41,10 @@ Q = TypeVar("Q", bound=SharedQuery)
 
 
 def fingerprint(value: Any) -> Hashable:
-    """Returns a hashable value that is equal for equal queries; dataclasses and arrays are compared by content."""
+    """Returns a hashable value that is equal for equal queries.
+
+    Dataclasses and arrays are compared by content.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return (type(value).__name__, *(fingerprint(getattr(value, field.name)) for field in fields(value)))
     if isinstance(value, np.ndarray):
@@ -55,7 +58,10 @@ def fingerprint(value: Any) -> Hashable:
 
 
 def lane(query: Query) -> str:
-    """Returns the lane of a query: "views" or "bulk", because tracks and parts take longer and must not delay views."""
+    """Returns the lane of a query, "views" or "bulk".
+
+    Tracks and parts have a separate lane, because they take longer and must not delay views.
+    """
     return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
 
 

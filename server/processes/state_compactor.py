@@ -1,4 +1,4 @@
-"""Compaction of a scene's older states in its worker: one state after each commit, and more while it is idle."""
+"""Compaction of a scene's older states by its worker, while the worker waits for messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ log = logging.getLogger("scas4d.worker")
 
 
 class StateCompactor:
-    """Compactor that converts all but the newest states of a scene to the compact format.
+    """Compactor that converts the states of a scene to the compact format.
+
+    The first state and the newest states stay exact.
 
     Args:
         spec: scene specification. If ``retention.exact_states`` is None, all states stay exact.
@@ -41,7 +43,10 @@ class StateCompactor:
         self._compaction = None
 
     def compact_while_idle(self, history: History, waits: Callable[[], bool]) -> None:
-        """Compacts due states until a message arrives; if the disk is full, retries at the next message.
+        """Compacts due states until a message arrives.
+
+        If more than `BEHIND` states are due, one state is compacted even if a message is waiting.
+        If the disk is full, the next call tries again.
 
         Args:
             history: the scene's committed states.

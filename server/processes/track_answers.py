@@ -53,7 +53,11 @@ def metres_per_unit(spec: SceneSpec) -> float:
 
 
 def cameras_of(query: TracksQuery) -> list[Camera]:
-    """Returns the cameras for projection and visibility: the camera of the pixels, if any, then those in `project`."""
+    """Returns the distinct cameras for which pixels and visibility are computed.
+
+    If the points are given as pixels, their camera is the first one. The cameras in `project`
+    follow.
+    """
     own = [query.camera] if query.pixels is not None and query.camera is not None else []
     names = [camera.name for camera in own]
     return own + [camera for camera in query.project if camera.name not in names]
@@ -103,7 +107,10 @@ def encode(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[b
 
 
 def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres_per_unit: float) -> Arrays:
-    """Returns the TAPVid-3D arrays for the first camera; without cameras, only the points in metres and world axes."""
+    """Returns the TAPVid-3D arrays for the first camera.
+
+    Without cameras, the result contains only the points in metres, in world axes.
+    """
     if not cameras:
         return {"tracks_XYZ": (found["tracks_world"] * metres_per_unit).astype(np.float32)}
     row = query.frames.index(query.at) if query.at in query.frames else -1

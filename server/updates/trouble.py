@@ -1,4 +1,4 @@
-"""Reason why a scene is degraded, as a message about its newest frame, its worker or the disk."""
+"""Reason why a scene is degraded. The message concerns the newest frame, the worker or the disk."""
 
 from __future__ import annotations
 

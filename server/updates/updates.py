@@ -1,4 +1,7 @@
-"""Scheduling of a scene's updates: sends queued frames to the worker one at a time and records each outcome."""
+"""Scheduling of a scene's updates: sends queued frames to the worker one at a time and records each outcome.
+
+The next frame is sent as soon as the state of the previous one is in the worker's memory, while it is being written.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,11 @@ from server.background import Background
 from server.hub import Publisher
 from server.messages import (
     ChangeRetention,
+    DecodeAhead,
     FrameCommitted,
     FrameFailedInWorker,
     FrameReady,
+    FrameSolved,
     Progressed,
     Ready,
     RepairResult,
@@ -44,8 +49,9 @@ class Updates:
     """Scheduler of one scene's updates. All methods run on the event loop.
 
     An acknowledged frame waits in the ledger until `begin` sends it to the worker as `FrameReady`. The worker responds
-    with `FrameCommitted` or `FrameFailedInWorker`, or it dies. `_commit`, `_record_failure` and `_retry_or_fail` record
-    the outcome.
+    with `FrameSolved`, after which it accepts the next frame, and with `FrameCommitted`; or with `FrameFailedInWorker`;
+    or it dies. `_commit`, `_record_failure` and `_retry_or_fail` record the outcome. Meanwhile, the frame after it is
+    announced with `DecodeAhead`.
 
     Args:
         scene_log: the scene's journal, ledger and frame log.
@@ -63,7 +69,8 @@ class Updates:
     Attributes:
         clock: predictor of when the current update ends.
         worker: supervisor of the worker process.
-        progress: progress of frame 0 while it is being reconstructed, otherwise None.
+        progress: progress of the first frame while it is being reconstructed, or of the compilation
+            of kernels before an update; otherwise None.
         first: facts about the first frame; see `first_frame_facts`.
     """
 
@@ -98,6 +105,11 @@ class Updates:
         self.progress: ProgressModel | None = None
         self.first = first
         self._index: int | None = None
+        """Frame that the worker is updating, or None."""
+        self._writing: list[int] = []
+        """Frames whose states the worker is writing, oldest first."""
+        self._announced: int | None = None
+        """Frame that was last announced to the worker, or None."""
         self._pauses = 0
         self._stopped = False
         self._rule: IngestSettings | None = None
@@ -114,7 +126,7 @@ class Updates:
     @property
     def at_work(self) -> bool:
         """Whether the worker is processing a frame."""
-        return self._index is not None and self.worker.ready
+        return (self._index is not None or bool(self._writing)) and self.worker.ready
 
     @property
     def has_work(self) -> bool:
@@ -124,7 +136,7 @@ class Updates:
         """
         mending = self._repair_queue.at_work is not None or self._repair_queue.current_repair is not None
         waits = bool(self._pauses or self._waiting()) or self._rule is not None or self.worker.starts_again
-        return self._index is not None or waits or mending
+        return self._index is not None or bool(self._writing) or waits or mending
 
     def _waiting(self) -> list[int]:
         ledger = self._ledger
@@ -136,7 +148,10 @@ class Updates:
             return
         self._publisher.publish_status()
         ledger = self._ledger
-        if self._index is not None or self._pauses or self._repair_queue.at_work is not None:
+        if self._index is not None:
+            self._announce_next()
+            return
+        if self._pauses or self._repair_queue.at_work is not None:
             return
         waiting = self._waiting()
         if not self.worker.ready:
@@ -150,14 +165,26 @@ class Updates:
                 self._begin_in(seconds)
             return
         index = waiting[0]
-        entry = ledger.frames[index]
+        message = self._frame_ready(index)
+        ledger.set_state(index, FrameState.UPDATING)
+        self._index, self._announced = index, None
+        self.clock.begin(first=not ledger.committed)
+        self.worker.send(message)
+        self._announce_next()
+        self._publisher.publish_status()
+
+    def _frame_ready(self, index: int) -> FrameReady:
+        entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        ledger.set_state(index, FrameState.UPDATING)
-        self._index = index
-        self.clock.begin(first=not ledger.committed)
-        self.worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
-        self._publisher.publish_status()
+        return FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
+
+    def _announce_next(self) -> None:
+        """Lets the worker decode the next frame while it is updating this one."""
+        waiting = self._waiting() if self.worker.ready and not self._pauses else []
+        if waiting and waiting[0] != self._announced:
+            self._announced = waiting[0]
+            self.worker.send(DecodeAhead(self._frame_ready(waiting[0])))
 
     def _begin_in(self, seconds: float) -> None:
         if self._repair_timer is not None:
@@ -185,6 +212,8 @@ class Updates:
                 self.progress = None if over else ProgressModel(**vars(message))
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self._publisher.publish_status()
+            case FrameSolved():
+                self._start_next(message.index)
             case FrameCommitted():
                 self._background.run(self._commit(message))
             case StatesRetained():
@@ -236,10 +265,24 @@ class Updates:
         self.begin()
         self._background.run(self.worker.remove_earlier_epochs(), endless=True)
 
+    def _start_next(self, index: int) -> None:
+        """Sends the next frame while the state of frame `index` is being written.
+
+        After a crash, each frame is committed before the next one is sent, so that the cause of another crash is clear.
+        """
+        if index == self._index and not self.worker.deaths.in_a_row:
+            self.clock.end(committed=True)
+            self._index, self.progress = None, None
+            self._writing.append(index)
+            self.begin()
+
     async def _commit(self, message: FrameCommitted) -> None:
         self.worker.deaths.note_commit()
-        self.clock.end(committed=True)
-        self._index, self.progress = None, None
+        if message.index == self._index:
+            self.clock.end(committed=True)
+            self._index, self.progress = None, None
+        else:
+            self._writing.remove(message.index)
         self._ledger.set_state(message.index, FrameState.COMMITTED)
         self._record(message.index, message.report)
         report = self._ledger.frames[message.index].report
@@ -332,9 +375,13 @@ class Updates:
         self._background.run(self._retry_or_fail(reason, own, delay))
 
     async def _retry_or_fail(self, reason: ProcessExit, own: bool, delay: float) -> None:
-        index, self._index = self._index, None
-        if index is not None and self._ledger.frames[index].state == FrameState.UPDATING:
+        at_work = [*self._writing, *([] if self._index is None else [self._index])]
+        self._index, self._announced, self._writing = None, None, []
+        queued = [index for index in at_work if self._ledger.frames[index].state == FrameState.UPDATING]
+        for index in queued:
             self._ledger.set_state(index, FrameState.QUEUED)
+        if queued:
+            index = queued[-1]
             if not reason.lost:  # the loss of a machine is not the frame's fault
                 death = WorkerDied(index=index, reason=str(reason), own=own)
                 await self._log.write(death)

@@ -23,7 +23,8 @@ Between two stages of frame 0, the prediction is this fraction of the elapsed ti
 class WorkClock:
     """Predictor of the end of the current update, based on the durations of earlier updates and on its progress.
 
-    Frame 0 is not counted as an update, because it takes minutes while an update takes about a second.
+    The first frame is not counted as an update, because its reconstruction takes minutes, whereas
+    an update takes about a second.
 
     Args:
         now: monotonic clock that returns seconds.
@@ -60,9 +61,13 @@ class WorkClock:
         self._stage, self._done, self._first_end = "", 0.0, None
 
     def progress(self, stage: str, done: int, total: int, seconds: float | None = None) -> None:
-        """Records the progress of frame 0 within a stage.
+        """Records the progress of the first frame within a stage.
 
-        `seconds` is the predicted time until the end of the frame, or None.
+        Args:
+            stage: name of the stage.
+            done: completed part of the stage.
+            total: value of `done` at the end of the stage.
+            seconds: predicted time until the end of the frame in seconds, or None.
         """
         if stage != self._stage:
             self._stage, self._stage_began = stage, self._now()
@@ -80,7 +85,10 @@ class WorkClock:
         self._began = self._stalled_until = None
 
     def remaining(self) -> float:
-        """Returns the predicted seconds until the current frame ends, or the duration of an update if there is none."""
+        """Returns the predicted time in seconds until the current frame ends.
+
+        If no frame is being processed, the result is the predicted duration of an update.
+        """
         if self._began is None:
             return max(SHORTEST_S, self.update_seconds)
         now = self._now()

@@ -49,6 +49,11 @@ class WorkerDeaths:
         self._in_a_row = self._lost_in_a_row = 0
         self._oom_kills = oom_kills()
 
+    @property
+    def in_a_row(self) -> int:
+        """Number of crashes and machine losses since the last commit."""
+        return self._in_a_row + self._lost_in_a_row
+
     def note_start(self) -> None:
         """Records a start of the worker."""
         self._oom_kills = oom_kills()

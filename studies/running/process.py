@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,17 @@ class Service:
     Args:
         data: the service's data folder.
         environment: additional environment variables, such as SCAS4D_TOKEN.
+        program: arguments of Python that start the service; the port is added.
     """
 
-    def __init__(self, data: Path, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        data: Path,
+        environment: Mapping[str, str] | None = None,
+        program: Sequence[str] = ("-m", "client.cli.main", "serve"),
+    ) -> None:
         self.data = data
+        self._program = [sys.executable, *program]
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = int(free.getsockname()[1])
@@ -74,10 +81,9 @@ class Service:
         Raises:
             StudyError: the service ended, or was not ready in time.
         """
-        program = [sys.executable, "-m", "client.cli.main", "serve"]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self._process = subprocess.Popen(
-                [*program, "--port", str(self.port)], env=self._environment, stdout=log, stderr=log
+                [*self._program, "--port", str(self.port)], env=self._environment, stdout=log, stderr=log
             )
         until = time.monotonic() + START_S
         while True:

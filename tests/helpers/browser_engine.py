@@ -8,6 +8,7 @@ import fakes
 import numpy as np
 
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.storage.history import run_now
 
 COUNT = 24
 BUMPED_FROM = 5
@@ -48,7 +49,7 @@ def colours():
 
 
 class DrawnReconstruction(fakes.FakeReconstruction):
-    def commit(self, frame, dropped, notes):
+    def commit(self, frame, dropped, notes, defer=run_now):
         fits = {
             name: {"psnr": 32.0 + number, "colour_shift": [0.001, 0, 0], "health": 0.95}
             for number, name in enumerate(frame.images)
@@ -63,7 +64,7 @@ class DrawnReconstruction(fakes.FakeReconstruction):
         if not self.history.indices and next(iter(frame.images.values()))[0, 0, 0] == fakes.GUESSED:
             off = {"miscalibrated": list(make_rig().names[:4]), "warnings": list(OFF)}
             more["calibration"] = {"cameras": {}, **off, "refined": None}
-        return super().commit(frame, dropped, {**(notes or {}), **more})
+        return super().commit(frame, dropped, {**(notes or {}), **more}, defer)
 
 
 class DrawnCommitted(fakes.FakeCommitted):

@@ -17,7 +17,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.storage.history import History, HistoryError
+from scas4d_core.storage.history import History, HistoryError, run_now
 
 SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
 HELD, LEAVES_OUT, STANDS, GUESSED, REFINES, LATE = 240, 241, 242, 243, 244, 245
@@ -118,7 +118,9 @@ class FakeReconstruction:
         self.iterations = ITERATIONS
 
     @classmethod
-    def start(cls, rig, frame, settings, *, points, progress, history, dropped=None, notes=None, started=None):
+    def start(
+        cls, rig, frame, settings, *, points, progress, history, dropped=None, notes=None, started=None, defer=run_now
+    ):
         assert started is None or started <= time.perf_counter()
         if obey(frame) == PICKY and settings.static.iterations != PICKED:
             raise FloatingPointError("the fake is picky")
@@ -129,7 +131,7 @@ class FakeReconstruction:
         scene = cls(rig.world_frame().to_inside(given).astype(np.float32), history)
         if int(next(iter(frame.images.values()))[0, 0, 0]) == REFINES:
             notes = {**(notes or {}), "calibration": refined(rig.cameras[1])}
-        scene.commit(frame, dropped, notes)
+        scene.commit(frame, dropped, notes, defer)
         return scene
 
     @classmethod
@@ -146,7 +148,7 @@ class FakeReconstruction:
         points = history.gaussians(first).means - offset
         return cls(points, history, Resumed(last, history.truncate(last), faults, False))
 
-    def commit(self, frame, dropped, notes):
+    def commit(self, frame, dropped, notes, defer=run_now):
         count = len(self.points)
         report = Report(frame.index, frame.time, self.iterations, {"update": 0.01}, [0.5, 0.25], 31.5, count, count)
         known = self.history.indices
@@ -184,13 +186,13 @@ class FakeReconstruction:
         ]
         record["errors"] = {"previous": 0.5, "end": 1 / self.iterations}
         record |= {"candidate": record.get("candidate", "end"), "attempts": ["as set"], "threads": 2}
-        self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record)
+        self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record, defer=defer)
         return report
 
-    def step(self, frame, *, dropped=None, notes=None, started=None):
+    def step(self, frame, *, dropped=None, notes=None, started=None, defer=run_now):
         assert started is None or started <= time.perf_counter()
         obey(frame)
-        return self.commit(frame, dropped, notes)
+        return self.commit(frame, dropped, notes, defer)
 
     def set_budget(self, *, iterations=None, budget_ms=None, stop_gain=None, skip_tolerance=None):
         self.iterations = int(budget_ms / MS_EACH) if budget_ms else iterations or ITERATIONS

@@ -42,8 +42,9 @@ def test_kernels_are_compiled_before_they_are_called(tmp_path, monkeypatch, poin
         assert first.resume()
         assert asked == []  # nothing to reconstruct yet
         images = {name: np.zeros((HEIGHT, WIDTH, 3), np.uint8) for name in spec.rig.names}
-        first.reconstruct(Frame(0, 0.0, images, {}), {}, Budget(), time.perf_counter())
-        first.reconstruct(Frame(1, 0.1, images, {}), {}, Budget(), time.perf_counter())
+        for frame in (Frame(0, 0.0, images, {}), Frame(1, 0.1, images, {})):
+            for write in first.reconstruct(frame, {}, Budget(), time.perf_counter()).writes:
+                write()
         assert Worker(spec, theirs).resume()
         said = []
         while ours.poll():

@@ -1,0 +1,1 @@
+"""Frame rate and latency of the whole service with an engine whose iterations take no time."""
