@@ -1,7 +1,8 @@
-"""Cameras, rigs and the similarity transform to the internal world frame. Requires only NumPy.
+"""Cameras, rigs of cameras, and the similarity transform to the internal world frame.
 
-Axes follow OpenCV: x right, y down, z forward; ``X_cam = R X_world + t``; ``u = fx x/z + cx``.
-Pixel (column i, row j) covers [i, i+1) x [j, j+1), and its centre is (i + 0.5, j + 0.5).
+Camera axes follow OpenCV: x right, y down, z forward; ``X_cam = R X_world + t``;
+``u = fx x/z + cx``. Pixel (column i, row j) covers [i, i+1) x [j, j+1), and its centre is
+(i + 0.5, j + 0.5). This module requires only NumPy.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ ROTATION_TOLERANCE = 1e-3
 
 
 class CameraError(InputError):
-    """Raised if a camera or rig is invalid; the message names the problem and the remedy."""
+    """Raised if a camera or a rig is invalid. The message names the problem and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +39,9 @@ class Camera:
         width, height: image size in pixels.
 
     Raises:
-        CameraError: if a value is not finite, a focal length is not positive, the intrinsics have skew, the rotation is
-            invalid, or the image is empty.
+        CameraError: if a matrix has the wrong shape or contains NaN or infinity. Also if a focal
+            length is not positive, the intrinsics have skew, the pose is not rigid, or the image is
+            empty.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> camera = Camera("front", lens, np.eye(4), width=64, height=48)
@@ -67,7 +69,7 @@ class Camera:
                 raise CameraError(f"camera {self.name!r}: {field} contains NaN or infinity", "use finite numbers")
             value.setflags(write=False)
             object.__setattr__(self, field, value)
-        with np.errstate(over="ignore", invalid="ignore"):  # values that overflow fail the checks below
+        with np.errstate(over="ignore", invalid="ignore"):  # values that overflow fail the checks
             self._check()
 
     def _check(self) -> None:
@@ -140,9 +142,11 @@ class Camera:
         return centre
 
     def scaled(self, image_scale: float) -> Camera:
-        """Returns the camera for images resized by ``image_scale``; sizes are rounded to whole pixels.
+        """Returns the camera for images resized by ``image_scale``.
 
-        With pixel centres at +0.5, resizing multiplies u, v (and therefore fx, fy, cx, cy) by the exact size ratio.
+        The new image size is rounded to whole pixels. Pixel centres are at +0.5, so resizing
+        multiplies u and v by the ratio of the new to the old size. The same factors apply to fx,
+        fy, cx and cy.
         """
         width = max(1, round(self.width * image_scale))
         height = max(1, round(self.height * image_scale))
@@ -155,7 +159,10 @@ class Camera:
         return result
 
     def project(self, points: ArrayLike) -> tuple[Float, Float]:
-        """Projects world points [..., 3] to pixels [..., 2] and depths [...]; pixels are NaN if depth <= 0."""
+        """Projects world points [..., 3] to pixel coordinates [..., 2] and depths [...].
+
+        The pixel coordinates are NaN for points with a depth of 0 or less.
+        """
         seen = self.to_camera(points)
         depth = seen[..., 2]
         safe = np.where(depth > 0, depth, np.nan)
@@ -163,7 +170,10 @@ class Camera:
         return uv, depth
 
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Float:
-        """Lifts pixels [..., 2] at depths [...] (along z, not along the ray) to world points [..., 3]."""
+        """Converts pixel coordinates [..., 2] and depths [...] to world points [..., 3].
+
+        Depths are measured along the z axis of the camera, not along the viewing ray.
+        """
         uv = np.asarray(uv, dtype=np.float64)
         z = np.asarray(depth, dtype=np.float64)
         x = (uv[..., 0] - self.cx) / self.fx * z
@@ -174,7 +184,9 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class WorldFrame:
-    """Similarity transform from the user's world to the internal one: ``inside = (user − origin) · metres_per_unit``.
+    """Similarity transform from the user's world to the internal world of a scene.
+
+    The transform is ``inside = (user − origin) · metres_per_unit``. It does not rotate.
 
     Attributes:
         origin: [3] float64 origin of the internal world, in the user's world and units.
@@ -191,17 +203,20 @@ class WorldFrame:
     metres_per_unit: float = 1.0
 
     def to_inside(self, points: ArrayLike) -> Float:
-        """Converts points [..., 3] from user units to metres relative to the origin."""
+        """Converts points [..., 3] from the user's world to the internal world (metres)."""
         result: Float = (np.asarray(points, dtype=np.float64) - self.origin) * self.metres_per_unit
         return result
 
     def to_user(self, points: ArrayLike) -> Float:
-        """Converts points [..., 3] from metres relative to the origin to user units."""
+        """Converts points [..., 3] from the internal world (metres) to the user's world."""
         result: Float = np.asarray(points, dtype=np.float64) / self.metres_per_unit + self.origin
         return result
 
     def camera_to_inside(self, camera: Camera) -> Camera:
-        """Returns the camera in the internal world; its rotation and intrinsics do not change."""
+        """Converts a camera from the user's world to the internal world.
+
+        The rotation and the intrinsics of the camera do not change.
+        """
         pose = camera.world_to_camera.copy()
         pose[:3, 3] = (camera.rotation @ self.origin + camera.translation) * self.metres_per_unit
         return Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
@@ -220,6 +235,9 @@ LONG_LENS = 2.0
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Ordered set of uniquely named cameras that observe the same scene.
+
+    Raises:
+        CameraError: if there is no camera, or two cameras have the same name.
 
     >>> lens, pose = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside = pose.copy()
@@ -268,24 +286,27 @@ class Rig:
     def radius(self) -> float:
         """1.1 times the largest distance of a camera from the mean camera centre, as in Dynamic3DGaussians.
 
-        A single camera, or several at the same position, cannot determine the scene size, and a radius of 0 would give
-        learning rates of 0. In these cases, the radius is ``AUTO_RIG_RADIUS_M`` in the unit of the cameras.
+        A single camera does not determine the size of the scene, and neither do several cameras at
+        the same position. A radius of 0 would result in learning rates of 0. In these cases, the
+        radius is ``AUTO_RIG_RADIUS_M``, in the unit of the cameras.
         """
         return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread
 
     @property
     def reach(self) -> float:
-        """Rig radius, reduced if the median lens exceeds ``LONG_LENS``, because long lenses see only part of the scene.
+        """Length to which the learning rates of positions are proportional: the rig radius or less.
 
-        Position learning rates are proportional to this value. A step that moves a point by one pixel with a normal
-        lens moves it by ten pixels with a lens ten times as long.
+        The value is smaller than the radius if the cameras have long lenses, which see only part of
+        the scene. A lens counts as long if the ratio of focal length to longer image side exceeds
+        ``LONG_LENS``; the median over the cameras decides. A step that moves a point by one pixel
+        with a normal lens moves it by ten pixels with a lens ten times as long.
         """
         lens = float(np.median([camera.intrinsics[0, 0] / max(camera.width, camera.height) for camera in self.cameras]))
         return self.radius * min(1.0, LONG_LENS / lens)
 
     @property
     def at_one_place(self) -> bool:
-        """Whether all camera centres coincide, so that they do not determine the scene scale."""
+        """Whether all camera centres coincide, and thus do not determine the scale of the scene."""
         return self._spread < ONE_PLACE
 
     @cached_property
@@ -299,8 +320,8 @@ class Rig:
             metres_per_unit: metres per calibration unit, or "auto" to assume a rig radius of 3 m.
 
         Raises:
-            CameraError: if the value is not positive, "auto" is used although all cameras are at the same position, or
-                the poses overflow.
+            CameraError: if the value is not positive, "auto" is used although all cameras are at
+                the same position, or the camera centres overflow.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             far = not np.isfinite(self._spread)
@@ -336,7 +357,11 @@ def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
 
 
 def farthest_first(centres: NDArray[np.floating], count: int) -> list[int]:
-    """Selects ``count`` points [N, 3] by farthest-point sampling, starting with the first, and returns their indices.
+    """Selects points by farthest-point sampling, and returns their indices.
+
+    Args:
+        centres: [N, 3] points. The first point is always selected.
+        count: number of points to select. If there are fewer points, all of them are selected.
 
     >>> farthest_first(np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
     [0, 2]

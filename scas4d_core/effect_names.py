@@ -1,7 +1,8 @@
-"""Names and modules of all effects, and the modes that settings can assign to them.
+"""Names and modules of all effects, and the modes that settings can assign to effects.
 
-To add an effect, add a file in ``effects/`` and an entry here. This module imports no effects, because settings use it
-to validate names; ``effects.effect.effect`` imports the module of an effect on first use.
+To add an effect, add a file to ``effects/`` and an entry to ``EFFECTS``. This module imports no
+effects, because the settings only need the names. ``effects.effect.effect`` imports the module of
+an effect on first use.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Errors that state a problem and its remedy, and error messages without local paths. No third-party dependencies."""
+"""Errors that state a problem and its remedy, and error messages without local paths.
+
+This module requires only the standard library.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,11 @@ slash.
 
 
 class InputError(ValueError):
-    """Raised for unusable input; the message is "fault; remedy".
+    """Raised if input is unusable. The message has the form "fault; remedy".
 
     Attributes:
-        fault: description of the problem, including the value.
-        remedy: what to provide instead; may be empty.
+        fault: description of the problem, including the rejected value.
+        remedy: description of the input to provide instead; may be empty.
     """
 
     def __init__(self, fault: str, remedy: str = "") -> None:
@@ -25,7 +28,10 @@ class InputError(ValueError):
 
 
 def without_paths(text: str) -> str:
-    """Shortens each absolute path on this machine to its last component; URL paths such as ``/v1/scenes`` are kept.
+    """Replaces each absolute path in a text by the last component of the path.
+
+    A path counts as a local path if its first component is a folder of this machine. Other paths,
+    such as the URL path ``/v1/scenes``, are kept.
 
     >>> without_paths("cannot read /usr/share/scenes/a.npz of /v1/scenes/a")
     'cannot read a.npz of /v1/scenes/a'
@@ -34,7 +40,10 @@ def without_paths(text: str) -> str:
 
 
 def message_of(error: BaseException) -> str:
-    """Returns an error's message without paths, or only the system's error text for an ``OSError``.
+    """Returns the message of an error without local paths.
+
+    For an ``OSError``, the result is the error text of the operating system. For an error without a
+    message, the result is the name of its class.
 
     >>> message_of(OSError(28, "No space left on device", "/usr/share/a.npz"))
     'No space left on device'
@@ -55,4 +64,4 @@ def _last_part(found: re.Match[str]) -> str:
 
 
 class StepError(ValueError):
-    """Raised if a frame cannot be processed; the state is unchanged."""
+    """Raised if a frame cannot be processed. The state of the scene does not change."""

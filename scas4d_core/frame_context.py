@@ -1,4 +1,4 @@
-"""Data of one frame while ``Reconstruction.step`` processes it; each stage adds its results."""
+"""Data of one frame while ``Reconstruction.step`` processes the frame. Each stage adds results."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from scas4d_core.update.result import Stopwatch, UpdateResult
 
 @dataclass(frozen=True, eq=False)
 class FrameInput:
-    """Measurements taken from the images of a frame before its update.
+    """Views of a frame, and measurements taken from its images before the update.
 
     Attributes:
         seconds: time since the last committed frame, in seconds.
         views: views of all cameras that have an image.
         bright: mean brightness of each camera's image, 0…1.
-        fingerprints: fingerprint of each camera's image.
-        exposure: brightness of the frame relative to the usual brightness.
-        left_out: maps each excluded camera to the reason.
-        unusable: reason why the frame cannot be used, or None (``robust.checks.check_brightness``).
+        fingerprints: checksum of each camera's image (``robust.checks.fingerprints``).
+        exposure: brightness of the frame relative to the usual brightness; 1 if the ratio is within
+            the usual range.
+        left_out: maps each camera excluded by ``robust.checks.check_brightness`` to the reason.
+        unusable: reason why nothing can be learnt from the frame, or None.
         light_changes: whether the lighting keeps changing from frame to frame.
         past: statistics of the scene, including the brightness of this frame.
     """
@@ -43,31 +44,31 @@ class FrameInput:
 
     @property
     def believed(self) -> list[TrainingView]:
-        """Views that the update learns from."""
+        """Views from which the update learns: those of all cameras that are not excluded."""
         return [view for view in self.views if view.name not in self.left_out]
 
     @property
     def steady(self) -> bool:
-        """Whether image differences from the previous frame are due to motion rather than lighting."""
+        """Whether changes of the images since the previous frame are motion, not lighting."""
         return self.unusable is None and self.exposure == 1.0
 
 
 @dataclass(eq=False)
 class FrameContext:
-    """Frame being processed; each stage of ``Reconstruction.step`` fills in its fields.
+    """A frame that is being processed. Each stage of ``Reconstruction.step`` sets some fields.
 
     Attributes:
         frame: the frame, with decoded images.
         watch: stopwatch that times the stages.
         dropped: maps each camera excluded by the caller to the reason.
         notes: additional JSON data to commit.
-        frame_input: measurements of the images, set by the "observe" stage.
+        frame_input: views and measurements of the images, set by the "observe" stage.
         prepared: updater and carry-over, set by the "prepare" stage.
         update_input: input of the updater, set by the "prepare" stage.
         result: result of the update, set by the "solve" stage.
         past: statistics after the update, set by the "solve" stage.
         check_seconds: duration of the checks outside the update, in seconds.
-        birth_fit_time: time limit for fitting added Gaussians, used by the "populate" stage.
+        birth_fit_time: time limit for fitting added Gaussians, set by the "populate" stage.
     """
 
     frame: Frame

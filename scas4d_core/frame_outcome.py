@@ -1,4 +1,7 @@
-"""Frame outcomes, alarms and their user-facing messages; cheap to import in every process."""
+"""Outcomes of frames, alarms, and their messages for users.
+
+This module has no heavy dependencies, so every process can import it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,11 @@ OTHER_ORDERS = "other orders"
 
 
 class Candidate(StrEnum):
-    """Candidate for Θ_t; the candidate with the lowest error on the probe views is kept. Values are stored on disk."""
+    """Candidate for the new state Θ_t of a frame.
+
+    The candidate with the lowest error on the probe views becomes the state
+    (``update.best_state``). The values are stored on disk.
+    """
 
     END = "end"
     """The state at the end of the update."""
@@ -27,7 +34,7 @@ class Candidate(StrEnum):
 
 
 class FrameOutcome(StrEnum):
-    """Outcome of a frame.
+    """Outcome of the attempt to update the state to a frame.
 
     >>> FrameOutcome.REJECTED_MISFIT.rejected, FrameOutcome.RELOCATED.degraded, FrameOutcome.UNCHANGED.learnt
     (True, True, False)
@@ -53,7 +60,7 @@ class FrameOutcome(StrEnum):
 
     @property
     def rejected(self) -> bool:
-        """Whether the frame was rejected and the previous state is kept."""
+        """Whether the frame was rejected, so that the previous state is kept."""
         return self in (self.REJECTED_UNUSABLE, self.REJECTED_IMPLAUSIBLE, self.REJECTED_MISFIT)
 
     @property
@@ -68,7 +75,10 @@ class FrameOutcome(StrEnum):
 
 
 class AlarmKind(StrEnum):
-    """Subject of an alarm. The values are used on disk and in messages; see ``robust/alarms.py`` for the conditions."""
+    """Subject of an alarm. The values are stored on disk and used in messages.
+
+    ``robust/alarms.py`` contains the conditions for the alarms.
+    """
 
     CAMERA_LEFT_OUT = "camera_left_out"
     """Nothing was learnt from the camera: its image is missing or was excluded."""
@@ -92,12 +102,12 @@ class AlarmKind(StrEnum):
 
 @dataclass(frozen=True)
 class Alarm:
-    """Condition that needs a person's attention; an entry of a frame report.
+    """Condition that needs a person's attention. Alarms are entries of a frame report.
 
     Attributes:
         kind: subject of the alarm.
-        camera: affected camera, or None.
-        evidence: user-facing explanation with figures.
+        camera: affected camera, or None if the alarm does not concern a single camera.
+        evidence: explanation for the user, with figures.
     """
 
     kind: AlarmKind
@@ -106,10 +116,11 @@ class Alarm:
 
 
 class CameraTiming(TypedDict):
-    """Estimated capture time of a camera relative to the others; an entry of the report on disk.
+    """Estimated capture time of a camera relative to the other cameras, as stored in a report.
 
     Keys:
-        frames: delay relative to the median of all cameras, in frames; negative if the camera is early.
+        frames: delay relative to the median over cameras, in frames; negative if the camera is
+            early.
         error: standard error of the delay, in frames.
         out_of_step: whether the camera is clearly out of step.
     """
@@ -120,7 +131,7 @@ class CameraTiming(TypedDict):
 
 
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
-    """Returns the user-facing explanation of a degraded outcome, or None if the outcome is not degraded.
+    """Returns the explanation of a degraded outcome for the user, or None for other outcomes.
 
     >>> degraded_text(FrameOutcome.REJECTED_MISFIT, "the pictures are met at 12.0 dB")
     'previous state kept: the pictures are met at 12.0 dB'
@@ -137,10 +148,13 @@ partly a guess; above it, no other methods are needed (``first_frame.initial_poi
 
 
 def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
-    """Returns warnings if the initial points of frame 0 are unreliable, otherwise an empty list.
+    """Returns a list with a warning if the initial points of frame 0 are unreliable.
 
     Args:
-        cloud: record of a ``FirstCloud``, or None for all frames except the first.
+        cloud: fields of a ``FirstCloud``, or None for any frame except the first.
+
+    Returns:
+        The warning, or an empty list if the points are reliable or were supplied by the user.
 
     >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
@@ -162,7 +176,10 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
 
 
 def time_warnings(shortened: Sequence[str]) -> list[str]:
-    """Returns a list with a warning about steps of frame 0 that were cut for lack of time, or an empty list.
+    """Returns a list with a warning if steps of frame 0 were shortened for lack of time.
+
+    Args:
+        shortened: descriptions of the shortened steps; the list is empty if there are none.
 
     >>> time_warnings(["no stereo", "1500 of 3000 iterations"])[0][:75]
     'frame 0 did not have enough time: no stereo; 1500 of 3000 iterations; if it'
@@ -174,10 +191,10 @@ def time_warnings(shortened: Sequence[str]) -> list[str]:
 
 
 def grey_warnings(grey: Sequence[str]) -> list[str]:
-    """Returns a list with a warning about grayscale cameras among colour cameras, or an empty list.
+    """Returns a list with a warning if a rig of colour cameras contains grayscale cameras.
 
     Args:
-        grey: names of the grayscale cameras.
+        grey: names of the grayscale cameras; the list is empty if there are none.
 
     >>> grey_warnings(["left"])[0][:41]
     'grayscale cameras among colour ones: left'
@@ -191,10 +208,11 @@ def grey_warnings(grey: Sequence[str]) -> list[str]:
 
 
 def first_warnings(record: Mapping[str, Any]) -> list[str]:
-    """Returns the warnings in the report of the first frame, one sentence each.
+    """Returns all warnings about the first frame, as one sentence each.
 
     Args:
-        record: report as JSON, or only its entries ``cloud``, ``calibration``, ``shortened`` and ``grey``.
+        record: report of the first frame as JSON data. Only the entries ``cloud``, ``calibration``,
+            ``shortened`` and ``grey`` are used.
 
     >>> first_warnings({"calibration": {"warnings": ["camera 'a' is off"]}})
     ["camera 'a' is off"]
@@ -208,13 +226,17 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
 
 
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
-    """Returns a list with a warning about cameras that are clearly out of step, or an empty list.
+    """Returns a list with a warning if cameras are clearly out of step with the other cameras.
 
-    Being out of step is a lasting fault of the rig rather than of one frame. The scene status shows a constant message
-    while the fault lasts; the report has the figures, which change from frame to frame.
+    A camera that is out of step is a lasting fault of the rig, not of one frame. The text of the
+    warning therefore stays the same while the fault lasts. The measured delays, which change from
+    frame to frame, are in the report.
 
     Args:
-        timing: ``timing`` entry of the newest report, or None if it has none.
+        timing: ``timing`` entry of the newest report, or None if the report has no such entry.
+
+    Returns:
+        The warning, or an empty list if no camera is out of step.
 
     >>> in_step = {"frames": 0.02, "error": 0.03, "out_of_step": False}
     >>> late = {"frames": 0.41, "error": 0.03, "out_of_step": True}

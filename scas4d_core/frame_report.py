@@ -1,4 +1,4 @@
-"""Report of frame 0 or of an update, committed together with the state."""
+"""Reports of frames. The report of a frame is committed together with the state."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ class CurvePoint(TypedDict):
 
     Keys:
         iterations: number of completed iterations.
-        milliseconds: time since the start of the update, without decoding, in milliseconds.
+        milliseconds: time since the start of the update in milliseconds. The time for decoding the
+            images is not included.
         loss: mean training loss since the previous point.
     """
 
@@ -55,44 +56,52 @@ class CurvePoint(TypedDict):
 
 @dataclass(frozen=True)
 class FrameReport:
-    """Report of frame 0 or of the update of a frame.
+    """Report of the fit of frame 0, or of the update to a later frame.
 
     Attributes:
         index: index of the frame.
         time: time of the frame in seconds.
         iterations: number of iterations.
-        seconds: duration of each stage in seconds; ``report`` covers compiling this report and writing the previous
-            one.
-        loss: weighted loss of each iteration; for frame 0, at most ``REPORTED_LOSSES`` means.
-        psnr: mean PSNR in dB over the views of the last iterations, as rendered at that time; NaN if not measured.
+        seconds: duration of each stage in seconds. The stage ``report`` covers compiling this
+            report and writing the previous one.
+        loss: weighted loss of each iteration. For frame 0, losses are averaged in at most
+            ``REPORTED_LOSSES`` groups.
+        psnr: mean PSNR in dB over the last ``REPORTED_ITERATIONS`` rendered views, each measured
+            when the view was rendered; NaN if not measured.
         moving: number of moving Gaussians.
-        gaussians: number of present Gaussians.
-        cameras: quality of the match with each camera's image when last rendered; reveals cameras that were bumped.
+        gaussians: number of Gaussians that are not retired.
+        cameras: fit of each camera's image when last rendered. A poor fit may reveal a camera that
+            was bumped.
         used: cameras from which the update learnt; empty for a rejected or skipped frame.
         dropped: maps each excluded camera to the reason.
         outcome: outcome of the frame.
-        degraded: user-facing explanation of a degraded outcome, or None if the outcome is not degraded.
+        degraded: explanation of a degraded outcome for the user, or None for other outcomes.
         attempts: description and result of each attempt at the frame.
-        exposure: brightness of the frame relative to the lighting in which the colours were learnt. For a frame that
-            was not attempted, it is estimated from the mean image brightness. A lasting light change is learnt into the
-            colours.
-        frozen: number of individual Gaussians that keep their previous state.
-        guards: number of times each guard acted.
-        planned: (iteration, total iterations) for each time the stopping rule or the time limit of frame 0 changes the
-            total.
+        exposure: brightness of the frame relative to the lighting in which the colours were learnt.
+            For a frame without an attempt, the ratio is estimated from the mean image brightness.
+            After a lasting change of the lighting, the colours are adapted and the ratio is 1.
+        frozen: number of Gaussians that keep their previous state, because their new state is not
+            finite, bounded and plausible.
+        guards: number of times that each guard acted (``guards.py``), and number of axis lengths
+            clamped to their bounds (``axis_bounds``).
+        planned: (iteration, total iterations) for each change of the total by the stopping rule or
+            by the time limit of frame 0.
         curve: loss curve of the last attempt.
-        errors: mean image loss of each candidate on the probe views, for images without the ``exposure`` gain.
+        errors: mean image loss of each candidate on the probe views. The images are divided by the
+            ``exposure`` gain before the comparison.
         candidate: candidate that became the state; "previous" if the frame was rejected.
         born: number of Gaussians added in this frame.
         retired: number of Gaussians retired in this frame.
         revived: number of Gaussians revived in this frame.
-        postponed: descriptions of work that exceeded the time budget; the next frame has time for some of it.
+        postponed: descriptions of work for which the time budget was too short. Later frames do
+            some of this work.
         alarms: conditions that need attention (``robust/alarms.py``).
-        timing: estimated delay of each camera relative to the others, from all frames so far. Includes only cameras
-            whose delay is well determined by motion (``robust/timing.py``).
+        timing: estimated delay of each camera relative to the other cameras, averaged over this and
+            earlier frames. Cameras are included only if motion determines their delay well
+            (``robust/timing.py``).
         cloud: origin of the initial points; frame 0 only.
-        shortened: descriptions of steps for which ``StaticSettings.seconds`` was too short; frame 0 only. Small
-            reductions of the iterations appear only in ``planned``.
+        shortened: descriptions of steps for which ``StaticSettings.seconds`` was too short; frame 0
+            only. Small reductions of the iterations appear only in ``planned``.
         calibration: comparison of the calibration with the images; frame 0 only.
         grey: grayscale cameras in a rig that also has colour cameras; frame 0 only.
     """
@@ -131,14 +140,14 @@ class FrameReport:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about likely faults and steps cut for lack of time (``first_warnings``, ``timing_warnings``)."""
+        """Warnings of this report: those of ``first_warnings`` and ``timing_warnings``."""
         named = {"cloud": self.cloud, "calibration": self.calibration}
         given = {name: asdict(value) for name, value in named.items() if value is not None}
         first = first_warnings({**given, "shortened": self.shortened, "grey": self.grey})
         return [*first, *timing_warnings(self.timing)]
 
     def record(self) -> dict[str, Any]:
-        """Returns the report as JSON data; non-finite numbers become None."""
+        """Returns the report as JSON data, with None in place of non-finite numbers."""
         record: dict[str, Any] = _finite(asdict(self))
         return record
 
@@ -172,7 +181,7 @@ def report_of_first(
         moving: number of Gaussians in the hierarchy.
         seconds: duration of each stage in seconds.
         dropped: maps each camera excluded by the caller to the reason.
-        calibration: comparison of the calibration with the images, or None if not measured.
+        calibration: comparison of the calibration with the images, or None if there was none.
     """
     return FrameReport(
         index=frame.index,
@@ -208,14 +217,14 @@ def report_of_update(
     """Returns the report of an update.
 
     Args:
-        frame: the updated frame.
+        frame: frame to which the state was updated.
         result: update result to be committed.
         before: previously committed state.
-        left_out: maps each camera excluded by the first checks to the reason.
+        left_out: maps each camera excluded by the brightness check to the reason.
         names: names of the rig's cameras.
         watch: stopwatch with the stages "decode", "judge", "update" and optionally "presence".
         dropped: maps each camera excluded by the caller to the reason.
-        postponed: descriptions of work that exceeded the time budget.
+        postponed: descriptions of work for which the time budget was too short.
     """
     trace, gaussians = result.trace, result.gaussians
     began = perf_counter()
@@ -263,17 +272,22 @@ def report_of_update(
 
 
 def _last(psnr: Sequence[float]) -> float:
-    """Returns the mean PSNR in dB of the last rendered views."""
+    """Returns the mean PSNR in dB of the last ``REPORTED_ITERATIONS`` views, or NaN if empty."""
     return float(np.mean(psnr[-REPORTED_ITERATIONS:])) if psnr else nan
 
 
 def means(values: list[float], most: int) -> list[float]:
-    """Splits the values into at most ``most`` consecutive groups and returns their means."""
+    """Splits the values into at most ``most`` consecutive groups, and returns the group means."""
     return [float(np.mean(part)) for part in np.array_split(values, max(1, min(len(values), most))) if len(part)]
 
 
 def curve(losses: list[float], moments: list[float]) -> list[CurvePoint]:
-    """Returns the loss curve of an update, given each iteration's loss and its end time in seconds."""
+    """Returns the loss curve of an update.
+
+    Args:
+        losses: loss of each iteration.
+        moments: end of each iteration, in seconds since the start of the update.
+    """
     ends = np.unique(np.linspace(0, len(moments), CHECKPOINTS + 1).round().astype(int))
     return [
         CurvePoint(iterations=int(end), milliseconds=1000 * moments[end - 1], loss=float(np.mean(losses[begin:end])))

@@ -22,29 +22,31 @@ UNBORN = -1
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians at one point in time. Rows identify Gaussians: row i is the same piece of matter in every frame.
+    """N Gaussians at one point in time.
 
-    New Gaussians are appended (``concatenate``). A Gaussian that leaves the scene is retired but keeps its row, so it
-    can return with the same identity. A retired Gaussian is not rendered, does not move and does not count as moving.
+    A Gaussian is identified by its row: row i is the same piece of matter in every frame. New
+    Gaussians are appended (``concatenate``). A Gaussian that leaves the scene is retired but keeps
+    its row, so it can return with the same identity. A retired Gaussian is not rendered, does not
+    move and does not count as moving.
 
     Attributes:
         means: [N, 3] float32 centres in metres, in the internal world.
-        factors: [N, 3, 3] float32 factors F of the covariances Σ = F Fᵀ; the columns are the transported axes in
-            metres.
-        rotations: [N, 4] float32 unit quaternions (w, x, y, z) of the material rotation since frame 0, or since the
-            Gaussian was added.
-        opacities: [N] float32 opacities as rendered: 0 for retired Gaussians, otherwise in (0, 1). Fixed after a
-            Gaussian's first frame.
+        factors: [N, 3, 3] float32 factors F of the covariances Σ = F Fᵀ. The columns of F are axes
+            in metres, which the motion transforms.
+        rotations: [N, 4] float32 unit quaternions (w, x, y, z) of the rotation of the material
+            since frame 0, or since the Gaussian was added.
+        opacities: [N] float32 opacities as rendered: 0 for retired Gaussians, otherwise in (0, 1).
         colours: [N, 3] float32 RGB colours, nominally 0…1, without any gloss.
-        foreground: [N] float32 learnt labels in 0…1; a Gaussian moves if its label is above 0.5.
-        ids: [N] int64 permanent ids; −1 until a Gaussian's first frame is committed.
+        foreground: [N] float32 learnt labels in 0…1. A Gaussian moves if its label is above 0.5.
+        ids: [N] int64 permanent ids, or −1 for Gaussians that have not been committed yet.
         retired: [N] bool, true for retired Gaussians; defaults to all false.
-        own_opacities: [N] float32 opacities in (0, 1), without the zeros of retired Gaussians; derived from
-            ``opacities``.
-        gloss: [M, 3] float32 world-space normals of the first M Gaussians, scaled by reflection strength; Gaussians
-            added later have no gloss. None if colours do not depend on the viewing direction.
-        environment: [ROWS, 3] float32 reflected environment (``kernels.appearance.direction``). None if colours do not
-            depend on the viewing direction.
+        own_opacities: [N] float32 opacities in (0, 1), also of retired Gaussians; defaults to
+            ``opacities``. They do not change after the first frame of a Gaussian.
+        gloss: [M, 3] float32 normals of the first M Gaussians in the internal world, scaled by the
+            strength of the reflection. Gaussians in later rows have no gloss. None if colours do
+            not depend on the viewing direction.
+        environment: [ROWS, 3] float32 reflected environment (``kernels.appearance.direction``).
+            None if colours do not depend on the viewing direction.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [0.5, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> len(state), state.moving
@@ -75,13 +77,13 @@ class Gaussians:
         own = self.opacities if self.own_opacities is None else self.own_opacities
         shown = np.where(retired, np.float32(0), own) if retired.any() else own
         if shown is not own and np.array_equal(shown, self.opacities):
-            shown = self.opacities  # the same array, so that a device copy of it remains usable
+            shown = self.opacities  # the same array object, so that its copy on a GPU stays valid
         for name, array in (("retired", retired), ("own_opacities", own), ("opacities", shown)):
             object.__setattr__(self, name, array)
 
     @classmethod
     def of_points(cls, points: ArrayLike, radius: float, colours: ArrayLike = 0.5) -> Gaussians:
-        """Returns isotropic moving Gaussians, one per point, for hand-made scenes.
+        """Returns one isotropic moving Gaussian per point, for hand-made scenes.
 
         Args:
             points: [N, 3] centres in metres, in the internal world.
@@ -108,9 +110,10 @@ class Gaussians:
         return np.concatenate([colours, self.foreground[:, None]], axis=1)
 
     def replace(self, **changes: Any) -> Gaussians:
-        """Returns a copy with some arrays replaced; the others are shared. ``opacities`` also sets ``own_opacities``.
+        """Returns a copy with some arrays replaced. The copy shares the other arrays.
 
-        If no Gaussian is retired, all arrays may be replaced by arrays with a different number of rows.
+        A value for ``opacities`` also replaces ``own_opacities``. If no Gaussian is retired, all
+        arrays may be replaced by arrays with a different number of rows.
         """
         if "opacities" in changes:
             changes["own_opacities"] = changes["opacities"]
@@ -125,7 +128,7 @@ class Gaussians:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[N] bool, true for Gaussians whose label is above 0.5; false for retired ones."""
+        """[N] bool, true for Gaussians that are not retired and whose label is above 0.5."""
         moving: NDArray[np.bool_] = (self.foreground > 0.5) & ~self.retired
         return moving
 
@@ -142,16 +145,25 @@ class Gaussians:
         return replace(self, gloss=gloss, **{name: array[chosen] for name, array in self._by_row().items()})
 
     def concatenate(self, born: Gaussians) -> Gaussians:
-        """Returns the state with new Gaussians appended; they get ids when the frame is committed."""
+        """Returns the state with new Gaussians appended.
+
+        The new Gaussians get their ids when the frame is committed.
+
+        Args:
+            born: new Gaussians; their ids, gloss and environment are ignored.
+        """
         others = {**born._by_row(), "ids": np.full(len(born), UNBORN, np.int64)}
         return replace(self, **{name: np.concatenate([own, others[name]]) for name, own in self._by_row().items()})
 
     def retire(self, rows: ArrayLike) -> Gaussians:
-        """Returns the state with the given rows ([N] bool mask, or indices) retired."""
+        """Returns the state in which the given rows ([N] bool mask, or indices) are retired."""
         return self._with_retired(rows, True)
 
     def revive(self, rows: ArrayLike) -> Gaussians:
-        """Returns the state with the given retired rows ([N] bool mask, or indices) restored unchanged."""
+        """Returns the state in which the given rows ([N] bool mask, or indices) are not retired.
+
+        The other values of these rows do not change.
+        """
         return self._with_retired(rows, False)
 
     def _with_retired(self, rows: ArrayLike, value: bool) -> Gaussians:
@@ -166,8 +178,8 @@ class Gaussians:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Returns the arrays for files and messages, keyed by field name.
 
-        ``opacities`` are the unmasked ``own_opacities``. ``retired`` is omitted if no Gaussian is retired, and so are
-        fields that are None.
+        ``opacities`` contains ``own_opacities``, which also has values for retired Gaussians.
+        ``retired`` is omitted if no Gaussian is retired. Fields that are None are omitted.
         """
         arrays_by_name = {item.name: getattr(self, item.name) for item in fields(self)}
         arrays_by_name["opacities"] = arrays_by_name.pop("own_opacities")
@@ -198,7 +210,14 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
 
 
 def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
-    """Converts unit quaternions [4, ...], one array per component, to rotation matrices: 3 rows of 3 arrays [...]."""
+    """Converts unit quaternions to rotation matrices, component by component.
+
+    Args:
+        quaternion: [4, ...] components w, x, y and z.
+
+    Returns:
+        3 rows of 3 arrays [...], the entries of the matrices.
+    """
     w, x, y, z = quaternion
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -208,12 +227,18 @@ def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
 
 
 def quaternion_products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Returns the quaternion products a∘b, [M, 4] (w, x, y, z), where b is applied first."""
+    """Returns the quaternion products a∘b, [M, 4] (w, x, y, z), which apply rotation b first."""
     return np.stack(product_components(a.T, b.T), axis=1)
 
 
 def turned_rotations(rotations: NDArray[Any], rows: NDArray[np.int64], turns: NDArray[Any]) -> NDArray[Any]:
-    """Returns a copy of unit quaternions [N, 4] with the given rows [M] rotated by ``turns`` [M, 4] (w, x, y, z)."""
+    """Returns a copy of unit quaternions in which some rows are rotated further.
+
+    Args:
+        rotations: [N, 4] unit quaternions (w, x, y, z).
+        rows: [M] rows to rotate.
+        turns: [M, 4] quaternions (w, x, y, z), which are applied after ``rotations``.
+    """
     made = rotations.copy()
     turned = quaternion_products(turns, rotations[rows])
     made[rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
@@ -221,7 +246,16 @@ def turned_rotations(rotations: NDArray[Any], rows: NDArray[np.int64], turns: ND
 
 
 def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
-    """Returns the components (w, x, y, z), [M] each, of a∘b for quaternions [4, M], where b is applied first."""
+    """Returns the quaternion products a∘b, component by component.
+
+    The products apply the rotation b first.
+
+    Args:
+        a, b: [4, M] components w, x, y and z.
+
+    Returns:
+        The components w, x, y and z of the products, [M] each.
+    """
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return [
@@ -233,12 +267,14 @@ def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def moving_extent(gaussians: Gaussians) -> float:
-    """Returns the longest side, in metres, of the box spanned by the central 98 % of moving Gaussians along each axis.
+    """Returns the extent of the moving Gaussians in metres.
 
-    If no Gaussian is moving, all present Gaussians are used; if none is present, all Gaussians are used.
+    The extent is the longest side of a box that contains the central 98 % of the centres along each
+    axis. A few stray Gaussians therefore hardly affect the result. If no Gaussian moves, all Gaussians
+    that are not retired are used. If all Gaussians are retired, all of them are used.
 
-    Tolerances and features use the extent as their unit, so that they do not depend on the scene size. A few stray
-    Gaussians hardly affect it.
+    Tolerances and features use the extent as their unit, so that they do not depend on the size of
+    the scene.
 
     >>> points = np.linspace(0, 1, 101)[:, None] * [2, 1, 0]
     >>> round(moving_extent(Gaussians.of_points(points, 0.01)), 3)

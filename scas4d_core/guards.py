@@ -1,11 +1,12 @@
-"""Tables of every clamp, floor and epsilon in the arithmetic of the core, with name, value, unit and reason.
+"""Numerical constants of the core: every clamp, floor and epsilon, with its value, unit and reason.
 
-There are two tables. A *guard* acts only when a value would become non-finite. Each action is counted, so that a guard
-cannot hide a fault. A *convention* is part of the method: it always acts and is not counted. Kernels import the values;
-``kernels.cache`` recompiles them when a value changes.
+There are two tables of constants. A *guard* acts only when a value would otherwise become
+non-finite, undefined or denormal. Every action of a guard is counted, so that guards cannot hide a
+fault. A *convention* is part of the method: it always acts, and its actions are not counted.
+Kernels import the values, and ``kernels.cache`` recompiles the kernels when a value changes.
 
-``scripts/bench stability`` runs the catalogue of hard cases and documents both tables. With ``--mutate``, it disables
-each entry in turn to find the cases that then fail.
+``scripts/bench stability`` runs a catalogue of hard cases and documents both tables. With
+``--mutate``, the command disables each constant in turn, and reports the cases that then fail.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ class Guard:
     Attributes:
         name: key of the entry and of its count.
         value: value of the constant, in ``unit``.
-        without: value that disables the guard, or NaN if disabling it requires a different change.
+        without: value that disables the guard, or NaN if the code must be changed to disable it.
         unit: unit of the value.
         where: files in ``scas4d_core`` that use the constant.
-        reason: effect and purpose of the guard; the first clause describes the effect.
-        counted: what is counted; for a convention, the reason why nothing is counted.
+        reason: effect and purpose of the guard. The first clause describes the effect.
+        counted: description of what is counted; for a convention, where or when it acts.
     """
 
     name: str
@@ -237,10 +238,10 @@ SMALLEST_SQUARE = _convention(
 
 
 class GuardCounts(Mapping[str, int]):
-    """Number of actions of each guard since the last ``reset``.
+    """Number of times that each guard has acted since the last ``reset``.
 
     Args:
-        names: names of the guards and observed events to count.
+        names: names of the guards and of the observed events (``OBSERVED``) to count.
 
     >>> counts = GuardCounts("gradient_ceiling", "moment_floor")
     >>> counts.add(("gradient_ceiling", "moment_floor"), np.array([[2, 0], [1, 5]]))  # from two tasks
@@ -255,7 +256,12 @@ class GuardCounts(Mapping[str, int]):
         self._counts = dict.fromkeys(names, 0)
 
     def add(self, names: Sequence[str], guard_counts: NDArray[np.int64]) -> None:
-        """Adds the counts of a kernel, [tasks, names] or [names], to the named guards."""
+        """Adds the counts returned by a kernel.
+
+        Args:
+            names: names of the counted guards and events.
+            guard_counts: counts, [tasks, names] or [names].
+        """
         counts = guard_counts.reshape(-1, len(names)).sum(axis=0)
         for name, count in zip(names, counts.tolist(), strict=True):
             self._counts[name] += count
@@ -285,7 +291,7 @@ OBSERVED = {
 
 
 def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Returns the sum of several counts for each name."""
+    """Returns the sum of several mappings from names to counts."""
     total: dict[str, int] = {}
     for each in counts:
         for name, count in each.items():

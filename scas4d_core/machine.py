@@ -1,4 +1,4 @@
-"""Facts about the machine."""
+"""Number of processor cores that this process may use."""
 
 from __future__ import annotations
 

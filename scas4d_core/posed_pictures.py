@@ -1,4 +1,7 @@
-"""Images with camera poses, and visibility, occlusion and colours of points in several images. Requires only NumPy."""
+"""Images of calibrated cameras, and the visibility and colours of 3D points in several images.
+
+This module requires only NumPy.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ BLOCK = 32_768
 
 
 class InitialPointsError(ValueError):
-    """Raised if a point cloud cannot be computed; the message names the field, the value and the remedy."""
+    """Raised if initial points cannot be computed. The message names the problem and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +44,16 @@ class PosedPicture:
 def collect_views(
     rig: Rig, images: Mapping[str, NDArray[np.uint8]], masks: Mapping[str, NDArray[np.uint8]]
 ) -> list[PosedPicture]:
-    """Returns the views of all cameras that have an image, in rig order.
+    """Returns the images of all cameras that have one, with their cameras, in rig order.
+
+    Args:
+        rig: calibrated cameras in the user's world, at the size of the images.
+        images: maps camera names to images, [H, W, 3] uint8.
+        masks: maps camera names to masks, [H, W], non-zero on the foreground; may be empty.
 
     Raises:
-        InitialPointsError: if there are fewer than two images, or an image or mask does not have its camera's size.
+        InitialPointsError: if there are fewer than two images, or an image or a mask does not have
+            the size of its camera.
     """
     views = []
     for camera in rig.cameras:
@@ -70,14 +79,18 @@ def collect_views(
 
 
 def halved(view: PosedPicture, width: int) -> PosedPicture:
-    """Returns the view downscaled by factors of two until it is at most ``width`` pixels wide."""
+    """Halves the size of a view repeatedly until its image is at most ``width`` pixels wide.
+
+    A pixel of the smaller mask is foreground if any of its four original pixels is foreground.
+    """
     image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
     while camera.width > width and camera.width >= 2 and camera.height >= 2:
         h, w = camera.height // 2 * 2, camera.width // 2 * 2
         image = image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
         if mask is not None:
             mask = np.asarray(mask[:h, :w].reshape(h // 2, 2, w // 2, 2).any((1, 3)), dtype=np.bool_)
-        # With 2 × 2 blocks and pixel centres at +0.5, every pixel coordinate is halved exactly, even for odd sizes.
+        # The blocks of 2 × 2 pixels start at the upper left corner, and pixel centres are at +0.5.
+        # Every pixel coordinate is therefore halved exactly, even for odd sizes.
         matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
         camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
     return PosedPicture(camera, np.rint(image).astype(np.uint8), mask)
@@ -92,7 +105,10 @@ class Posed(Protocol):
 
 
 def look_at_point(views: Sequence[Posed]) -> Float:
-    """Returns the [3] point nearest to all optical axes (least squares): the centre of an inward-looking rig."""
+    """Returns the [3] point nearest to all optical axes, in the least-squares sense.
+
+    For a rig of inward-looking cameras, this point is at the centre of the observed scene.
+    """
     axes = np.array([view.camera.rotation[2] for view in views])
     centres = np.array([view.camera.centre for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -102,10 +118,12 @@ def look_at_point(views: Sequence[Posed]) -> Float:
 
 
 def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float, Bool]:
-    """Projects world points [P, 3] to whole pixels of an image.
+    """Returns the pixel of an image to which each world point [P, 3] projects.
 
     Returns:
-        Column and row [P] of each point (0 if outside the image), its depth [P], and whether it is inside [P].
+        Four arrays [P]: the column and the row of each point (0 if the point is outside the image),
+        the depth of the point, and whether the point is in front of the camera and inside the
+        image.
     """
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
@@ -121,19 +139,20 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 
     Args:
         camera: viewing camera.
-        occluders: [M, 3] world positions of discs with a diameter of ``spacing`` or one pixel, whichever is larger.
+        occluders: [M, 3] world positions of discs, whose diameter is ``spacing`` or one pixel,
+            whichever is larger.
         spacing: distance between neighbouring occluders, in world units.
         points: [P, 3] world positions of the points.
 
     Returns:
-        [P] depths, infinite if nothing occludes the point or the point is outside the image.
+        [P] depths; infinite if the pixel has no occluder, or the point is outside the image.
     """
     front = np.full(len(points), np.inf)
     column, line, depth, inside = pixels_inside(camera, occluders)
     if not inside.any():
         return front
-    # Cells are two discs wide. Each contains a point of every surface that covers it, and slopes hardly change within
-    # it.
+    # The image is divided into cells that are two discs wide. A cell contains a point of every
+    # surface that covers the cell, and is so small that the depth of a slope hardly varies.
     cell = 2.0 * max(1.0, camera.fx * spacing / float(np.median(depth[inside])))
     shape = (int(camera.height / cell) + 1, int(camera.width / cell) + 1)
     nearest = np.full(shape, np.inf)
@@ -146,13 +165,20 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 
 
 def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
-    """Returns the visibility of points [P, 3] in each view; the points themselves are the occluders.
+    """Returns whether each point is visible in each view.
 
-    A point is hidden if it is more than four disc diameters behind the nearest point; see ``front_depth``. Surfaces
-    seen at more than about 60 degrees from their normal may count as hidden, but their colour is unreliable anyway.
+    The points themselves are the occluders. A point is hidden if it is more than four disc
+    diameters behind the nearest point at its pixel; see ``front_depth``. A surface that is seen at
+    more than about 60 degrees from its normal may count as hidden. The colour of such a surface is
+    unreliable anyway.
+
+    Args:
+        views: V views.
+        points: [P, 3] world positions of the points.
+        spacing: distance between neighbouring points, in world units.
 
     Returns:
-        [V, P] mask, which is also false if the point projects outside the image.
+        [V, P] bool; false also for points that project outside the image.
     """
     visible = np.zeros((len(views), len(points)), dtype=bool)
     for row, view in zip(visible, views, strict=True):
@@ -164,11 +190,12 @@ def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -
 
 @dataclass(frozen=True, eq=False)
 class PointColours:
-    """Colours of points, combined over all cameras that see them.
+    """Colours of points, combined over all cameras that see each point.
 
     Attributes:
-        colours: [P, 3] float32 median RGB over these cameras, 0…1.
-        spread: [P] median absolute deviation of the colours, maximum over channels, 0…1.
+        colours: [P, 3] float32 median RGB over the cameras that see the point, 0…1.
+        spread: [P] median absolute deviation from ``colours`` over these cameras, 0…1. The channel
+            with the largest deviation counts.
         count: [P] number of cameras that see each point.
     """
 
@@ -178,8 +205,16 @@ class PointColours:
 
 
 def observe(views: Sequence[PosedPicture], points: Float, visible: Bool) -> PointColours:
-    """Returns the colours of points [P, 3], given their visibility [V, P]; NaN for points that no camera sees."""
-    if len(points) > BLOCK:  # limits the memory of the samples
+    """Returns the colours of points in several views.
+
+    Points that no camera sees have the colour NaN.
+
+    Args:
+        views: V views.
+        points: [P, 3] world positions of the points.
+        visible: [V, P] bool, whether each point is visible in each view.
+    """
+    if len(points) > BLOCK:  # points are processed in blocks, to limit the memory of the samples
         blocks = [slice(start, start + BLOCK) for start in range(0, len(points), BLOCK)]
         parts = [observe(views, points[block], visible[:, block]) for block in blocks]
         return PointColours(

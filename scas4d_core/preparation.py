@@ -1,8 +1,10 @@
-"""Prepares the updates of a scene: clusters and neighbours of moving Gaussians, and the components of active effects.
+"""Prepares the updates of a scene.
 
-They are rebuilt when more Gaussians are found to move, when an effect is switched on or off, and when Gaussians are
-added or retired. They are built from the scene's *roots*: Θ_0 plus the Gaussians added since, at the positions they
-would have had in frame 0.
+An update needs the clusters and neighbours of the moving Gaussians, and the components of the
+active effects. These are rebuilt when more Gaussians are found to move and when an effect is
+switched on or off. They are also rebuilt when Gaussians are added, retired or revived. Clusters
+and neighbours are computed from the *roots* of the scene: Θ_0 plus all Gaussians added since, at
+the positions that the added Gaussians would have had in frame 0.
 """
 
 from __future__ import annotations
@@ -65,12 +67,14 @@ MAX_BORN_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class PreparedUpdate:
-    """Input of the next update in addition to Θ_{t−1}, always replaced as a whole.
+    """Everything that the next update needs in addition to Θ_{t−1} and the images.
+
+    Objects of this class are never changed in place. A scene replaces the whole object.
 
     Attributes:
         updater: updater with the active effects.
         carried: state carried over from the previous update.
-        roots: Θ_0 plus the Gaussians added since.
+        roots: Θ_0 plus all Gaussians added since, as of frame 0.
     """
 
     updater: FrameUpdate
@@ -83,12 +87,12 @@ class PreparedUpdate:
         return self.updater.plan
 
     def with_carry_over(self, **changes: Any) -> PreparedUpdate:
-        """Returns a copy in which the given fields of the carry-over are replaced."""
+        """Returns a copy in which the given fields of ``carried`` are replaced."""
         return replace(self, carried=replace(self.carried, **changes))
 
 
 class Preparation:
-    """Prepares the updates of a scene.
+    """Builder of the input of updates (``PreparedUpdate``) for one scene.
 
     Args:
         factory: factory of the scene's views.
@@ -107,11 +111,15 @@ class Preparation:
             self._scene = self._scene.model_copy(update={"floor": floor_inside(self._scene.floor, world)})
 
     def first_frame_effects(self, frame: Frame, result: StaticResult) -> tuple[dict[str, Switch], dict[str, Arrays]]:
-        """Returns the switches of the effects after the first frame, and the arrays that the effects keep from it.
+        """Decides which effects the first frame switches on.
 
         Args:
             frame: first frame, at the resolution of the rig.
             result: fit of the first frame.
+
+        Returns:
+            The switches of the effects after the first frame, and the arrays of this frame that the
+            effects need in later frames. Both are keyed by effect name.
         """
         switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
@@ -125,11 +133,12 @@ class Preparation:
     ) -> list[TrainingView]:
         """Returns the views of a frame, with the current estimates of camera poses and exposures.
 
-        Masks are not read if no term uses them.
+        Masks are only read if a loss term uses them.
 
         Args:
             frame: frame at its original resolution.
-            fixed: maps each camera to its [3, 2] colour gain and offset, as estimated in frame 0.
+            fixed: maps each camera name to the [3, 2] gain and offset of its colour channels, as
+                estimated in frame 0.
             prepared: current input of the next update.
 
         Raises:
@@ -141,48 +150,62 @@ class Preparation:
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
     def rebuild(self, roots: Gaussians, carried: CarryOver) -> PreparedUpdate:
-        """Rebuilds the input of the next update; carried-over motion is dropped if the clusters have changed.
+        """Rebuilds the input of the next update.
+
+        If the clusters or neighbours have changed, the motion in ``carried`` does not apply to them
+        and is dropped.
 
         Args:
-            roots: Θ_0 plus all Gaussians added since.
+            roots: Θ_0 plus all Gaussians added since, as of frame 0.
             carried: state carried over from the previous update.
         """
-        # no switches are carried over if a report was lost
+        # If a report was lost, switches may be missing in ``carried``.
         known = {**first_switches(self._settings, 0), **carried.switches}
         switches = {
             name: replace(switch, on=switch.on and effect(name).refusal(self._settings) is None)
             for name, switch in known.items()
         }
-        carried = replace(carried, switches=switches)  # a replay may use other settings than the scene
+        # An effect that was on may now be refused, because a replay may use other settings.
+        carried = replace(carried, switches=switches)
         updater, structure = self._updater(with_labels(roots, carried.labels), switches)
         if carried.structure != structure:
             carried = replace(carried, motion=None, structure=structure)
         return PreparedUpdate(updater, carried, roots)
 
     def _updater(self, roots: Gaussians, switches: Switches) -> tuple[FrameUpdate, int]:
-        """Returns the updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
+        """Builds an updater on the engine of ``settings.device``.
 
         Args:
             roots: roots with the current labels of moving Gaussians.
             switches: on/off state of each effect.
+
+        Returns:
+            The updater, and the digest of its clusters and neighbours.
         """
         hierarchy = self._clusters(roots)
         builder = PlanBuilder(self._scene, self._settings.update, self._factory, hierarchy, roots)
         built = register_effects(builder, names_on(switches))
-        if not built.plan.freedom.clusters:  # no cluster moves, so the cascade is not needed
+        if not built.plan.freedom.clusters:  # clusters are not needed if no effect moves them
             hierarchy = built.hierarchy = hierarchy.without_layers
         neighbours = self._neighbour_graph(roots, hierarchy) if built.plan.neighbour_terms else None
         updater = FrameUpdate(engine_of(resolve_device(self._settings.device)), built, neighbours)
         return updater, digest(hierarchy, neighbours)
 
     def _neighbour_graph(self, roots: Gaussians, hierarchy: Hierarchy) -> Neighbours:
-        """Returns the neighbour graph of the current hierarchy."""
+        """Returns the neighbour graph of the current hierarchy, and builds it if necessary."""
         if self._neighbours is None:
             self._neighbours = build_neighbours(roots.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
         return self._neighbours
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
-        """Returns the hierarchy of the moving Gaussians; rebuilds it, and its neighbours, only after changes."""
+        """Returns the hierarchy of the moving Gaussians.
+
+        The hierarchy is rebuilt only if positions or labels of ``first`` have changed. The
+        neighbour graph is then discarded, because its indices refer to the hierarchy.
+
+        Args:
+            first: roots with the current labels of moving Gaussians.
+        """
         made = self._hierarchy_inputs
         if made is None or not all(map(np.array_equal, made, (first.means, first.moving))):
             update = self._settings.update
@@ -193,11 +216,12 @@ class Preparation:
     def learn_labels(
         self, prepared: PreparedUpdate, newest: Gaussians, believed: Sequence[TrainingView]
     ) -> PreparedUpdate:
-        """Rebuilds the update with newly detected moving Gaussians, for scenes without masks.
+        """Detects moving Gaussians in a scene without masks.
 
-        A Gaussian that has moved once stays in the hierarchy. The labels become part of the state when the frame is
-        committed. Changed labels produce a new hierarchy to which the previous motion does not apply, so the update is
-        a cold start.
+        If there are new moving Gaussians, the input of the update is rebuilt.
+        A Gaussian that has moved once stays in the hierarchy. The labels become part of the state
+        when the frame is committed. New labels result in a new hierarchy. The previous motion does
+        not apply to the new hierarchy, so the update is a cold start.
 
         Args:
             prepared: current input of the next update.
@@ -213,12 +237,15 @@ class Preparation:
     def after_frame(
         self, prepared: PreparedUpdate, seen: FrameObservation, may_change_population: bool
     ) -> tuple[UpdateResult, PreparedUpdate]:
-        """Returns the final result of a frame that was learnt, and the input of the next update.
+        """Adds and retires Gaussians after an update, and prepares the next update.
 
         Args:
             prepared: input of the update that produced the result.
             seen: observation of the frame, with the result of its update.
-            may_change_population: whether Gaussians may be added or retired.
+            may_change_population: whether Gaussians may be added, retired or revived.
+
+        Returns:
+            The final result of the frame, and the input of the next update.
         """
         on, seen = names_on(prepared.carried.switches), record_arrays(prepared.carried.switches, self._settings, seen)
         switches = decide_switches(prepared.carried.switches, self._settings, seen)
@@ -235,14 +262,16 @@ class Preparation:
         return result, prepared
 
     def add_and_retire_gaussians(self, names: Sequence[str], seen: FrameObservation) -> UpdateResult:
-        """Applies the effects that add, retire or revive Gaussians to a result; non-finite results are skipped.
+        """Applies the effects that add, retire or revive Gaussians to the result of an update.
+
+        The changes of an effect are ignored if its result contains values that are not finite.
 
         Args:
             names: names of the effects that took part in the update.
             seen: observation of the frame, with the result of its update.
 
         Raises:
-            ValueError: if an effect changed rows in a way that is not allowed.
+            ValueError: if an effect removed or reordered rows, or returned invalid parents.
         """
         for name in names:
             one = effect(name)
@@ -256,14 +285,17 @@ class Preparation:
         return seen.result
 
     def _is_motion(self, result: UpdateResult) -> bool:
-        """Returns whether the difference between the two states is a motion rather than a jump."""
+        """Returns whether the motion of a frame may be used for the next warm start.
+
+        The result is false for a relocated object, which jumped instead of moving.
+        """
         return self._settings.update.cluster_map == "centred" and result.outcome is not FrameOutcome.RELOCATED
 
 
 def _with_changed_rows(
     prepared: PreparedUpdate, before: Gaussians, result: UpdateResult, other_rows: bool
 ) -> PreparedUpdate:
-    """Extends the roots, labels and effect arrays to match the Gaussians of a result.
+    """Extends roots, labels and effect arrays after Gaussians were added, retired or revived.
 
     Args:
         prepared: input of the next update.
@@ -285,7 +317,13 @@ def _with_changed_rows(
 
 
 def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: UpdateResult) -> PreparedUpdate:
-    """Adds the motion from the previous to the new state, expressed per cluster of the updater."""
+    """Adds the motion from the previous to the new state, expressed in the clusters of the updater.
+
+    Args:
+        prepared: input of the next update, without motion.
+        seen: observation of the frame, with the result before Gaussians were added and retired.
+        result: final result of the frame.
+    """
     if seen.result.motion is None:
         return prepared
     before, now, hierarchy = seen.result.gaussians, result.gaussians, prepared.updater.hierarchy
@@ -296,7 +334,7 @@ def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: Updat
 
 
 def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
-    """Raises ``ValueError`` if an effect changed rows that it must not change."""
+    """Raises ``ValueError`` if an effect removed or reordered rows, or returned invalid parents."""
     count, born = len(before.gaussians), len(after.gaussians) - len(before.gaussians)
     kept = born >= 0 and np.array_equal(after.gaussians.ids[:count], before.gaussians.ids)
     if not kept or (after.gaussians.ids[count:] != UNBORN).any():
@@ -311,7 +349,16 @@ def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
 
 
 def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
-    """Returns an effect's array, with rows appended for added Gaussians if it has one row per Gaussian."""
+    """Appends rows for added Gaussians to an array of an effect.
+
+    The row of an added Gaussian is a copy of its parent's row, or zero without a parent. An array
+    that does not have one row per Gaussian is returned unchanged.
+
+    Args:
+        array: array of the effect.
+        count: number of Gaussians before any were added.
+        parents: [B] row of each added Gaussian's parent, or None if no Gaussian was added.
+    """
     if parents is None or not array.ndim or len(array) != count:
         return array
     rows = array[np.maximum(parents, 0)]
@@ -320,7 +367,7 @@ def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | N
 
 
 def room_for_births(first: int, now: int) -> int:
-    """Returns the number of Gaussians that may still be added.
+    """Returns the number of Gaussians that may still be added to a scene.
 
     Args:
         first: number of Gaussians in frame 0.

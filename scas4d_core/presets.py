@@ -33,21 +33,23 @@ OURS = (
 
 
 def _pinned(on: Iterable[str] = (), off: Iterable[str] = ()) -> dict[str, Mode]:
-    """Returns effect modes in the form of ``Settings.effects``."""
+    """Returns the modes of some effects, as for ``Settings.effects``."""
     return {**dict.fromkeys(on, "on"), **dict.fromkeys(off, "off")}
 
 
 PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
-    # Half the iterations after the first motion, and none if nothing has moved (docs/accuracy-and-time.md).
+    # Half the iterations of the default, except in a cold start, and no iterations if nothing has
+    # moved (docs/accuracy-and-time.md).
     "adaptive": Settings(update=UpdateSettings(iterations=50, cold_start_iterations=6.0, skip_tolerance=0.02)),
-    # Even fewer iterations and a third of the Gaussians; takes a third of the default's time.
+    # Fewer iterations than "adaptive", and 30 % of the Gaussians. An update takes about 30 % of the
+    # time of the default.
     "fast": Settings(
         static=StaticSettings(detail=0.3),
         update=UpdateSettings(iterations=45, cold_start_iterations=6.0, skip_tolerance=0.02),
     ),
-    # The paper's choices instead of this project's (docs/method.md); learning rates that the paper does not specify are
-    # ours.
+    # The choices of the paper instead of those of this project (docs/method.md). Learning rates
+    # that the paper does not specify are those of this project.
     "paper": Settings(
         update=UpdateSettings(
             cluster_map="published",
@@ -81,8 +83,9 @@ PRESETS: dict[str, Settings] = {
         ),
         effects=_pinned(on=("static_colour",), off=OURS),
     ),
-    # Presets for kinds of scenes: some effects are pinned, all others are "auto"; weights and rates are unchanged
-    # (docs/effects.md). Pin a new effect here if a kind of scene always or never needs it.
+    # Presets for kinds of scenes (docs/effects.md). Some effects are pinned, and all others are
+    # "auto". Weights and rates are those of the default. If a kind of scene always or never needs a
+    # new effect, pin the effect in the preset of this kind.
     "rigid": Settings(effects=_pinned(on=TIES, off=("cluster_scaling", "own_rotation", "own_scale"))),
     "articulated": Settings(effects=_pinned(on=("cluster_rotation", "own_position", *TIES))),
     "cloth": Settings(effects=_pinned(on=("bending", "cluster_scaling", "isometry", "own_position"))),
@@ -113,7 +116,11 @@ class SettingError(InputError):
 
 
 def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
-    """Returns the preset ``name`` after applying changes (nested mappings); later changes take precedence.
+    """Returns the settings of a preset, with changes.
+
+    Args:
+        name: name of the preset.
+        changes: nested mappings of settings to change. Later mappings take precedence.
 
     Raises:
         SettingError: if the preset or a setting does not exist, a value is out of range, or effects contradict each
@@ -131,7 +138,11 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
 
 
 def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
-    """Returns the settings after applying changes (nested mappings); later changes take precedence.
+    """Returns the settings with changes.
+
+    Args:
+        settings: settings to start from.
+        changes: nested mappings of settings to change. Later mappings take precedence.
 
     Raises:
         SettingError: if a setting does not exist, a value is out of range, or effects contradict each other.
@@ -154,7 +165,7 @@ def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Merges two nested mappings; values in ``changes`` take precedence."""
+    """Returns the union of two nested mappings, in which values of ``changes`` take precedence."""
     result = dict(base)
     for name, value in changes.items():
         old = result.get(name)
@@ -163,7 +174,11 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
 
 
 def _setting_error(error: ValidationError) -> SettingError:
-    """Converts the first validation error; for an unknown name, the remedy suggests the most similar setting."""
+    """Converts a pydantic error to a ``SettingError``.
+
+    If the pydantic error lists several faults, only the first is described in detail.
+    For an unknown setting, the remedy suggests the setting with the most similar name.
+    """
     details = error.errors(include_url=False)
     first = details[0]
     setting = _place(first["loc"])
@@ -185,12 +200,15 @@ def _setting_error(error: ValidationError) -> SettingError:
 
 
 def _place(loc: Iterable[int | str]) -> str:
-    """Returns the dotted name of a setting, such as ``scene.background.2``."""
+    """Converts a location in a pydantic error to a dotted name, such as ``scene.background.2``."""
     return ".".join(str(part) for part in loc if not _of_union(part))
 
 
 def _description(loc: Iterable[int | str]) -> str:
-    """Returns the documented description of a setting, or an empty string if it has none.
+    """Returns the description of a setting, or an empty string if the setting has none.
+
+    Args:
+        loc: location of the setting in a pydantic error.
 
     >>> _description(("scene", "image_scale", "float"))
     'Factor by which images are resized before any other step.'
@@ -209,12 +227,20 @@ def _description(loc: Iterable[int | str]) -> str:
 
 
 def _of_union(part: int | str) -> bool:
-    """Returns whether a part of a location is a union member, such as ``literal['auto']``, rather than a setting."""
+    """Returns whether a part of a pydantic location is a type in a union, not a setting.
+
+    An example of such a part is ``literal['auto']``.
+    """
     return isinstance(part, str) and (not part.isidentifier() or part in ("bool", "float", "int", "str"))
 
 
 def _names(values: Mapping[str, Any], under: str = "") -> Iterator[str]:
-    """Yields the dotted names of all settings and setting groups."""
+    """Yields the dotted names of all settings and groups of settings.
+
+    Args:
+        values: nested mapping of settings.
+        under: prefix of the names.
+    """
     for name, value in values.items():
         yield f"{under}{name}"
         if isinstance(value, Mapping):

@@ -1,7 +1,8 @@
-"""Recomputes a committed state from the images of its frame after the state was damaged on disk.
+"""Recomputes a committed state that was damaged on disk, from the images of its frame.
 
-The recomputed state comes from a cold start at the previous state. It looks like the original but is not bit-identical,
-and its report contains ``recomputed``. Later states were computed from the original state and do not change.
+The recomputation is a cold start from the previous state. The result looks like the original state
+but is not bit-identical. The report of the result contains ``recomputed``. Later states were
+computed from the original state and do not change.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ def recompute(
         settings: settings of the scene.
         history: history of the scene, in the process that appends to it.
         base: index of the previous committed frame.
-        frame: damaged frame with its images.
-        budget: budget that applied to the frame, as keyword arguments of ``Reconstruction.set_budget``.
+        frame: frame whose state is damaged, with its images.
+        budget: budget that applied to the frame, as keyword arguments of
+            ``Reconstruction.set_budget``.
         dropped: maps each camera excluded by the caller to the reason.
         notes: additional JSON data to commit.
 
@@ -49,10 +51,12 @@ def recompute(
 
     Raises:
         HistoryError: if the first frame or ``base`` cannot be read.
-        StepError: if the frame does not follow ``base``, or its images do not match the rig.
+        StepError: if the frame does not follow ``base``, its images do not match the rig, or the
+            update is rejected.
     """
     scratch = Reconstruction.fork(rig, settings, history, base)
-    scratch.may_change_population = False  # later states already contain the Gaussians added and retired in this frame
+    # Later states already contain the Gaussians that were added and retired in this frame.
+    scratch.may_change_population = False
     scratch.set_budget(**budget)
     made = scratch.step(frame, dropped=dropped, notes={**(notes or {}), RECOMPUTED: True})
     if made.outcome.rejected:  # nothing was learnt from the images
@@ -60,7 +64,8 @@ def recompute(
     report = scratch.history.report(frame.index)
     arrays = history.complete_state(frame.index, scratch.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
-    # Presence effects are omitted, because the births of this frame are those in the history, not of this update.
+    # The arrays of presence effects are omitted. They would not describe the Gaussians that the
+    # history contains for this frame, because this update added and retired none.
     left = scratch.history.effects(frame.index)
     left = {name: given for name, given in left.items() if effect(name).group is not EffectGroup.PRESENCE}
     history.replace(frame.index, frame.time, kept, report, left)

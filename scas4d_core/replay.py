@@ -1,8 +1,9 @@
-"""Replays the last frames of a scene in memory, to measure the cost and error of a different number of iterations.
+"""Replays the last frames of a scene, to measure time and error for other numbers of iterations.
 
-Every replay begins with a cold start from the same committed state. The first frame is a warm-up and is not counted;
-each later update starts from the previous motion, as in the live scene. The time budget and stopping rule are disabled,
-so that every update runs all iterations. Nothing is written to disk.
+Every replay begins with a cold start from the same committed state. The first frame is a warm-up
+and does not count. Every later update starts from the previous motion, as in the live scene. The
+time budget, the stopping rule and the skipping of updates are disabled, so that every update runs
+all iterations. Nothing is written to the files of the scene.
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ Decode = Callable[[], tuple[Frame, Mapping[str, str]]]
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """Cost and error of a frame for a given number of iterations.
+    """Time and error per frame for a given number of iterations.
 
     Attributes:
         iterations: number of iterations per frame.
-        milliseconds: median time per frame from decoding to the end of the update, without writing.
-        error: mean image loss of the kept state on the probe views, or None if the settings disable the checks.
+        milliseconds: median time per frame in milliseconds, from decoding to the end of the update.
+            The time for writing the state is not included.
+        error: mean image loss of the committed states on the probe views, or None if the settings
+            disable the comparison of states.
         psnr: mean PSNR in dB of the training views as last rendered, or None if not measured.
         frames: number of measured frames.
     """
@@ -53,19 +56,19 @@ def replay(
     iterations: int,
     over: Callable[[], None] = lambda: None,
 ) -> ReplayResult:
-    """Replays frames with a different number of iterations.
+    """Updates a copy of a scene with a given number of iterations, and measures time and error.
 
     Args:
         rig: training cameras in the user's world.
         settings: settings of the scene.
         history: history of the scene; only ``base`` and the first frame are read.
         base: index of the committed frame that precedes ``frames``.
-        frames: decoders of at least two frames, in order; the first frame is a warm-up.
+        frames: decoders of at least two frames, in order. The first frame is a warm-up.
         iterations: number of iterations per frame.
         over: function called at the end of each update.
 
     Raises:
-        HistoryError: if ``base`` cannot be read.
+        HistoryError: if ``base`` or the first frame cannot be read.
         StepError: if a frame does not follow the previous one.
     """
     update = settings.update.model_copy(
@@ -83,7 +86,10 @@ def replay(
 
 
 def summary(iterations: int, reports: Sequence[FrameReport]) -> ReplayResult:
-    """Summarizes reports; retried or degraded frames are included only if there are no others."""
+    """Returns the medians and means over the reports of several frames.
+
+    Frames that were degraded or took several attempts are included only if there are no others.
+    """
     clean = [report for report in reports if report.degraded is None and len(report.attempts) <= 1] or reports
     errors = [report.errors[report.candidate] for report in clean if report.candidate in report.errors]
     return ReplayResult(

@@ -1,6 +1,7 @@
-"""Checks of a rig before a scene starts: errors for unusable rigs, warnings for likely mistakes. Requires only NumPy.
+"""Checks of a rig before a scene starts: errors for unusable rigs, warnings for likely mistakes.
 
-Importers, the service and ``reconstruct`` use the same functions, so that their messages are identical.
+Importers, the service and the command ``reconstruct`` use the same functions, so that their
+messages are identical.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ USUAL_RADIUS = 60.0
 
 
 class RigError(CameraError):
-    """Raised if a rig or its settings are unusable.
+    """Raised if a rig, its points or its settings are unusable.
 
     Attributes:
         field: dotted name of the field, as in a request to the service.
@@ -65,10 +66,10 @@ class RigError(CameraError):
 
 
 def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
-    """Rejects unusable rigs, settings and initial points before images are read.
+    """Raises an error if a rig, settings or initial points are unusable. No images are needed.
 
     Args:
-        rig: rig in the user's world, at image size.
+        rig: rig in the user's world, at the size of the images.
         scene: scene settings; only the unit and the image scale are used.
         positions: [P, 3] point cloud in the user's world, or None.
 
@@ -82,10 +83,10 @@ def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
 
 
 def check_scene(rig: Rig, scene: SceneSettings) -> None:
-    """Rejects rigs and settings that are unusable with any images.
+    """Raises an error if a rig and settings are unusable, whatever the images and points are.
 
     Args:
-        rig: rig in the user's world, at image size.
+        rig: rig in the user's world, at the size of the images.
         scene: scene settings; only the unit and the image scale are used.
 
     Raises:
@@ -146,10 +147,17 @@ def _check_extent(rig: Rig, scene: SceneSettings) -> None:
 
 
 def check_start(rig: Rig, has_points: bool) -> None:
-    """Rejects a start without points if all cameras are at the same position, because depth cannot be estimated.
+    """Raises an error if a scene starts without points and all cameras are at the same position.
+
+    Depth cannot be estimated from such images.
+
+    Args:
+        rig: rig in the user's world.
+        has_points: whether initial points are given.
 
     Raises:
-        RigError: if there are no points, and all cameras (or the only one) are at the same position.
+        RigError: if there are no points, and there is only one camera or all cameras are at the
+            same position.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> check_start(Rig((Camera("front", lens, np.eye(4), 64, 48),)), has_points=False)
@@ -168,12 +176,16 @@ def check_start(rig: Rig, has_points: bool) -> None:
 
 
 def check_points(rig: Rig, positions: Float) -> None:
-    """Rejects points [P, 3] in the user's world if all of them are behind all cameras.
+    """Raises an error if all initial points are behind all cameras.
+
+    Args:
+        rig: rig in the user's world.
+        positions: [P, 3] point cloud in the user's world.
 
     Raises:
-        RigError: if no camera can see any point.
+        RigError: if no point is in front of any camera.
     """
-    for cloud in (_some(positions), positions):  # a small sample is usually sufficient
+    for cloud in (_some(positions), positions):  # a small sample usually suffices
         if any((camera.to_camera(cloud)[:, 2] > 0).any() for camera in rig.cameras):
             return
     raise RigError(
@@ -186,7 +198,7 @@ def check_points(rig: Rig, positions: Float) -> None:
 
 
 def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None) -> list[str]:
-    """Returns warnings about a usable rig: its unit, its poses and its point cloud.
+    """Returns warnings about likely mistakes in the unit, the poses or the points of a usable rig.
 
     Args:
         rig: rig in the user's world.
@@ -199,7 +211,10 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
 
 
 def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
-    """Returns a list with a warning if the rig's size suggests that ``metres_per_unit`` is wrong, or an empty list.
+    """Returns a warning if the size of the rig suggests that ``metres_per_unit`` is wrong.
+
+    Returns:
+        A list with one warning, or an empty list.
 
     >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> there[0, 3] = 4000
@@ -222,7 +237,14 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
 
 
 def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
-    """Returns a list with a warning if hardly any points [P, 3] are in view or they are far away, or an empty list.
+    """Returns a warning if the cameras see hardly any points, or the points are very far away.
+
+    Args:
+        rig: rig in the user's world.
+        positions: [P, 3] point cloud in the user's world.
+
+    Returns:
+        A list with one warning, or an empty list.
 
     >>> lens, beside = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside[0, 3] = -0.2
@@ -246,17 +268,25 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
-    """Returns warnings about poses that appear to be inverted (camera to world), or an empty list if none do.
+    """Returns a warning if the poses seem to be inverted (camera to world).
 
-    With points, the evidence is that few of them are in view, but many would be with inverted poses. Without points,
-    the evidence is that the viewing axes meet neither in front of nor behind the cameras, but would meet in nearly all
-    images with inverted poses. The axes of outward-looking rigs meet behind the cameras; those of rigs that look in one
-    direction never meet. With poses relative to one of the cameras, the axes often meet in both cases. Nothing is
-    reported then, because only the images could decide.
+    With points, the evidence is that few points are in view, but many points would be in view with
+    inverted poses. Without points, the evidence is the common point of the viewing axes. With the
+    given poses, few cameras have this point in view or behind them. With inverted poses, nearly all
+    cameras would have the common point in view.
+
+    The axes of an outward-looking rig meet behind the cameras. The axes of a rig that looks in one
+    direction never meet. With poses relative to one of the cameras, the axes often meet both with
+    the given and with inverted poses. There is no warning then, because only the images could
+    decide.
 
     Args:
-        rig: rig in the user's world; without points, it is checked only if it has at least three cameras.
+        rig: rig in the user's world. Without points, a rig is checked only if it has at least
+            three cameras.
         positions: [P, 3] point cloud in the user's world, or None.
+
+    Returns:
+        A list with one warning, or an empty list.
 
     >>> lens, ring = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], []
     >>> for i, angle in enumerate((0, 2, 4)):
@@ -272,7 +302,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     if positions is not None and len(positions):
         some = _some(positions)
         given = float(np.mean(_seen(rig.cameras, some)))
-        if given > FEW_SEE:  # inverted poses could not show many times as much
+        if given > FEW_SEE:  # the fraction cannot be 1 / FEW_SEE times as large with inverted poses
             return []
         other = float(np.mean(_seen([_inverted(camera) for camera in rig.cameras], some)))
         if other < POINTS_SEEN or given > FEW_SEE * other:
@@ -298,7 +328,11 @@ def _inverted(camera: Camera) -> Camera:
 
 
 def _seen(cameras: Sequence[Camera], points: Float) -> NDArray[np.bool_]:
-    """Evaluates `_sees` for all cameras at once, [C, P], because a service may check hundreds of rigs."""
+    """Returns whether each camera sees each point [P, 3], as [C, P] bool.
+
+    The result equals that of `_sees` for each camera, but is computed for all cameras at once,
+    because a service may check hundreds of rigs.
+    """
     poses, lenses = np.stack([one.world_to_camera for one in cameras]), np.stack([one.intrinsics for one in cameras])
     sizes = np.array([(one.width, one.height) for one in cameras])[:, None]
     there = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
@@ -317,11 +351,15 @@ def _sees(camera: Camera, points: Float) -> NDArray[np.bool_]:
 
 
 def _come_together(cameras: Sequence[Camera], *, behind: bool) -> float:
-    """Returns the fraction of cameras that see the point nearest to all viewing axes; 0 if there is no such point.
+    """Returns the fraction of cameras that see the common point of all viewing axes.
+
+    The common point is nearest to all axes, in the least-squares sense. The fraction is 0 if the
+    axes are nearly parallel or all cameras are at the same position.
 
     Args:
         cameras: cameras to check.
-        behind: whether a point behind a camera also counts as seen, if the camera sees its mirror image.
+        behind: whether a camera also counts if the point is behind the camera, and the camera sees
+            the point after its reflection through the camera centre.
     """
     axes = np.array([camera.rotation[2] for camera in cameras])
     centres = np.array([camera.centre for camera in cameras])

@@ -1,6 +1,6 @@
-"""Settings of a scene: every value that a user can change, with its unit, range and the reason for its default.
+"""Settings of a scene: all values that users can change, with their units, ranges and defaults.
 
-Values that only developers of the method would change are constants in the modules where they are used.
+Values that only developers of the method would change are constants in the modules that use them.
 """
 
 from __future__ import annotations

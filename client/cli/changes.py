@@ -79,7 +79,7 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
 
 
 def format_changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the nested settings that differ from `usual`, keyed by dotted name; the inverse of ``parse_changes``.
+    """Returns the settings that differ from `usual`, keyed by their dotted names.
 
     >>> format_changes({"update": {"iterations": 200, "seed": 0}}, {"update": {"iterations": 100, "seed": 0}})
     {'update.iterations': 200}

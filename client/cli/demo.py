@@ -86,14 +86,14 @@ def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
         return 0, 1
     except ServiceError as error:
         said = error.problem.model_extra or {}
-        if said.get("warming_up") or said.get("recovering"):  # it becomes ready on its own
+        if said.get("warming_up") or said.get("recovering"):  # the service becomes ready on its own
             return int(said.get("kernels_compiled", 0)), int(said.get("kernels", 1))
         raise RuntimeError(f"the service failed to become ready: {error}; see the log at {log}") from None
     return None
 
 
 def _token() -> str | None:
-    """Returns the token from the environment, where the started service reads it too."""
+    """Returns the access token from the environment variable that the service also reads."""
     return os.environ.get("SCAS4D_TOKEN")
 
 

@@ -1,4 +1,4 @@
-"""Checks of the machine for `scas4d doctor`: Python, extras, memory, disk and GPU."""
+"""Checks of the machine for `scas4d doctor`: Python, CPU cores, extras, disk and GPU."""
 
 from __future__ import annotations
 
@@ -37,7 +37,11 @@ class Check:
 
 
 def checks(data: Path) -> Iterator[Check]:
-    """Checks the machine; ``data`` is the service's data folder, which need not exist yet."""
+    """Yields the checks of the machine.
+
+    Args:
+        data: data folder of the service, which need not exist yet.
+    """
     from scas4d_core.machine import usable_cores
 
     cores = usable_cores()
@@ -49,7 +53,7 @@ def checks(data: Path) -> Iterator[Check]:
 
 
 def installed() -> Iterator[Check]:
-    """Checks the packages of each extra; only `server` is required."""
+    """Yields one check per extra; only a missing `server` is a fault."""
     for extra, modules in extras.EXTRAS.items():
         missing = [module for module in modules if find_spec(module) is None]
         if missing:
@@ -60,7 +64,7 @@ def installed() -> Iterator[Check]:
 
 
 def disk(data: Path) -> Check:
-    """Checks the free disk space for the data folder."""
+    """Checks the free disk space for the data folder; little space is not a fault."""
     existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
     free = shutil.disk_usage(existing).free / 1e9
     small = (
@@ -72,7 +76,7 @@ def disk(data: Path) -> Check:
 
 
 def gpu() -> Check:
-    """Checks whether scenes with device 'auto' use a GPU and, if not, what is missing."""
+    """Checks whether scenes with the device 'auto' use a GPU, or what is missing for it."""
     from scas4d_core.engines.choose import gpu_fault, warp_device
 
     driver = driver_version(DRIVER_FILE.read_text()) if DRIVER_FILE.exists() else None

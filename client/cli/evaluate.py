@@ -74,7 +74,7 @@ class Job:
     def open_truth(self) -> Capture:
         """Opens the capture for evaluation, at the resolution of the renders.
 
-        If it has no test cameras, its training cameras are used as test cameras.
+        If the capture has no test cameras, its training cameras are used as test cameras.
         """
         truth = self.options.open(self.capture, image_scale=self.settings.scene.image_scale)
         return truth if truth.full_test_rig is not None else truth.with_training_as_test()
@@ -290,7 +290,10 @@ def summary(lines: Sequence[Row]) -> Row:
 
 
 def _seconds(updates: Sequence[Row]) -> Row:
-    """Returns median times, because the first update also compiles or loads kernels."""
+    """Returns the median times of the updates.
+
+    A mean would include the time that the first update takes to compile or load kernels.
+    """
     stages = dict.fromkeys(name for line in updates for name in line["stages"])
     return {
         "seconds_update": float(np.median([line["seconds"] for line in updates])),

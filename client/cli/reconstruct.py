@@ -34,12 +34,12 @@ FRAME_ALARMS = (AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART)
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """A committed frame, which may be degraded.
+    """One reconstructed frame, with its times and its report. The frame may be degraded.
 
     Attributes:
         index: frame index in the capture.
-        seconds: wall-clock time of this frame alone, including decoding.
-        cpu_seconds: CPU time of this frame, summed over all threads.
+        seconds: wall-clock time of this frame in seconds, including decoding.
+        cpu_seconds: CPU time of this frame in seconds, summed over all threads.
         report: report on the update; None for frame 0.
     """
 
@@ -58,7 +58,9 @@ def reconstruct_frames(
     static: StaticResult | None = None,
     progress: Callable[[str, int, int], None],
 ) -> Iterator[tuple[Reconstruction, ReconstructedFrame]]:
-    """Reconstructs the first `count` frames of a capture in order, yielding after each one.
+    """Reconstructs the first `count` frames of a capture in order.
+
+    After each frame, the function yields the reconstruction and the result of the frame.
 
     Args:
         capture: capture at full size; the reconstruction resizes its images itself.
@@ -180,7 +182,7 @@ def reconstruct(
 
 
 def remarks_on(report: FrameReport | None) -> str:
-    """Returns the text printed after a frame's PSNR: the reason why it is degraded, and its alarms.
+    """Returns the text printed after a frame's PSNR: why the frame is degraded, and its alarms.
 
     >>> remarks_on(None)
     ''
@@ -189,7 +191,7 @@ def remarks_on(report: FrameReport | None) -> str:
         return ""
     parts = [] if report.degraded is None else [report.degraded]
     for alarm in report.alarms:
-        if alarm.kind not in FRAME_ALARMS:  # `degraded` already contains it
+        if alarm.kind not in FRAME_ALARMS:  # `degraded` already contains this evidence
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     return "".join(f"\n  ! {part}" for part in parts)
 

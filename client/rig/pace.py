@@ -11,7 +11,7 @@ class Pace:
     """Frame rate, jitter and losses of a simulated rig; deterministic for a given seed.
 
     Attributes:
-        fps: frames per second; None sends as fast as the service accepts frames.
+        fps: frames per second; None to send as fast as the service accepts frames.
         jitter: maximum delay of a frame in seconds, uniformly distributed; models cables, encoders and switches.
         drop: fraction of frames that the rig loses, in 0…1. Frame 0 is never lost.
         seed: random seed for the jitter and losses.
@@ -37,9 +37,9 @@ class Pace:
             raise ValueError(f"drop must be a fraction in [0, 1); got {self.drop!r}")
 
     def drops(self, index: int, camera: str = "") -> bool:
-        """Returns True if this frame, or this camera's image of it, is lost; deterministic."""
+        """Returns whether this frame, or one camera's image of it, is lost; deterministic."""
         return index > 0 and random.Random(f"{self.seed} {index} {camera} lost").random() < self.drop
 
     def delay(self, index: int, camera: str = "") -> float:
-        """Returns the delay of this frame, or of this camera's image of it, in seconds; deterministic."""
+        """Returns the delay in seconds of this frame or of one camera's image; deterministic."""
         return random.Random(f"{self.seed} {index} {camera} late").uniform(0, self.jitter)

@@ -43,7 +43,7 @@ class Requests:
 
 
 class Sockets:
-    """Transport that sends frames over WebSockets, one per sender."""
+    """Transport that sends frames over WebSockets: one for whole frames, or one per camera."""
 
     def __init__(self, client: Client, scene: str) -> None:
         self._client = client
@@ -75,7 +75,7 @@ class Sockets:
 
 
 class Sender:
-    """Sends all frames at the configured pace."""
+    """Sender of all frames of a sequence at the configured pace."""
 
     def __init__(
         self,

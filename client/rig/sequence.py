@@ -1,4 +1,4 @@
-"""Frames of a capture as frames of a scene, encoded ahead of time."""
+"""Frames of a capture as encoded frames of a scene. The next frame is read ahead of time."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ def ping_pong(index: int, count: int) -> int:
 
 
 class Sequence:
-    """Frames of a capture as frames of a scene, starting at `start`; with `loop`, they run back and forth endlessly.
+    """The frames of a capture, from `start` on, as the frames of a scene.
 
-    Playback reverses at the ends, because a jump from the last frame to the first would not be plausible motion.
+    With `loop`, the frames run back and forth endlessly. Playback reverses at the ends, because a
+    jump from the last frame to the first would not be plausible motion.
     """
 
     def __init__(self, source: Capture, *, start: int = 0, loop: bool = False) -> None:
@@ -63,7 +64,7 @@ class Sequence:
         return self.time(self._last) + (index - self._last) / self.source.fps
 
     def files(self, index: int) -> EncodedFrame:
-        """Returns the files of a frame and prefetches the next frame."""
+        """Returns the files of a frame, and starts to read the next frame in the background."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
         files = future.result()
         if index + 1 < len(self):

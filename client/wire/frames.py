@@ -22,7 +22,7 @@ class FrameReceipt(Model):
 
 
 class CameraReceipt(Model):
-    """Confirms that one camera's files are on disk. Repeating the request returns current camera lists."""
+    """Confirms that one camera's files are on disk. A repeated request returns current lists."""
 
     scene: str
     index: int
@@ -55,7 +55,7 @@ class MissingRequest(Model):
 
 
 class CameraFitModel(Model):
-    """How well one camera's image matches the render; reveals cameras that have moved or changed."""
+    """Match between a camera's image and the render; poor if the camera moved or changed."""
 
     psnr: float | None = Field(description="PSNR in dB.")
     colour_shift: tuple[float, float, float] | None = Field(

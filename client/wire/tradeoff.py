@@ -50,7 +50,7 @@ class TradeoffPoint(Model):
 
 
 class CurveMean(Model):
-    """Mean convergence of updates after a given number of their iterations."""
+    """Mean loss and median time of updates after a given number of iterations."""
 
     planned: int = Field(description="Total number of iterations of the update.")
     iterations: int

@@ -33,14 +33,16 @@ __all__ = [
 
 
 def open_capture(folder: Path | str, **options: Any) -> Capture:
-    """Opens a capture, detecting its layout from the files in the folder.
+    """Opens a capture. The files in the folder determine which layout is read.
 
     Args:
-        folder: capture folder.
-        options: keyword arguments for `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
+        folder: folder of the capture.
+        options: keyword arguments for `read_dynamic3dgs`: image_scale, fps, use_masks, use_points,
+            size_mismatch.
 
     Raises:
-        CaptureError: if the folder does not exist, its layout is unknown, or one of its files is invalid.
+        CaptureError: if the folder does not exist, its layout is unknown, or one of its files is
+            missing or invalid.
 
     >>> capture = open_capture("samples/robot", image_scale=0.25)
     >>> capture.rig.names[:3], capture.frame_count

@@ -1,4 +1,4 @@
-"""`Capture`, a sequence of frames from one rig whose images are decoded lazily on access."""
+"""`Capture`, a sequence of frames from one camera rig. Images are decoded lazily, on access."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from scas4d_core.captures.reader import PictureReader
 
 
 class LazyPictures(Mapping[str, NDArray[np.uint8]]):
-    """Maps camera names to images. To limit memory use, images are decoded on every access and not cached."""
+    """Read-only mapping from camera names to images or masks.
+
+    An image is decoded on every access and never cached, to limit memory use.
+
+    Args:
+        cameras: names of the cameras.
+        decode: function that decodes the image of a camera.
+    """
 
     def __init__(self, cameras: Collection[str], decode: Callable[[str], NDArray[np.uint8]]) -> None:
         self._cameras = cameras
@@ -44,12 +51,14 @@ class Capture:
         full_rig: training cameras at the full image size.
         full_test_rig: test cameras at the full image size, or None.
         pictures: reader for the images and masks of all cameras.
-        image_scale: factor by which images, masks, labels and the cameras of ``rig`` are scaled.
+        image_scale: factor by which images, masks, labels and the cameras of ``rig`` and
+            ``test_rig`` are scaled.
         fps: frames per second; the time of frame i is i / fps if the images have no timestamps.
         points: point cloud of frame 0, or None.
         ground_truth: ground-truth tracks and parts, or None.
-        extent: longest side of the foreground's bounding box over the sequence, in the user's units, or None.
-        remarks: user-facing notes on how the files were read.
+        extent: longest side of the foreground's bounding box over all frames, in the user's units,
+            or None if unknown.
+        remarks: notes for the user on how the files were read.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -91,7 +100,7 @@ class Capture:
         return self.pictures.frame_count
 
     def time(self, index: int) -> float:
-        """Returns a frame's time in seconds, from image timestamps if available, otherwise from the frame rate."""
+        """Returns the time of a frame in seconds: its timestamp, or index / fps if it has none."""
         given = self.pictures.time(index)
         return index / self.fps if given is None else given
 
@@ -99,23 +108,29 @@ class Capture:
         """Returns the training images and masks of one frame.
 
         Raises:
-            IndexError: if the frame does not exist. Accessing an image may also raise ImageError.
+            IndexError: if the frame does not exist. A later access to an image of the frame may
+                raise ImageError.
         """
         return self._frame(index, self.full_rig)
 
     def test_frame(self, index: int) -> Frame:
-        """Returns the test images of one frame, and their masks if available. Only use them for evaluation.
+        """Returns the test images of one frame, and their masks if available.
+
+        Test images must only be used for evaluation.
 
         Raises:
-            IndexError: if the frame does not exist.
-            CaptureError: if the capture has no test cameras. Accessing an image may also raise ImageError.
+            IndexError: if the frame does not exist. A later access to an image of the frame may
+                raise ImageError.
+            CaptureError: if the capture has no test cameras.
         """
         if self.full_test_rig is None:
             raise CaptureError(f"capture {self.name} has no test cameras; hold some out with --test")
         return self._frame(index, self.full_test_rig)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns a training or test camera's image file as bytes, at full size regardless of ``image_scale``.
+        """Returns the image file of a training or test camera, as bytes.
+
+        The image has its full size, regardless of ``image_scale``.
 
         Raises:
             IndexError: if the frame does not exist.
@@ -126,7 +141,9 @@ class Capture:
         return self.pictures.encoded_image(index, camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns a mask file as bytes, at full size regardless of ``image_scale``, or None if there is no mask.
+        """Returns the mask file of a training or test camera as bytes, or None if it has no mask.
+
+        The mask has its full size, regardless of ``image_scale``.
 
         Raises:
             IndexError: if the frame does not exist.
@@ -136,7 +153,7 @@ class Capture:
         return self.pictures.encoded_mask(index, camera)
 
     def scaled(self, image_scale: float) -> Capture:
-        """Returns a copy of the capture with another ``image_scale``, sharing the image reader."""
+        """Returns a copy of the capture with another ``image_scale`` and the same image reader."""
         truth = self.ground_truth
         if truth is not None:
             sizes = {name: (full, scaled_size(full, image_scale)) for name, (full, _) in truth.image_size.items()}
@@ -144,7 +161,9 @@ class Capture:
         return replace(self, image_scale=image_scale, ground_truth=truth)
 
     def with_held_out(self, names: Collection[str]) -> Capture:
-        """Returns a copy of the capture in which the named cameras are test cameras instead of training cameras.
+        """Returns a copy of the capture in which the named cameras are test cameras.
+
+        Cameras that already are test cameras remain test cameras.
 
         Raises:
             CaptureError: if a camera does not exist, or no training camera would be left.
@@ -163,10 +182,13 @@ class Capture:
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
     def with_training_as_test(self, rig: Rig | None = None) -> Capture:
-        """Returns a copy whose test cameras are the training cameras, to measure the fit to the training images.
+        """Returns a copy of the capture whose test cameras are the training cameras.
+
+        An evaluation of this copy measures the fit to the training images.
 
         Args:
-            rig: training cameras refined by a scene, or None to use the capture's own cameras.
+            rig: training cameras as refined by a scene, at the full image size, or None to use the
+                cameras of the capture.
         """
         return replace(self, full_test_rig=self.full_rig if rig is None else rig)
 

@@ -1,10 +1,15 @@
-"""Reads the Dynamic3DGaussians data layout. Requires only NumPy and Pillow.
+"""Reads captures in the data layout of Dynamic3DGaussians.
 
-``train_meta.json`` and ``test_meta.json`` contain ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
-axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are in ``seg/`` under the same paths, with the
-suffix ``.png``. ``init_pt_cld.npz`` contains ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). This reader also
-accepts ``fps`` in ``train_meta.json``, one value per camera for ``w`` and ``h``, and point clouds with six columns
-(no foreground).
+This module requires only NumPy and Pillow.
+
+In the following, t is the index of a frame and c is the index of a camera.
+``train_meta.json`` and ``test_meta.json`` contain ``w``, ``h``, ``k[t][c]`` (3×3, pixels),
+``w2c[t][c]`` (4×4, OpenCV axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are
+in ``seg/`` under the same paths, with the suffix ``.png``. ``init_pt_cld.npz`` contains ``data``
+[P, 7]: x y z, r g b (0…1), foreground (0…1).
+
+This reader also accepts three extensions: ``fps`` in ``train_meta.json``, one value per camera for
+``w`` and ``h``, and point clouds with six columns (without foreground).
 
 Reference: ``train.py`` in JonathonLuiten/Dynamic3DGaussians.
 """
@@ -44,21 +49,23 @@ def read_dynamic3dgs(
 ) -> Capture:
     """Opens a capture in the Dynamic3DGaussians layout.
 
-    Cameras are named ``str(cam_id)``, and ``test_meta.json`` lists the test cameras. Masks, point cloud, test cameras
-    and ground truth are optional, but masks must exist for all training cameras or for none.
+    The name of a camera is ``str(cam_id)``. ``test_meta.json`` lists the test cameras. Masks, point
+    cloud, test cameras and ground truth are optional. If masks are read and the folder ``seg/``
+    exists, it must contain a mask for every training image.
 
     Args:
         folder: folder that contains ``train_meta.json``.
         image_scale: factor by which images, masks, labels and cameras are scaled.
-        fps: frames per second, or None to use ``fps`` from ``train_meta.json`` (written by ``scas4d import``), which
-            defaults to 30.
+        fps: frames per second, or None to use ``fps`` from ``train_meta.json`` (written by
+            ``scas4d import``), or 30 if the file has no such entry.
         use_masks: whether to read the masks in ``seg/``.
         use_points: whether to read ``init_pt_cld.npz``.
-        size_mismatch: how images with an aspect ratio other than ``w``:``h`` were produced (see `adapt_intrinsics`), or
-            None to reject such images.
+        size_mismatch: how images with an aspect ratio other than ``w``:``h`` were produced (see
+            `adapt_intrinsics`), or None to reject such images.
 
     Raises:
-        CaptureError: if a file is missing, damaged or inconsistent with the others, or a camera moves.
+        CaptureError: if a file is missing, damaged or inconsistent with other files, or if a camera
+            moves.
     """
     folder = Path(folder)
     train = _read_cameras(folder, TRAIN_META, size_mismatch)
@@ -95,7 +102,7 @@ def read_dynamic3dgs(
 
 
 def _merge_files(of: list[tuple[Files, ...]]) -> list[Files]:
-    """Merges the files of training and test cameras, frame by frame."""
+    """Merges the files of training and test cameras into one mapping per frame."""
     return [{name: file for files in frame for name, file in files.items()} for frame in zip(*of, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""Reads a capture's JSON and npz files, with detailed error messages for invalid files. Requires only NumPy."""
+"""Reads the JSON and npz files of a capture, with detailed error messages. Requires only NumPy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Reads a JSON file that contains an object.
 
     Raises:
-        CaptureError: if the file is missing, not JSON, or not an object.
+        CaptureError: if the file is missing, is not valid JSON, or does not contain an object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

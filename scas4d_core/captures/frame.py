@@ -1,4 +1,7 @@
-"""`Frame`, the images and masks of one time step, and `InitialPoints`, a point cloud. Requires only NumPy."""
+"""`Frame`, the images and masks of one time step, and `InitialPoints`, a point cloud.
+
+This module requires only NumPy.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,15 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The images of all cameras at one time step.
+    """The images and masks of a rig's cameras at one time step.
 
     Attributes:
         index: position in temporal order, starting at 0.
         time: time since the first frame, in seconds.
-        images: maps each camera name to its image, [H, W, 3] uint8, sRGB values as in the file. Images may be decoded
-            lazily on access.
-        masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground; empty if the capture has no masks.
+        images: maps each camera name to its image, [H, W, 3] uint8, sRGB values as in the file.
+            Images may be decoded lazily, on access.
+        masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground. Empty if the
+            frame has no masks.
 
     >>> picture = np.zeros((48, 64, 3), np.uint8)
     >>> frame = Frame(index=3, time=0.1, images={"front": picture, "left": picture}, masks={})

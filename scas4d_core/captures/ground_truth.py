@@ -23,8 +23,8 @@ class TruePart:
         rigid: whether the part moves as a rigid body.
         static: whether the part never moves.
         foreground: whether the masks include the part.
-        pose: [T, 4, 4] part-to-world transforms if the part is rigid, otherwise None; ``pose[t] @ inv(pose[s])`` moves
-            a point from frame s to frame t.
+        pose: [T, 4, 4] part-to-world transforms if the part is rigid, otherwise None.
+            ``pose[t] @ inv(pose[s])`` moves a point of the part from frame s to frame t.
     """
 
     id: int
@@ -37,17 +37,19 @@ class TruePart:
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """Tracks of P material points over T frames, their visibility in C cameras, and part labels per pixel.
+    """Ground truth of a capture: point tracks, their visibility in each camera, and part labels.
+
+    P is the number of tracked material points, T the number of frames, and C the number of cameras.
 
     Attributes:
         points: [T, P, 3] float64 world positions, in the user's units.
         part_id: [P] int64 part id of each point.
         visible: [T, C, P] bool, whether each point is inside the image and not occluded.
-        cameras: camera names along axis C, both training and test cameras.
+        cameras: names of the C cameras, which include training and test cameras.
         parts: parts of the scene; empty if the capture lists none.
         label_files: maps each camera name to the paths of its label images, one per frame; empty if there are none.
-        image_size: maps each camera name to its full and scaled (width, height); labels are resized from full to
-            scaled.
+        image_size: maps each camera name to its full and scaled (width, height). Labels are resized
+            from the full to the scaled size.
 
     >>> from scas4d_core.captures import open_capture
     >>> truth = open_capture("samples/robot").ground_truth
@@ -69,7 +71,8 @@ class GroundTruth:
     def moving(self) -> NDArray[np.bool_]:
         """[P] bool, whether each point ever leaves its position in frame 0.
 
-        Displacements of up to 10⁻⁶ of the longest side of the bounding box of all points are ignored.
+        A displacement of up to 10⁻⁶ times the longest side of the bounding box does not count as
+        motion. The box contains all points of all frames.
         """
         moved: NDArray[np.float64] = np.linalg.norm(self.points - self.points[:1], axis=-1).max(axis=0)
         box = float(np.ptp(self.points.reshape(-1, 3), axis=0).max())
@@ -92,9 +95,9 @@ class GroundTruth:
         return tuple(self.label_files)
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint8]:
-        """Returns the part id of each pixel in a frame, [H, W] uint8, or 0 where there is no part.
+        """Returns the part id of each pixel in a frame, [H, W] uint8; 0 where there is no part.
 
-        Labels are resized by sampling, not averaging.
+        Labels are resized by sampling, because the average of two ids is meaningless.
 
         Raises:
             KeyError: if the camera has no labels.
@@ -105,7 +108,10 @@ class GroundTruth:
 
 
 def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[Size, Size]]) -> GroundTruth | None:
-    """Reads a capture's ground truth: ``gt_tracks.npz`` and, if present, ``scene.json`` and ``gt_parts/``.
+    """Reads the ground truth of a capture.
+
+    The ground truth consists of ``gt_tracks.npz`` and, if they exist, ``scene.json`` and
+    ``gt_parts/``.
 
     Args:
         folder: capture folder.
@@ -144,7 +150,7 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
         points=points.astype(np.float64),
         part_id=part_id.astype(np.int64),
         visible=visible.astype(np.bool_),
-        # The axis C is indexed by cam_id, which is also the camera's name.
+        # The camera axis C is indexed by cam_id, which is also the name of the camera.
         cameras=tuple(str(index) for index in range(visible.shape[1])),
         parts=_read_parts(folder / "scene.json", frame_count),
         label_files=label_files,
@@ -153,9 +159,13 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
 
 
 def read_extent(folder: Path) -> float | None:
-    """Returns the longest side of the foreground's bounding box over the sequence, in the user's units.
+    """Reads the longest side of the foreground's bounding box over all frames, in the user's units.
 
-    The value is read from ``scene.json``. Returns None if the file or the value is missing.
+    Returns:
+        The value of ``extent`` in ``scene.json``, or None if the file or the value is missing.
+
+    Raises:
+        CaptureError: if the file is invalid, or the value is not a positive number.
     """
     path = folder / "scene.json"
     value = read_json(path).get("extent") if path.exists() else None

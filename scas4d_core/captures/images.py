@@ -4,7 +4,7 @@ Image files are handled as follows:
 
 ======================  ====================================================================================
 EXIF orientation ≠ 1    rejected: intrinsics are valid for one orientation of the pixels only, and the file
-                        does not record which one was calibrated
+                        does not record for which orientation the camera was calibrated
 alpha (also palette)    composited over black, the empty background of a capture, without linearization
 grey                    replicated to three channels
 16 bit                  grey: value / 257, rounded to 8 bit; colour: the high byte (at most one level off)
@@ -57,15 +57,16 @@ def decode_image(
     Args:
         source: image file, as bytes or as a path.
         size: required (width, height) of the file in pixels, before scaling; not checked if None.
-        image_scale: scale factor; the image is resized by area averaging to the size given by `Camera.scaled`.
+        image_scale: scale factor. The image is resized by area averaging to the size that
+            `Camera.scaled` returns.
         name: name of the image in error messages; defaults to the path.
 
     Returns:
         Image [H, W, 3] uint8.
 
     Raises:
-        ImageError: if the file is missing, is not an image, has the wrong size, or is rejected (see the module
-            docstring).
+        ImageError: if the file is missing, is not an image, has the wrong size, or has properties
+            that the docstring of this module lists as rejected.
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
@@ -84,10 +85,10 @@ def decode_image(
 def decode_mask(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """Decodes a foreground mask. Takes the same arguments as `decode_image` and raises the same errors.
+    """Decodes a foreground mask. The arguments and errors are those of `decode_image`.
 
-    A pixel is foreground if any stored value is nonzero. After scaling, it is foreground if at least half of its area
-    is foreground.
+    A pixel is foreground if the stored value of any channel is nonzero. A pixel of a scaled mask is
+    foreground if at least half of its area is foreground.
 
     Returns:
         Mask [H, W] uint8, 1 on the foreground and 0 elsewhere.
@@ -111,7 +112,7 @@ def decode_mask(
 
 
 def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
-    """Decodes an 8-bit single-channel label image. Resizing samples labels and never averages them.
+    """Decodes an 8-bit single-channel label image, and resizes it by sampling.
 
     Args:
         source: image file, as bytes or as a path.
@@ -143,7 +144,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
 
 
 def picture_size(source: bytes | Path, name: str | None = None) -> Size:
-    """Returns an image's width and height in pixels, reading only the file header.
+    """Returns the width and height of an image in pixels. The pixels are not decoded.
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2)).save(file, "JPEG")
@@ -161,8 +162,9 @@ def picture_size(source: bytes | Path, name: str | None = None) -> Size:
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     """Resizes an image [H, W, C] to (width, height) by area averaging.
 
-    Image edges stay aligned, so pixel coordinates (centres at +0.5) scale by the ratio of the sizes, as in
-    `Camera.scaled`. Pillow's BOX filter only uses whole source pixels and is half a pixel off at fractional ratios.
+    The edges of the image stay aligned. Pixel coordinates, with pixel centres at +0.5, therefore
+    scale by the ratio of the sizes, as in `Camera.scaled`. Pillow's BOX filter is unsuitable: it
+    weights whole source pixels only, and is half a pixel off at fractional ratios.
 
     >>> resize_area(np.array([[[0], [10], [20]]], np.uint8), size=(2, 1))[..., 0]
     array([[ 3, 17]], dtype=uint8)
@@ -173,7 +175,9 @@ def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
 
 def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
-    """Resizes a mask [H, W] of 0 and 1 to (width, height); a pixel is 1 if at least half of its area was 1.
+    """Resizes a mask [H, W] of 0 and 1 to (width, height).
+
+    A pixel of the result is 1 if at least half of its area is 1 in the original mask.
 
     >>> resize_mask(np.array([[1, 1, 1, 0]], np.uint8), size=(2, 1))
     array([[1, 1]], dtype=uint8)
@@ -185,7 +189,7 @@ def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
 
 def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
-    """Returns an 8-bit JPEG, PNG or WebP file unchanged; any other image is re-encoded as an 8-bit PNG.
+    """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG file.
 
     Raises:
         ImageError: if the image must be re-encoded but cannot be decoded.
@@ -209,7 +213,9 @@ def is_sixteen_bit(head: bytes) -> bool:
 
 
 def describe_pictures(files: Mapping[str, Path]) -> list[str]:
-    """Returns user-facing remarks on 16-bit images and on greyscale cameras in colour rigs, based on the image headers.
+    """Returns remarks for the user on 16-bit images, and on greyscale cameras in a colour rig.
+
+    The remarks are based on the headers of the files. The pixels are not decoded.
 
     Args:
         files: maps each camera name to one of its image files.
@@ -232,18 +238,27 @@ def describe_pictures(files: Mapping[str, Path]) -> list[str]:
 
 
 def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
-    """Returns a list with one remark if some cameras are greyscale and others are not, otherwise an empty list."""
+    """Returns a remark for the user if only some of the cameras are greyscale.
+
+    Args:
+        grey: maps each camera name to whether its images are greyscale.
+
+    Returns:
+        A list with one remark, or an empty list if all cameras are of the same kind.
+    """
     if len(set(grey.values())) < 2:
         return []
     return grey_warnings([name for name, is_grey in grey.items() if is_grey])
 
 
 def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
-    """Returns the names of cameras with greyscale images if others have colour images. Ignores images without contrast.
+    """Returns the names of the greyscale cameras in a rig that also has colour cameras.
+
+    An image of a colour camera has at least one pixel that is not grey, because of sensor noise. An
+    image in which all values are equal does not show whether its camera is greyscale.
 
     Args:
-        images: maps each camera name to its image [H, W, 3]. Sensor noise ensures that an image from a colour camera is
-            never grey in every pixel.
+        images: maps each camera name to its image [H, W, 3].
 
     >>> grey = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)[..., :1].repeat(3, axis=2)
     >>> red = grey + np.uint8([1, 0, 0])
@@ -261,7 +276,8 @@ def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64
     for axis, target in ((0, size[1]), (1, size[0])):
         picture = np.moveaxis(picture, axis, 0)
         length = picture.shape[0]
-        # The cumulative integral of the image is linear within a pixel, so interpolating it at new edges is exact.
+        # The cumulative integral of the image is linear within a pixel. Linear interpolation at the
+        # new edges is therefore exact.
         integral = np.concatenate([np.zeros_like(picture[:1]), np.cumsum(picture, axis=0)])
         edges = np.arange(target + 1) * (length / target)
         left = np.minimum(edges.astype(np.intp), length - 1)
@@ -288,10 +304,10 @@ def _unreadable(name: str, fault: Exception) -> ImageError:
 
 
 def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size | None) -> Image.Image:
-    # For damaged files, Pillow's decoders raise many kinds of exceptions (OSError, SyntaxError, struct.error, …).
+    # Pillow raises many types of exceptions for damaged files (OSError, SyntaxError, …).
     try:
         picture = Image.open(_stream(source), formats=formats)
-        # Check before decoding, because a small file can decompress to gigabytes.
+        # The size is checked before decoding, because a small file can decompress to gigabytes.
         if size is not None and picture.size != size:
             raise ImageError(
                 f"{name} is {picture.width}x{picture.height} pixels, but its camera requires {size[0]}x{size[1]}; "
@@ -340,7 +356,8 @@ def _to_srgb(picture: Image.Image, profile: bytes, name: str) -> Image.Image:
         source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         described = source.profile.profile_description or ""
         if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in described:
-            # A grey profile is only a tone curve, and converting sRGB to sRGB would merely add rounding errors.
+            # A grey profile is only a tone curve. A conversion from sRGB to sRGB would only add
+            # rounding errors.
             return picture
         converted = ImageCms.profileToProfile(
             picture, source, ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC

@@ -1,4 +1,7 @@
-"""`PictureReader`, the interface for reading a capture's images, and `FileReader`. Requires only NumPy and Pillow."""
+"""`PictureReader`, the interface for reading the images of a capture, and `FileReader`.
+
+This module requires only NumPy and Pillow.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,11 @@ Files = Mapping[str, Path]
 
 
 class PictureReader(Protocol):
-    """Interface for reading the images and masks of training and test cameras, all of which are pinhole cameras.
+    """Interface for reading the images and masks of the training and test cameras of a capture.
 
-    Images have the size of their camera in the full rig, regardless of the capture's `image_scale`. A reader keeps at
-    most a few images per camera in memory, and decodes each image once if frames are read in order.
+    All cameras are pinhole cameras, so a reader removes lens distortion. An image has the full size
+    of its camera, regardless of the `image_scale` of the capture. A reader keeps at most a few
+    images per camera in memory.
     """
 
     @property
@@ -46,7 +50,7 @@ class PictureReader(Protocol):
         """Returns a decoded mask, [H, W], 1 on the foreground."""
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Returns an image as an 8-bit file that the service accepts: JPEG, PNG or WebP.
+        """Returns an image as the bytes of an 8-bit file: JPEG, PNG or WebP.
 
         Raises:
             KeyError: if the camera does not exist.
@@ -54,15 +58,16 @@ class PictureReader(Protocol):
         """
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns a mask as a PNG or BMP file, or None if there is none."""
+        """Returns a mask as the bytes of a PNG or BMP file, or None if the image has no mask."""
 
 
 class FileReader:
-    """Reads one file per image, as in the Dynamic3DGaussians layout.
+    """Reader of captures with one file per image, as in the Dynamic3DGaussians layout.
 
     Args:
         images: one mapping per frame, from camera name to image file.
-        masks: one mapping per frame, from camera name to mask file; a frame may lack masks for some cameras.
+        masks: one mapping per frame, from camera name to mask file. Cameras without a mask are
+            absent.
         sizes: maps each camera name to the required (width, height) of its files.
     """
 
@@ -91,7 +96,7 @@ class FileReader:
         return eight_bit_file(read_bytes(self.images[index][camera]), str(self.images[index][camera]))
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns the unchanged mask file, or None if there is none."""
+        """Returns the unchanged mask file, or None if the image has no mask file."""
         return read_bytes(self.masks[index][camera]) if self.has_mask(index, camera) else None
 
 

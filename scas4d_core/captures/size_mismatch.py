@@ -1,4 +1,7 @@
-"""Adapts the intrinsics of cameras whose images do not have the calibrated size. Requires only NumPy."""
+"""Adapts camera intrinsics to images that do not have the size assumed by the calibration.
+
+This module requires only NumPy.
+"""
 
 from __future__ import annotations
 
@@ -35,24 +38,28 @@ def adapt_intrinsics(
     where: str,
     size_mismatch: SizeMismatch | None = None,
 ) -> tuple[NDArray[np.float64], str | None]:
-    """Adapts intrinsics to images whose size differs from the calibrated size, and describes the change.
+    """Adapts intrinsics to images whose size differs from the calibrated size.
 
-    Images with the calibrated aspect ratio were resized, so the intrinsics are scaled. Images with another aspect ratio
-    may have been cropped in several ways, so they are rejected unless `size_mismatch` is given.
+    If the aspect ratio is the same and the size differs by more than ``MIN_RESIZE``, the images
+    were resized, and the intrinsics are scaled. Otherwise, the images may have been cropped in
+    several ways. The caller must then specify `size_mismatch`.
 
     Args:
-        intrinsics: [3, 3] camera matrix in pixels, with the principal point relative to the upper left corner.
+        intrinsics: [3, 3] camera matrix in pixels, with the principal point relative to the upper
+            left corner of the image.
         calibrated: (width, height) for which the camera was calibrated.
         found: actual (width, height) of the images.
         camera: name of the camera, used in messages.
         where: path of the image, used in messages.
-        size_mismatch: how images with a different aspect ratio were produced; if None, they are rejected.
+        size_mismatch: how images were produced that were not merely resized, or None to reject such
+            images.
 
     Returns:
-        The adapted intrinsics, and a remark for the user, which is None if the sizes are equal.
+        The adapted intrinsics, and a remark for the user that describes the change. The remark is
+        None if the sizes are equal.
 
     Raises:
-        CaptureError: if the aspect ratios differ and `size_mismatch` is None.
+        CaptureError: if the images were not merely resized and `size_mismatch` is None.
 
     >>> k = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
     >>> half, remark = adapt_intrinsics(k, (64, 48), (32, 24), camera="c", where="c.png")

@@ -1,7 +1,7 @@
-"""Encodes Gaussians without a reference state, i.e. the first frame's Gaussians and newborn Gaussians.
+"""Encodes Gaussians without a reference: those of the first frame, and newborn ones later.
 
-Later frames are coded relative to these Gaussians, so thin axes must keep their direction. Each axis is therefore
-quantized relative to its own length.
+Later frames are coded relative to these Gaussians, so even thin axes must keep their direction.
+Each axis is therefore quantized relative to its own length.
 """
 
 from __future__ import annotations

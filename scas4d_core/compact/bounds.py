@@ -10,10 +10,11 @@ from scas4d_core.errors import InputError
 
 @dataclass(frozen=True)
 class Bounds:
-    """Maximum error of a decoded state, per component of each attribute.
+    """Maximum error of each attribute of a decoded state.
 
-    A Gaussian's size is the root mean square of the lengths of its three axes. The defaults are the coarsest bounds at
-    which the five test objects lose less than 0.05 dB (see docs/format.md).
+    All errors except that of the rotation are per component. A Gaussian's size is the root mean
+    square of the lengths of its three axes. The defaults are the coarsest bounds at which the five
+    test objects lose less than 0.05 dB (see docs/format.md).
 
     Attributes:
         position: error of the centre, as a fraction of the Gaussian's size.

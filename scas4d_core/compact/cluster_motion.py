@@ -1,7 +1,8 @@
 """Predicts a state from the previous one with one affine map per cluster of Gaussians.
 
-As in the cascade, a map transforms centres (x → x + A (x − c) + t) and axes (F → (I + A) F). Material rotations are
-multiplied by the rotation nearest to I + A. The remaining residual of each Gaussian is small. Requires only NumPy.
+As in the motion cascade of the reconstruction, a map transforms centres (x → x + A (x − c) + t) and
+axes (F → (I + A) F). Material rotations are multiplied by the rotation nearest to I + A. After the
+prediction, the residual of each Gaussian is small. This module requires only NumPy.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ class ClusterMotion:
         moments[:, 3, 3] += 1e-12 + (moments[:, 3, 3] == 0)
         try:
             maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
-        except np.linalg.LinAlgError:  # near float64 overflow; code everything as residuals
+        except np.linalg.LinAlgError:  # values near float64 overflow; code all motion as residuals
             maps = np.zeros((clusters.count, 4, 3))
         maps[~np.isfinite(maps).all(axis=(1, 2))] = 0
         return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])

@@ -164,7 +164,7 @@ def label_of(levels: NDArray[Any]) -> Array:
 
 
 def products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Returns the quaternion products a∘b, [4, N]; b is applied first."""
+    """Returns the quaternion products a∘b, [4, N], which apply the rotation b first."""
     return np.stack(product_components(a, b))
 
 
@@ -198,7 +198,7 @@ def decorrelate_colours(colours: NDArray[Any]) -> NDArray[Any]:
 
 
 def restore_colours(planes: NDArray[Any]) -> NDArray[Any]:
-    """Inverts ``decorrelate_colours``; returns red, green and blue, [3, N]."""
+    """Converts the output of ``decorrelate_colours`` back to RGB, [3, N]."""
     green, red, blue = planes
     return np.stack([red + green, green, blue + green])
 
@@ -216,7 +216,7 @@ def rotation_vectors(turns: NDArray[Any]) -> NDArray[Any]:
 
 
 def rotations_of_vectors(vectors: NDArray[Any]) -> NDArray[Any]:
-    """Inverts ``rotation_vectors``; returns unit quaternions [4, N]."""
+    """Converts the output of ``rotation_vectors`` back to unit quaternions [4, N]."""
     squares = 1 + np.square(vectors).sum(axis=0) / 4
     return np.asarray(np.concatenate([np.ones_like(vectors[:1]), vectors / 2]) / np.sqrt(squares))
 

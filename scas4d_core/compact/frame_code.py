@@ -1,7 +1,7 @@
 """Encodes a state as cluster motion and per-Gaussian residuals, relative to a reference known to the reader.
 
 The reference is a decoded state, so errors do not accumulate: each frame corrects the errors of the previous one.
-Requires only NumPy.
+This module requires only NumPy and zstandard.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _codes_all_rows(reference: Columns, clusters: Clusters) -> bool:
-    """Returns whether to code all rows without a search for static ones, because all of them move or there is gloss."""
+    """Returns whether to code all rows: no row is static, or the Gaussians have gloss."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 

@@ -37,6 +37,9 @@ class PlaneError(ValueError):
 def pack(values: NDArray[Any]) -> bytes:
     """Encodes integers [N], each below 2³¹ in absolute value, as self-describing bytes.
 
+    Raises:
+        OverflowError: if a value is too large.
+
     >>> unpack(pack(np.array([0, -1, 3, 1000])), 4)[0]
     array([   0,   -1,    3, 1000], dtype=int32)
     """
@@ -123,7 +126,11 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
 
 
 def _bits(unsigned: Unsigned) -> int:
-    """Returns the packing mode with the smallest size, estimated from the values' entropy and the cost of escapes."""
+    """Returns the packing mode of a plane, in bits per value.
+
+    The mode is ``WIDE`` if many values exceed a byte. Otherwise, the mode has the smallest size,
+    estimated from the entropy of the values and the cost of escapes.
+    """
     count = len(unsigned)
     below = np.bincount(np.minimum(unsigned, 256), minlength=257)
     costs = []

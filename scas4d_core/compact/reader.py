@@ -1,4 +1,7 @@
-"""Reads compact files, even truncated files and files that are being written. Requires only NumPy and zstandard."""
+"""Reads compact files, including truncated files and files that are still being written.
+
+This module requires only NumPy and zstandard.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ MAX_PER_BYTE = 4
 
 
 class CompactReader:
-    """Reads the states of a file in any order.
+    """Reader of a compact file, which can decode the states in any order.
 
     Args:
         path: path of the file.
@@ -149,7 +152,9 @@ class CompactReader:
         return sum(self._born_count(record) for record in self._births)
 
     def state(self, index: int) -> Gaussians:
-        """Returns the state of a frame in the internal world of ``head.world``. Its arrays must not be modified.
+        """Returns the state of a frame, in the internal world of ``head.world``.
+
+        The arrays of the state must not be modified.
 
         Raises:
             FileError: if the file has no such frame.
@@ -175,15 +180,18 @@ class CompactReader:
         return state.gaussians()
 
     def copy_records(self, first: int, last: int, file: BinaryIO) -> list[int]:
-        """Copies the records of a range of frames to another file, without an index. Decoded states stay bit-identical.
+        """Copies the states of a range of frames to another file.
+
+        States decoded from the copy are bit-identical. The copy has no index, notes or part labels.
 
         Args:
             first, last: first and last frame, inclusive.
             file: output file.
 
         Returns:
-            Indices of the copied frames, up to the first damaged one. They include this file's first frame and the key
-            frame before ``first``, on which the others depend.
+            Indices of the copied frames, up to the first damaged one. They include frames on which
+            the requested frames depend: the first frame of this file, and all frames from the last
+            key frame up to ``first``.
 
         Raises:
             FileError: if no frame is in the range.
@@ -231,7 +239,7 @@ class CompactReader:
         return self._whole
 
     def encoder_state(self) -> EncoderState:
-        """Returns the state that a writer needs to append to the file; the file must contain at least one frame."""
+        """Returns what a writer needs to append to the file. The file must contain a frame."""
         place = len(self._states) - 1
         self.state(self._frames[place])
         record, columns = self._states[place], self._last
@@ -243,7 +251,7 @@ class CompactReader:
         return EncoderState(self.head, records, record, columns[1], born, clusters, place - key)
 
     def sizes(self) -> list[tuple[int, int, int]]:
-        """Returns (frame index, bytes since the previous state, checksum of the state) for each frame."""
+        """Returns each state's frame index, bytes since the previous state, and checksum."""
         ends = [0, *(one.end for one in self._states)]
         return [(one.frame, one.end - before, one.checksum) for one, before in zip(self._states, ends, strict=False)]
 
@@ -269,7 +277,7 @@ class CompactReader:
         self._records.append(record)
         if record.kind is RecordKind.BORN:
             self._births.append(record)
-            if not self._states:  # the first frame is its own birth record
+            if not self._states:  # the first birth record is also the state of the first frame
                 self._states.append(record)
                 self._frames.append(record.frame)
         elif record.kind in STATES:

@@ -103,7 +103,10 @@ def record_bytes(kind: RecordKind, body: bytes, frame: int = -1, time: float = 0
 
 
 def checksum_bytes(record: Record) -> bytes:
-    """Returns the checksum of a record's body as bytes; a delta's body begins with that of the previous state."""
+    """Returns the checksum of a record's body as bytes.
+
+    The body of a delta record begins with the checksum of the previous state.
+    """
     return _CHECKSUM.pack(record.checksum)
 
 
@@ -117,6 +120,7 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
 
     Raises:
         DamagedFileError: if there is no valid record at an offset where one is expected.
+        FileError: if a record has an unknown kind.
     """
     file.seek(0, 2)
     size = file.tell()
@@ -146,6 +150,7 @@ def checked_records(path: Path) -> Iterator[int]:
     Raises:
         FileNotFoundError: if the file does not exist.
         DamagedFileError: if a record is damaged.
+        FileError: if a record has an unknown kind.
     """
     with path.open("rb") as file:
         for record in scan(file, 0, path.name):
@@ -194,7 +199,7 @@ def note_bytes(note: Mapping[str, Any]) -> bytes:
         note: content of the note, as JSON values.
 
     Raises:
-        ValueError: if the note is not valid JSON, or is longer than 16 MB.
+        ValueError: if the note cannot be serialized as JSON, or is longer than 16 MiB.
 
     >>> read_note(note_bytes({"psnr": 36.5}))
     {'psnr': 36.5}

@@ -1,4 +1,7 @@
-"""Decodes a state attribute by attribute, from residuals quantized to the error bounds. Requires only NumPy."""
+"""Computes and applies quantized residuals of a state, one attribute at a time.
+
+The quantization steps follow from the error bounds. This module requires only NumPy and zstandard.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +117,7 @@ class DecodedState:
         factors = np.stack(multiply_rows(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)
         rotations /= np.sqrt(np.square(rotations).sum(axis=0))
-        # Rows without rotation must stay bit-identical, regardless of which other rows are coded with them.
+        # Rows that do not rotate must stay bit-identical, whichever other rows are coded with them.
         rotations = np.where(vectors.any(axis=0), rotations, self.state.rotations)
         return replace(self, state=self.state.replace(rotations=rotations, factors=factors))
 
@@ -122,7 +125,7 @@ class DecodedState:
 def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
     """Converts residuals [P, N] to int32, and returns a mask [N] of rows with non-finite or too large values.
 
-    In the result, such values are replaced by 0.
+    In the int32 array, such values are replaced by 0.
     """
     outside = ~(np.abs(found) < LARGEST)
     return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)

@@ -39,7 +39,7 @@ KEY_EVERY = 8
 
 
 class CompactWriter:
-    """Writes the states of a scene to a new file.
+    """Writer of a new compact file, which adds the states of a scene frame by frame.
 
     Args:
         path: path of the file, which must not exist.
@@ -53,6 +53,7 @@ class CompactWriter:
 
     Raises:
         FileExistsError: if the file exists.
+        FileError: if ``key_every`` is less than 1.
 
     >>> from tempfile import TemporaryDirectory
     >>> from scas4d_core.cameras import WorldFrame
@@ -93,7 +94,9 @@ class CompactWriter:
 
     @classmethod
     def resume(cls, path: Path | str, key_every: int = KEY_EVERY) -> CompactWriter:
-        """Resumes an unclosed file after its last complete state; anything after that is discarded.
+        """Resumes an unclosed file after its last complete state.
+
+        Records after that state are discarded, except its part labels.
 
         ``errors`` covers the existing frames that have a note, and all frames added from now on.
 

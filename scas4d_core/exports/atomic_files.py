@@ -1,4 +1,7 @@
-"""Writes files atomically, and imports packages that only some exports need. Requires only the standard library."""
+"""Writes files atomically, and imports packages that only some exports need.
+
+This module itself requires only the standard library.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def _beside(target: Path) -> Path:
 
 @contextmanager
 def translate_write_errors(path: Path | str) -> Iterator[None]:
-    """Converts an ``OSError`` to an ``InputError`` that names the output."""
+    """Converts an ``OSError`` during writing to an ``InputError`` that names the output file."""
     try:
         yield
     except OSError as error:
@@ -73,7 +76,7 @@ def translate_write_errors(path: Path | str) -> Iterator[None]:
 
 
 def import_optional(name: str, export: str) -> Any:
-    """Imports a package from the optional dependencies ``exports``.
+    """Imports a module that only some exports need, and returns it.
 
     Args:
         name: name of the module.

@@ -1,7 +1,8 @@
 """The Gaussians of one frame, prepared for export: decomposed covariances in the user's world, harmonics and ids.
 
-OpenCV axes are x right, y down, z forward; those of glTF, SPZ and USD are x right, y up, z towards the viewer. A half
-turn about x converts one to the other. It is a rotation, so nothing is mirrored, and it is its own inverse.
+OpenCV axes are x right, y down, z forward. The axes of glTF, SPZ and USD are x right, y up, z
+towards the viewer. A half turn about x converts between the two conventions. The half turn is a
+rotation, so it does not mirror the scene, and it is its own inverse.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ class Cloud:
     """The exported Gaussians of one frame.
 
     Attributes:
-        splats: means, scales, rotations, opacities and colours; only degree 0 of view-dependent colours.
+        splats: means, scales, rotations, opacities and colours. If colours depend on the view, they
+            are those of the harmonic of degree 0.
         harmonics: [N, K, 3] spherical harmonic coefficients of RGB − 0.5; K = 1, or 16 for view-dependent colours.
         ids: [N] int64 Gaussian ids.
     """
@@ -44,7 +46,7 @@ class Cloud:
         return len(self.ids)
 
     def half_turned(self) -> Cloud:
-        """Rotates the axes by 180° about x, so that y points up and z towards the viewer.
+        """Returns the cloud in axes rotated by 180° about x: y points up, and z towards the viewer.
 
         >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.1), WorldFrame(np.zeros(3)))
         >>> seen.half_turned().splats.means
@@ -62,7 +64,7 @@ class Cloud:
         )
 
     def scaled(self, length: float) -> Cloud:
-        """Multiplies all lengths by ``length``, for example by the metres per unit of the user's world.
+        """Returns the cloud with all lengths multiplied by ``length``, such as the metres per unit.
 
         >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.5), WorldFrame(np.zeros(3)))
         >>> seen.scaled(100).splats.scales
@@ -87,7 +89,8 @@ def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) 
         retired: whether to keep retired Gaussians, with opacity 0, instead of omitting them.
 
     Raises:
-        InputError: if some Gaussians have non-finite values or no volume; the message lists their rows and ids.
+        InputError: if some Gaussians have non-finite values or no volume. The message gives their
+            number, and the rows and ids of the first five.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1).retire([0])
     >>> found = cloud_of(state, WorldFrame(np.zeros(3), metres_per_unit=0.5))

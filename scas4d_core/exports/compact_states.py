@@ -19,7 +19,7 @@ Colour = tuple[float, float, float]
 
 
 class CompactSequence:
-    """Writes a sequence frame by frame. The file appears atomically on ``finish``.
+    """Writer of a compact 4D file, frame by frame. ``finish`` gives the file its final name.
 
     Args:
         path: path of the file; an existing file is replaced.
@@ -71,7 +71,8 @@ class CompactSequence:
         """Adds a frame, given its index, its time in seconds, and its state in the internal world.
 
         Raises:
-            InputError: if the frame cannot follow the previous frames, or has non-finite values.
+            InputError: if the frame cannot follow the previous frames, has non-finite values, or
+                cannot be written.
         """
         with translate_write_errors(self.path):
             try:

@@ -216,7 +216,7 @@ def check_suffix(path: Path, format: Format) -> None:
 
 
 def table() -> str:
-    """Returns the formats as a Markdown table; formats that differ only in name share a row.
+    """Returns a Markdown table of the formats; formats that differ only in their names share a row.
 
     >>> print(table().splitlines()[0])
     | name | suffixes | sequence | axes | unit | colour | scale | opacity | shape | ids | lost |

@@ -1,6 +1,7 @@
 """The ``.glb`` container (glTF 2.0, section 4): a JSON chunk, and a binary chunk referenced by accessors.
 
-Implemented without a third-party package, because splats need only a small subset of glTF.
+This module does not use a third-party glTF package, because splats need only a small subset of
+glTF.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ GENERATOR = "SCas4D"
 
 
 class Binary:
-    """Collects the arrays of one ``.glb`` file.
+    """The arrays of one ``.glb`` file, collected in memory until ``write``.
 
     Attributes:
         accessors, views: accessors and buffer views of the JSON document.

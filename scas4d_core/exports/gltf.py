@@ -1,15 +1,19 @@
 """Writes a frame as ``.glb`` with KHR_gaussian_splatting, as ratified by Khronos (see its README in KhronosGroup/glTF).
 
-Scale is linear and nonnegative, opacity linear in 0…1, rotation a unit quaternion (x, y, z, w), all float32. Harmonics
-have the signs and the order of 3DGS. Drafts of the extension used the logarithm of the scale.
+The extension stores a linear, nonnegative scale, a linear opacity in 0…1, and the rotation as a
+unit quaternion (x, y, z, w), all in float32. Harmonics have the same signs and order as in 3DGS.
+Drafts of the extension stored the logarithm of the scale.
 
-In glTF, y points up and z towards the viewer, and lengths are in metres. Positions, rotations and harmonics are rotated
-by 180° about x and converted to metres *in the data*, and the node's transform is the identity. The extension specifies
-that a reader SHOULD rotate harmonics with the node, so some readers will not. The half turn only changes signs, so it
-is lossless. ``asset.extras`` stores ``metres_per_unit`` for the inverse conversion.
+In glTF, y points up and z towards the viewer, and lengths are in metres. The half turn about x and
+the conversion to metres are applied to the stored *values*, and the node's transform is the
+identity. A rotation in the node would be less portable: the extension says only that a reader
+SHOULD rotate harmonics with the node. The half turn is lossless, because it only changes signs and
+the order of quaternion components. ``asset.extras`` stores ``metres_per_unit`` for the inverse
+conversion.
 
-Readers without the extension show points coloured by ``COLOR_0`` (linear light, 16 bits). ``_ID`` contains the ids
-as float32, which is exact below 2²⁴; it is omitted if an id is larger.
+Readers without the extension show points coloured by ``COLOR_0`` (linear light, 16 bits). The
+attribute ``_ID`` stores the ids as float32, which represents integers below 2²⁴ exactly. The
+attribute is omitted if any id is 2²⁴ or more.
 """
 
 from __future__ import annotations
@@ -42,8 +46,8 @@ def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
         world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: if some Gaussians have non-finite values or no volume, the file would exceed 4 GiB, or it cannot be
-            written.
+        InputError: if some Gaussians have non-finite values or no volume, or if the file would
+            exceed 4 GiB or cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

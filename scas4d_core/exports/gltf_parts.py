@@ -1,15 +1,18 @@
 """Writes an articulated asset: one ``.glb`` with a node per part that contains the part's splats and rigid motion.
 
-Each node contains the Gaussians of the first frame in the part's local frame. A linear animation contains the part's
-translation and rotation, with times in seconds since the first frame. Gaussians without a part do not move and are
-stored in the node ``standing``. Axes, units and attributes are the same as in ``gltf``. Deformation within a part,
-Gaussians born later, and changes of colour and size are lost. Highlights rotate with the part instead of staying fixed
-in the world.
+Each node contains the part's Gaussians as they are in the first frame, in the part's local
+coordinates. A linear animation contains the part's translation and rotation, with times in seconds
+since the first frame. Gaussians without a part do not move and are stored in the node ``standing``.
+Axes, units and attributes are the same as in ``gltf``. Deformation within a part, Gaussians born
+later, and changes of colour and size are lost. Highlights rotate with the part instead of staying
+fixed in the world.
 
-The ``extras`` of a node report the residual of the rigid motion. ``residual_rms`` is the weighted RMS distance between
-the rigid prediction and the means over all frames after the first. ``residual_worst`` is the distance in the worst
-frame, whose index is ``worst_frame``. Both are in the user's units; with the suffix ``_percent``, they are percentages
-of the extent of the moving Gaussians.
+The ``extras`` of a node report the residual of the part's rigid motion. The residual of a frame is
+the weighted RMS distance between the means and their rigid prediction. ``residual_rms`` is the RMS
+of the residuals of all frames after the first. ``residual_worst`` is the largest of these
+residuals, and ``worst_frame`` is the index of its frame. Both residuals are in the user's units.
+The values with the suffix ``_percent`` are percentages of the extent of the moving Gaussians in the
+first frame.
 """
 
 from __future__ import annotations
@@ -55,7 +58,9 @@ class _Keyframes:
 
 
 class PartAsset:
-    """Writes a sequence as an articulated asset. Memory use is the first frame plus 64 bytes per part and frame.
+    """Writer of an articulated asset. The file is written by ``finish``.
+
+    Only the first frame and the pose of each part in each frame are kept in memory.
 
     Args:
         path: path of the file.
@@ -115,7 +120,8 @@ class PartAsset:
         """Writes the file atomically.
 
         Raises:
-            InputError: if no frame was added, or the file cannot be written.
+            InputError: if no frame was added, some Gaussians cannot be exported, or the file cannot
+                be written.
         """
         if self._motion is None or self._first is None:
             raise InputError("there are no frames to export", "add at least one frame")
@@ -125,7 +131,7 @@ class PartAsset:
         meshes: list[dict[str, Any]] = []
         samplers: list[dict[str, Any]] = []
         channels: list[dict[str, Any]] = []
-        times: dict[tuple[float, ...], int] = {}  # parts present in the same frames share one accessor
+        times: dict[tuple[float, ...], int] = {}  # parts with the same times share an accessor
         left = self._first.present.copy()
         for part, keys in self._keys.items():
             rows = self._motion.rows(part)

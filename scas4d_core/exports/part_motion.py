@@ -1,7 +1,8 @@
-"""Fits the rigid motion of each part since the first frame, by weighted Kabsch over the means of its Gaussians.
+"""Fits the rigid motion of each part since the first frame with the weighted Kabsch algorithm.
 
-Each Gaussian is weighted by its image coverage. If the means leave a rotation undetermined, such as that of a thin rod
-about its axis, the Gaussians' material rotations determine it.
+The fitted points are the means of the part's Gaussians, weighted by image coverage. If the means
+leave a rotation undetermined, such as that of a thin rod about its axis, the Gaussians' material
+rotations determine the rotation.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ PULL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PartPose:
-    """The pose of a part in one frame. It maps a local point x₀ to ``rotation @ x₀ + position`` in the user's world.
+    """The pose of a part in one frame, which maps a local point x₀ to ``rotation @ x₀ + position``.
 
-    The local frame has the user's axes; its origin is the weighted centre of the part in the first frame.
+    The result is in the user's world. Local coordinates have the user's axes. The local origin is
+    the weighted centre of the part in the first frame.
 
     Attributes:
         part: label of the part.
@@ -53,9 +55,10 @@ class PartPose:
 
 
 class PartMotion:
-    """Tracks the rigid motion of parts from a first frame onwards. Stores the means of that frame, but no later frames.
+    """The rigid motion of parts relative to a first frame.
 
-    Gaussians that were born after the first frame, or are retired in the current one, are ignored.
+    Only the first frame is stored. Gaussians that were born after the first frame, or that are
+    retired in the given frame, are ignored.
 
     Args:
         labels: [N] part label of each Gaussian, negative for none.
@@ -65,6 +68,7 @@ class PartMotion:
     Attributes:
         parts: labels with at least one Gaussian in the first frame, in increasing order.
         extent: extent of the moving Gaussians in the first frame, in the user's units; the reference for percentages.
+        origins: local origin [3] of each part in the user's world, keyed by label.
 
     Raises:
         InputError: if the labels have an invalid shape or type, or no Gaussian of the first frame belongs to a part.
@@ -122,11 +126,11 @@ class PartMotion:
 def majority_motion(
     before: NDArray[Any], after: NDArray[Any], weights: NDArray[Any] | None = None, near: NDArray[Any] | None = None
 ) -> tuple[Float, Float, float]:
-    """Fits the rigid motion of the majority of points; arguments and results are the same as in ``rigid_motion``.
+    """Fits the rigid motion of most points; arguments and results are those of ``rigid_motion``.
 
-    Cauchy weights, scaled by the median distance, suppress outliers (Holland and Welsch 1977). Outliers occur because a
-    part segmented by motion includes Gaussians of its neighbours, and interior Gaussians that no image constrains. The
-    returned RMS distance is over all points.
+    Cauchy weights, scaled by the median distance, suppress outliers (Holland and Welsch 1977). A
+    part that was segmented by motion has outliers: Gaussians of neighbouring parts, and interior
+    Gaussians that no image constrains. The returned RMS distance is over all points.
 
     >>> before = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [2, 2, 2]])
     >>> shift = majority_motion(before, before + np.where(np.arange(6)[:, None] < 5, [0, 0, 1], [5, 0, 0]))[1]
@@ -208,6 +212,9 @@ def quaternion_of(rotation: NDArray[Any]) -> Float:
 
 def part_labels(labels: NDArray[Any], count: int) -> NDArray[np.int64]:
     """Truncates labels to ``count`` entries, or pads them with −1 for Gaussians that were born later.
+
+    Raises:
+        InputError: if the labels are not an integer array of shape [N].
 
     >>> part_labels(np.array([0, 1]), 3)
     array([ 0,  1, -1])

@@ -41,7 +41,7 @@ FRAME_WRITERS: dict[str, Callable[[Path, Gaussians, WorldFrame], None]] = {
 
 
 class SequenceWriter(Protocol):
-    """Writes a sequence to one output, frame by frame."""
+    """Interface of a writer that adds frames to one output."""
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Adds a frame."""
@@ -66,7 +66,7 @@ def export_sequence(
     background: Colour = (0.0, 0.0, 0.0),
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes frames in the given format, with at most one state in memory.
+    """Exports frames in the given format. Frames are read and written one at a time.
 
     Numbered files are named ``frame_000012.ply`` for frame 12. Each file is written atomically and replaces any
     existing file. A ``.zip`` or a single file appears only when it is complete. After an error, complete numbered files
@@ -82,8 +82,8 @@ def export_sequence(
         rig: rig in the user's world; used by USD and ``s4d``.
         parts: [N] part label of each Gaussian, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
         ids: ids of the Gaussians to write for ``tracks``, or None for all moving Gaussians.
-        frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None, the latter is derived
-            from the first two frames.
+        frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None,
+            the rate of the time codes is derived from the first two frames.
         background: background colour, RGB in 0…1; stored only by ``s4d``.
         progress: function called after each frame.
 

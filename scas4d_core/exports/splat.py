@@ -1,9 +1,10 @@
 """Writes and reads the ``.splat`` format of antimatter15/splat (its ``convert.py`` and ``main.js``).
 
-There is no header, just 32 bytes per Gaussian, little-endian: position 3×float32, scale 3×float32 (linear standard
-deviations), RGBA 4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. Axes and unit are the user's, as in the 3DGS
-``.ply``. Colour is the degree 0 component, and opacity is linear. Viewers render a file while it loads, so the largest
-and most opaque Gaussians come first, as in ``convert.py``. Row order and ids are lost.
+A file has no header. Each Gaussian has 32 bytes, little-endian: position 3×float32, scale 3×float32
+(linear standard deviations), RGBA 4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. Axes and
+unit are the user's, as in the 3DGS ``.ply``. Colour is the component of degree 0, and opacity is
+linear. Viewers render a file while it loads, so the largest and most opaque Gaussians come first,
+as in ``convert.py``. Row order and ids are lost.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("
 def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
     """Writes one frame atomically, without its retired Gaussians.
 
-    Of the equivalent quaternions q and −q, the one with a negative largest component is written, because a byte can
-    represent −1 but not +1.
+    The quaternions q and −q are equivalent. The one whose component of largest magnitude is
+    negative is written, because a byte can represent −1 but not +1.
 
     Args:
         path: path of the file.

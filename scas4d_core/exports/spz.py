@@ -1,8 +1,10 @@
-"""Writes and reads SPZ (Niantic, github.com/nianticlabs/spz), versions 3 (gzip) and 4 (zstd), using the gsply package.
+"""Writes and reads the SPZ format (Niantic, github.com/nianticlabs/spz) with the gsply package.
 
-As SPZ's README states, axes are RUB: x right, y up, z backward, that is, the user's world rotated by 180° about x.
-gsply does not convert axes, so this module does. Lengths are in metres, for which the format's value ranges are
-designed. Quantization, from gsply 0.4.6 and Niantic's ``load-spz.cc``:
+Versions 3 (gzip) and 4 (zstd) are written, and versions 1 to 4 are read. As SPZ's README states,
+axes are RUB: x right, y up, z backward, that is, the user's world rotated by 180° about x. gsply
+does not convert axes, so this module does. Lengths are in metres, because the value ranges of the
+format are designed for metres. The format quantizes as follows, according to gsply 0.4.6 and
+Niantic's ``load-spz.cc``:
 
 - positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m, with the largest number of fractional bits f for which the frame fits;
 - scales: the logarithm in one byte, 16 steps per factor of e: ±3.2 %, clipped below 45 µm or above 379 m;

@@ -54,7 +54,9 @@ class _Table:
 
 
 class TrackTable(_Table):
-    """Writes the Gaussians' means frame by frame; the ``confidence`` column is empty, because it is unknown.
+    """CSV table of the means of Gaussians, written frame by frame.
+
+    The column ``confidence`` is empty, because states have no confidence.
 
     Args:
         path: path of the file.
@@ -90,7 +92,7 @@ class TrackTable(_Table):
 
 
 class PoseTable(_Table):
-    """Writes the rigid motion of parts since the first frame (``part_motion``), frame by frame.
+    """CSV table of the rigid motion of parts since the first frame, written frame by frame.
 
     A point of a part at x in the first frame is at R (x − t₀) + t in a later frame, both in the user's world. Here, t
     is (tx, ty, tz), R is the rotation of the unit quaternion (qw, qx, qy, qz), and t₀ is t in the first frame.
@@ -136,9 +138,10 @@ class PoseTable(_Table):
 
 
 def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
-    """Writes queried tracks with their confidence; points absent from a frame have no row for that frame.
+    """Writes queried tracks with their confidence.
 
-    The column ``id`` contains the Gaussian with the largest weight for each point, so two points may share an id.
+    A point has no row for a frame in which the point is absent. The column ``id`` contains the
+    Gaussian with the largest weight for each point, so two points may share an id.
 
     Args:
         path: path of the file.

@@ -11,8 +11,8 @@ the cameras of the rig.
 The stage is y-up, that is, the user's world rotated by 180° about x. Its unit is the user's, given by
 ``metersPerUnit``. A time code is the number of seconds since the first frame times ``timeCodesPerSecond``.
 
-Frames are saved one by one, so memory use does not grow with their number. As a trade-off, a temporary copy next to the
-target doubles the disk space needed during the export.
+Frames are saved one by one, so memory use does not grow with the number of frames. In return, a
+temporary copy next to the target doubles the disk space needed during the export.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ DEFAULT_RATE = 24.0
 
 
 class UsdSequence:
-    """Writes a sequence frame by frame. The file appears atomically on ``finish``.
+    """Writer of a USD file, frame by frame. ``finish`` gives the file its final name.
 
     Args:
         path: output path with suffix ``.usdc`` or ``.usd`` (binary), ``.usda`` (text, about three times as large) or
@@ -166,7 +166,7 @@ class UsdSequence:
         self._save()
 
     def finish(self) -> None:
-        """Completes the stage and renames the file to its final name.
+        """Completes the stage, and writes it to the output path in the format of the suffix.
 
         Raises:
             InputError: if no frame was added, or the file cannot be written.

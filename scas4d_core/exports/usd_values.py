@@ -24,10 +24,11 @@ NEAREST, FARTHEST = 0.01, 1000.0
 
 
 class AnimatedValues:
-    """Writes time samples of an attribute with one value per Gaussian, but only when values change.
+    """Writer of the time samples of a USD attribute, such as one value per Gaussian.
 
-    USD interpolates between samples, so the previous frame's value is also written before a change. Gaussians born
-    later make samples longer, so shorter samples are padded before the file is completed (``lengthen``).
+    A sample is written only when values change. USD interpolates between samples, so the previous
+    frame's values are also written before a change. Gaussians born later make samples longer, so
+    shorter samples are padded before the file is completed (``lengthen``).
 
     Args:
         attribute: USD attribute.
@@ -62,7 +63,7 @@ class AnimatedValues:
         return not (grown and self._unborn is not None) and np.array_equal(before, after[: len(before)])
 
     def lengthen(self) -> Iterator[None]:
-        """Pads all samples to the full length; yields after each, so that the caller can save it."""
+        """Pads all samples to the full length; yields after each so that the caller can save it."""
         if len(self._births) < 2:
             return
         full = np.concatenate(self._births)
@@ -75,7 +76,7 @@ class AnimatedValues:
                 yield
 
     def store_constant_as_default(self) -> None:
-        """Stores the value of an attribute with a single sample as its default, for readers without time support."""
+        """Replaces a single time sample by a default value, for readers without time support."""
         codes = self._attribute.GetTimeSamples()
         if len(codes) == 1:
             value = self._attribute.Get(codes[0])
@@ -99,7 +100,9 @@ def quaternions_of(values: Array) -> Any:
 
 
 def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
-    """Converts a part's pose, [3, 3] and [3], from the user's axes to the stage's axes, both in the world and locally.
+    """Converts a part's rotation [3, 3] and position [3] from the user's axes to the stage's axes.
+
+    In the result, both the world and the part's local coordinates have the stage's axes.
 
     >>> to_stage_pose(np.eye(3), np.array([1.0, 2, 3]))[1]
     array([ 1., -2., -3.])
@@ -110,8 +113,9 @@ def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
 def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
     """Sets the attributes of a UsdGeomCamera from a camera in the user's world.
 
-    A USD camera looks along −z with y up, like an OpenCV camera after a half turn about x. At the focal length f, its
-    window has the size (w/fx, h/fy)·f and the offset ((w/2 − cx)/fx, (cy − h/2)/fy)·f from the axis.
+    A USD camera looks along −z with y up, like an OpenCV camera after a half turn about x. At the
+    focal length f, the aperture has the size (w/fx, h/fy)·f and the offset
+    ((w/2 − cx)/fx, (cy − h/2)/fy)·f.
     """
     gf, geometry = import_optional("pxr.Gf", "usd"), import_optional("pxr.UsdGeom", "usd")
     pose = np.eye(4)

@@ -1,9 +1,13 @@
-"""Cluster hierarchy (paper, Training Strategy): K-means for the finest layer, agglomerative merging for the others.
+"""Builds the hierarchy of clusters of moving Gaussians (paper, Training Strategy).
 
-Clusters are numbered such that, with Gaussians sorted by their finest cluster, every cluster of every layer is a
-contiguous range. The kernels and the gradient sums rely on this order.
+K-means creates the clusters of the finest layer. Agglomerative clustering merges these clusters
+into those of the coarser layers.
 
-Gaussians with non-finite positions belong to no cluster. They do not move, and are counted (``guards.LEFT_OUT``).
+The Gaussians are sorted such that every cluster of every layer is a contiguous range. The kernels
+and the gradient sums rely on this order.
+
+A Gaussian with a non-finite position belongs to no cluster and does not move. The number of such
+Gaussians is reported (``guards.LEFT_OUT``).
 """
 
 from __future__ import annotations
@@ -30,10 +34,14 @@ class Hierarchy:
     """Nested clusters of the M moving Gaussians.
 
     Attributes:
-        rows: [M] int64 row of each moving Gaussian in Θ, in an order that makes clusters contiguous.
-        labels: for each layer, coarse to fine, the [M] int32 cluster index of each entry of ``rows``, ascending.
-        starts: for each layer, the [K + 1] int64 boundaries of the clusters in ``rows``.
-        left_out: number of moving Gaussians that belong to no cluster because they have non-finite positions.
+        rows: [M] int64 row of each moving Gaussian in Θ, in an order in which all clusters are
+            contiguous.
+        labels: one array per layer, coarse to fine: the [M] int32 cluster index of each entry of
+            ``rows``, in ascending order.
+        starts: one array per layer, coarse to fine: the [K + 1] int64 boundaries of its K clusters
+            in ``rows``.
+        left_out: number of moving Gaussians that belong to no cluster because their positions are
+            not finite.
     """
 
     rows: Int
@@ -43,12 +51,12 @@ class Hierarchy:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Number of clusters per layer."""
+        """Number of clusters in each layer, coarse to fine."""
         return tuple(len(starts) - 1 for starts in self.starts)
 
     @property
     def without_layers(self) -> Hierarchy:
-        """A hierarchy of the same Gaussians in the same order, but without layers."""
+        """Hierarchy of the same Gaussians in the same order, but without layers."""
         return Hierarchy(self.rows, (), (), self.left_out)
 
 
@@ -58,14 +66,17 @@ def build_hierarchy(
     """Groups the moving Gaussians into layers of nested clusters (paper, Training Strategy).
 
     Args:
-        means: [N, 3] positions in metres; Gaussians with non-finite positions belong to no cluster.
+        means: [N, 3] positions in metres. A Gaussian with a non-finite position belongs to no
+            cluster.
         moving: [N] bool mask of the Gaussians to cluster.
-        clusters: number of clusters per layer, coarse to fine, ascending; no layers if empty.
-        smallest: minimum average number of Gaussians per cluster, which caps the numbers of clusters.
+        clusters: number of clusters of each layer, coarse to fine, in ascending order. If empty,
+            the hierarchy has no layers.
+        smallest: minimum average number of Gaussians per cluster. It limits the number of clusters
+            of each layer; layers that thereby become identical are merged.
         seed: random seed of K-means.
 
     Raises:
-        ValueError: if the numbers of clusters are not ascending.
+        ValueError: if the numbers of clusters are not strictly ascending.
 
     >>> points = np.array([[0, 0, 0], [5, 0, 0], [0.1, 0, 0], [5.1, 0, 0], [9, 9, 9]])
     >>> moving = np.array([True, True, True, True, False])
@@ -85,7 +96,8 @@ def build_hierarchy(
     if not sizes:
         return Hierarchy(rows, (), (), left_out)
     points = np.asarray(means, dtype=np.float64)[rows]
-    # Sums in the libraries depend on the order of threads, so a single thread is used for reproducible clusters.
+    # The rounding of sums in BLAS and OpenMP depends on the number of threads. A single thread
+    # makes the clusters reproducible.
     with threadpool_limits(limits=1):
         finest = _kmeans(points, sizes[-1], seed)
         layers = [finest]
@@ -105,10 +117,10 @@ def build_hierarchy(
 def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
     """Returns the [M] K-means labels of points [M, 3], without empty clusters.
 
-    Points are centred and in float64. Despite rounding differences between processors, nearly equidistant points thus
-    get the same label everywhere.
+    The points are centred and in float64. Rounding errors differ between processors, but are then
+    too small to change labels in practice.
     """
-    from sklearn.cluster import KMeans  # the import takes a second and is not needed for views and frame 0
+    from sklearn.cluster import KMeans  # imported here, because the import takes a second
 
     points = points - points.mean(axis=0)
     limit = KMEANS_SAMPLE_PER_CLUSTER * count
@@ -122,11 +134,12 @@ def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
 
 
 def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
-    """Returns the [M] labels after merging clusters into ``count`` larger ones.
+    """Merges clusters into ``count`` larger ones, and returns the [M] labels of the points.
 
-    Agglomerative clustering of the centroids (as in the paper) initializes K-means over the clusters. K-means assigns
-    clusters at a border to the nearer parent and keeps the layers nested. Without K-means, clusters that were merged
-    early would stay together even if they no longer belong together.
+    As in the paper, agglomerative clustering merges the centroids of the clusters. Its result
+    initializes K-means over the centroids, which assigns each cluster to the nearest larger one.
+    Without K-means, clusters that were merged early would stay together even if another assignment
+    is better. Whole clusters are assigned, so the layers stay nested.
     """
     from sklearn.cluster import AgglomerativeClustering, KMeans
 

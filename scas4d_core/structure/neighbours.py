@@ -1,4 +1,7 @@
-"""Neighbour graph of the rigidity terms (Dynamic3DGaussians): k nearest moving Gaussians and their weights."""
+"""Builds the neighbour graph of the rigidity terms, as in Dynamic3DGaussians.
+
+The graph contains the k nearest neighbours of each moving Gaussian, and their weights.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,13 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Neighbour graph over M Gaussians, in the order of the hierarchy.
+    """Neighbour graph over M moving Gaussians, in the order of ``Hierarchy.rows``.
 
     Attributes:
         index: [M, k] int32 indices of the neighbours of each Gaussian, 0 for missing neighbours.
         weights: [M, k] float32 weights exp(−falloff d²), 0 for missing neighbours.
-        distances: [M, k] float32 distances in metres when the graph was built, 0 for missing neighbours.
+        distances: [M, k] float32 distances in metres at the time when the graph was built, 0 for
+            missing neighbours.
     """
 
     index: NDArray[np.int32]
@@ -26,7 +30,9 @@ class Neighbours:
 
 
 def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbours:
-    """Returns the graph of the ``count`` nearest neighbours of each Gaussian, or of all others if there are fewer.
+    """Returns the graph of the ``count`` nearest neighbours of each Gaussian.
+
+    If there are fewer other Gaussians, all of them are neighbours.
 
     Args:
         means: [M, 3] positions in metres.
@@ -47,7 +53,8 @@ def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbo
     distances = np.zeros((total, count), np.float32)
     if neighbour_count > 0:
         far, near = (np.asarray(found_by) for found_by in cKDTree(points).query(points, k=neighbour_count + 1))
-        # A point usually comes first among its own neighbours; if points coincide, it may be anywhere or missing.
+        # The query usually returns the point itself first. If several points coincide, the point
+        # itself may be at any position, or missing; in that case, the farthest point is removed.
         own = near == np.arange(total)[:, None]
         own[~own.any(axis=1), -1] = True
         near, far = near[~own].reshape(total, neighbour_count), far[~own].reshape(total, neighbour_count)

@@ -36,8 +36,8 @@ log = logging.getLogger("scas4d.server")
 class Membership:
     """Membership in a Ray cluster that is restored after a loss.
 
-    When a node is lost, all actors that a service started through it are lost too, wherever they run. The head node is
-    lost each time its supervisor restarts it.
+    When a node is lost, all actors that a service started through this node are lost too, even
+    those on other nodes. The head node counts as lost each time its supervisor restarts it.
 
     Args:
         address: address of the head node; None selects the cluster on this machine or the one in RAY_ADDRESS.
@@ -54,7 +54,7 @@ class Membership:
         """Joins the cluster unless this process is already a member. Blocks.
 
         Raises:
-            RuntimeError: there is no cluster, or this machine has no node in it.
+            RuntimeError: there is no cluster, or this machine has no node in the cluster.
         """
         if not ray.is_initialized():
             try:
@@ -96,10 +96,10 @@ class Membership:
                 announced = await self._is_done(on_return)
 
     def leave(self) -> None:
-        """Leaves the cluster, which ends the remaining actors; a pending attempt to join finishes first. Blocks.
+        """Leaves the cluster, which ends the remaining actors. Blocks.
 
-        If Ray does not shut down in time, this process exits immediately, because the interpreter would otherwise wait
-        for Ray's threads.
+        A pending attempt to join finishes first. If Ray does not shut down in time, this process
+        exits immediately, because the interpreter would otherwise wait for Ray's threads.
         """
         leaving = self._thread.submit(ray.shutdown)
         self._thread.shutdown(wait=False)

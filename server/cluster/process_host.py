@@ -140,7 +140,10 @@ class ProcessHost:
             self._next += 1
 
     async def receive(self) -> list[Any]:
-        """Waits for messages from the process and returns at least one; `UnexpectedExit` is always the last."""
+        """Waits for messages from the process and returns at least one of them.
+
+        After an unexpected exit of the process, the last message is `UnexpectedExit`.
+        """
         messages = [await self._received.get()]
         while not self._received.empty():
             messages.append(self._received.get_nowait())

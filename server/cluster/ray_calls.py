@@ -28,7 +28,7 @@ class RayCalls:
 
     def __init__(self) -> None:
         self.running: set[Future[Any]] = set()
-        # A separate pool, since the event loop's own pool writes the journals and must not wait for a silent head.
+        # The event loop's own thread pool writes the journals, so it must not wait for Ray.
         self._threads = ThreadPoolExecutor(THREADS, "ray")
         self._enabled = asyncio.Event()
         self._enabled.set()

@@ -132,7 +132,10 @@ class RayPlacement(Placement):
         return describe_cluster(watch.nodes, self.placed.values(), lost=watch.lost, head_responds=watch.head_responds)
 
     async def announce(self, host: str, port: int) -> None:
-        """Announces the service through an actor that provides its address and ends with it; see `Placement`."""
+        """Announces the address of this service through an actor; see `Placement`.
+
+        The actor ends when the service exits.
+        """
         self._listens = host, port
         await self._announce()
 
@@ -149,7 +152,10 @@ class RayPlacement(Placement):
         return list(self._peers.values())
 
     def call_ray(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
-        """Calls a function that uses Ray in a thread, as soon as the service is a member of the cluster."""
+        """Calls a function that uses Ray, in a thread.
+
+        The call waits until the service is a member of the cluster.
+        """
         return self._calls.call(function, *arguments)
 
     async def close(self) -> None:
@@ -176,7 +182,7 @@ class RayPlacement(Placement):
         return process
 
     def create_actor(self, name: str, needs: ResourceNeeds) -> Any:
-        """Creates the actor of a process. Blocks, since the head node registers the actor's name."""
+        """Creates the actor of a process. Blocks until the head node has registered the name."""
         made: Any = ray.remote(ProcessHost)
         return made.options(name=name, **needs.actor_options()).remote(
             self.prepare, self._server.data.resolve(), self._token, ProcessScheduling.current()

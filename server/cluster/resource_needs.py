@@ -59,7 +59,10 @@ class ResourceNeeds:
 
 
 def resource_needs(entry: Entry, spec: Any, server: ServerSettings) -> ResourceNeeds | None:
-    """Returns the needs of a process, or None for a process without a scene, which runs on the service's machine."""
+    """Returns the resource needs of a process.
+
+    Returns None for a process without a scene. Such a process runs on the service's machine.
+    """
     scene = spec if isinstance(spec, SceneSpec) else getattr(spec, "scene", None)
     if not isinstance(scene, SceneSpec):
         return None

@@ -65,7 +65,7 @@ def register_service(word: str, host: str, port: int) -> Any:
 
 
 def _authority(host: str, port: int) -> str:
-    """Returns host and port with a numeric address, because a service refuses unknown host names."""
+    """Returns `host:port` with a numeric address, because services refuse unknown host names."""
     addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     number = str(addresses[0][4][0])
     return f"[{number}]:{port}" if ":" in number else f"{number}:{port}"
@@ -98,7 +98,10 @@ def peer_addresses(word: str, known: Mapping[str, str] | None) -> dict[str, str]
 
 
 def _fetch_addresses(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
-    """Returns the addresses of services, or the actor name in place of an address if a service does not respond."""
+    """Returns the URL of each service and the only machine that can reach it, keyed by actor name.
+
+    If a service does not respond, the name of its actor replaces the URL.
+    """
     addresses: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
     asked: dict[Any, str] = {}
     for name in names:

@@ -1,4 +1,7 @@
-"""Configuration of uvicorn with guarded connections, accepting forwarded headers from trusted proxies only."""
+"""Configuration of uvicorn, which guards all connections.
+
+Forwarded headers are accepted from trusted proxies only.
+"""
 
 from __future__ import annotations
 

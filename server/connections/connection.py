@@ -1,8 +1,9 @@
 """HTTP connections of uvicorn, with limits on headers and bodies that apply before the application is called.
 
-uvicorn and httptools accept headers of any length (concatenating them in quadratic time) and any number of trailers and
-pipelined requests, without a time limit. All of this happens before a token is checked. This module limits sizes as
-bytes arrive; `server.connections.guard` enforces deadlines.
+Without these limits, uvicorn and httptools accept headers of any length, concatenated in quadratic
+time, and any number of trailers and pipelined requests. There is no time limit, and no token has
+been checked yet. This module limits sizes as bytes arrive; `server.connections.guard` enforces
+deadlines.
 """
 
 from __future__ import annotations
@@ -297,12 +298,12 @@ class GuardedConnection(HttpToolsProtocol):
             self.handle_websocket_upgrade()
 
     def pause_writing(self) -> None:
-        """Notes that the peer reads more slowly than the service writes."""
+        """Records that the peer reads more slowly than the service writes."""
         super().pause_writing()
         self._record.write_paused = True
 
     def resume_writing(self) -> None:
-        """Notes that the peer has caught up."""
+        """Records that the peer has read most of the unsent data."""
         super().resume_writing()
         self._record.write_paused = False
 

@@ -1,6 +1,7 @@
-"""Guard that closes connections that exceed the limits on time, connection counts and unread responses.
+"""Guard of the service's connections, which closes connections that exceed a limit.
 
-Connections need no timers of their own, because a sweep checks all of them about once per second.
+There are limits on times, on the number of connections, and on unread responses. Connections need
+no timers of their own, because a sweep checks all of them about once per second.
 """
 
 from __future__ import annotations
@@ -147,11 +148,16 @@ class ConnectionGuard:
     def admit(
         self, handler: Handler, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, address: str
     ) -> tuple[OpenConnection, Refusal | None]:
-        """Registers a new connection; returns its record, and the refusal if it must be refused.
+        """Registers a new connection.
 
-        At a limit, the new connection replaces one that has not sent a complete header, is idle, or has stopped sending
-        its body, since an idle peer must not block a peer with a request. At the limit on all connections, any peer's
-        connection may be replaced, because a peer with many addresses has few connections per address.
+        If a limit is reached, the new connection replaces an inactive one, so that an idle peer
+        does not block a peer with a request. A connection is inactive if it has not sent a complete
+        header, is idle, or has stopped sending its body. At the limit on all connections, the
+        connection of any peer may be replaced, because an attacker with many addresses has few
+        connections per address.
+
+        Returns:
+            The record of the connection, and the reason if the connection must be refused.
         """
         now = loop.time()
         proxy = self.limits.is_proxy(address)
@@ -237,8 +243,9 @@ class ConnectionGuard:
     def _make_room_for_headers(self, new: OpenConnection) -> None:
         """Closes the oldest upload without progress if uploads occupy more than half of a limit.
 
-        The other half then consists of connections that can be replaced immediately. A client with a request can
-        therefore connect at any time, without waiting until stalled uploads can be distinguished from new ones.
+        Stalled uploads cannot be distinguished immediately from new ones. Uploads without progress
+        are therefore limited to about half of the limit. The other half consists of connections
+        that can be replaced immediately, so a client with a request can connect at any time.
         """
         peers: Iterable[Peer] = [new.peer]
         if new.peer.proxy or 2 * len(new.peer.bodies) <= self.limits.per_peer:
@@ -275,7 +282,11 @@ class ConnectionGuard:
             self._peers.pop(peer.address, None)
 
     def _evict(self, peers: Collection[Peer], now: float) -> bool:
-        """Closes the least important connection of these peers; returns False if all are needed."""
+        """Closes the least important connection of these peers.
+
+        Returns:
+            False if all connections are needed, otherwise True.
+        """
         for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
             oldest = [(len(queue), next(iter(queue))) for queue in queues if queue]
             if oldest:

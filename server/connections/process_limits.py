@@ -1,4 +1,7 @@
-"""Process-wide limits adjusted for many connections: retained freed memory, and open files."""
+"""Settings of the process for many connections: freed memory that is retained, and open files.
+
+The module also determines how much sent data a peer has not acknowledged.
+"""
 
 from __future__ import annotations
 

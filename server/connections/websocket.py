@@ -111,8 +111,8 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
         self.transport.write(b"".join(self.conn.data_to_send()))
         self.close_sent = True
         self.guard.set_phase(self._record, Phase.LINGER, self.loop.time())
-        # The application returns now. While this timer exists, uvicorn does not close the connection after that. The
-        # guard closes it before the timer expires.
+        # The application returns now. While this timer exists, uvicorn leaves the connection open
+        # after that. The guard closes the connection before the timer expires.
         self.close_timer = self.loop.call_later(LINGER_LONGEST_S, self.transport.close)
         if self.transport.can_write_eof():
             self.transport.write_eof()
@@ -138,12 +138,12 @@ class GuardedWebSocket(WebSocketsSansIOProtocol):
                 self.transport.write(frame)
 
     def pause_writing(self) -> None:
-        """Notes that the peer reads more slowly than the service writes."""
+        """Records that the peer reads more slowly than the service writes."""
         super().pause_writing()
         self._record.write_paused = self._fell_behind = True
 
     def resume_writing(self) -> None:
-        """Notes that the peer has caught up, and responds to its newest ping."""
+        """Records that the peer has read most of the unsent data, and answers its newest ping."""
         super().resume_writing()
         self._record.write_paused = False
         pong, self._pong = self._pong, b""

@@ -57,7 +57,11 @@ class TextFormatter(logging.Formatter):
 
 
 def is_worth_showing(record: logging.LogRecord) -> bool:
-    """Returns False for successful read requests, because a viewer or a waiting rig sends several per second."""
+    """Returns whether a log record is shown in a terminal.
+
+    Successful read requests are not shown, because a viewer or a waiting rig sends several of them
+    per second.
+    """
     return record.levelno > logging.INFO or not (
         getattr(record, "method", "") in ("GET", "HEAD") and getattr(record, "status", 500) < 400
     )

@@ -1,8 +1,9 @@
 """Readiness of the service, which depends on the compilation of its kernels.
 
-A separate process compiles the kernels that are not in the cache. The service is ready once the kernels for a first
-frame are compiled; the kernels for updates are compiled while frame 0 is being reconstructed. The process that handles
-requests never loads the kernels. Workers load them from the cache, and wait for the update kernels if necessary.
+A separate process compiles the kernels that are not in the cache. The service is ready as soon as
+the kernels for a first frame are compiled. The kernels for updates are compiled after that. The
+process that handles requests never loads the kernels. Workers load the kernels from the cache, and
+wait for the kernels of updates if necessary.
 """
 
 from __future__ import annotations

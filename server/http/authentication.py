@@ -1,8 +1,8 @@
 """Authentication of requests and WebSockets by tokens, tickets and share links.
 
-The service's token grants full access, a read-only token grants read access, and a share link grants read access to one
-scene until the link expires. A share link is signed with the service's token and is not stored; changing the token
-revokes all links.
+The service's token grants full access. A read-only token grants read access until the token
+expires, either to all scenes or, as part of a share link, to one scene. Read-only tokens are signed
+with the service's token and are not stored. Changing the service's token revokes all of them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ They prevent framing by other sites, media type sniffing by browsers, and outdat
 
 
 class AuthMiddleware:
-    """Middleware that authenticates requests and WebSockets and rejects all others with a problem document."""
+    """Middleware that authenticates requests and WebSockets.
+
+    Unauthorized requests get a problem document.
+    """
 
     def __init__(self, app: ASGIApp, settings: ServerSettings, tickets: Tickets) -> None:
         self.app = app

@@ -81,7 +81,9 @@ def immutable_response(
 
 
 async def immutable_file_response(request: Request, path: Path, *, tag: str, media_type: str, name: str) -> Response:
-    """Returns a response that streams an immutable file in blocks; otherwise like `immutable_response`.
+    """Returns a response that streams an immutable file in blocks.
+
+    Conditional requests and byte ranges are handled as in `immutable_response`.
 
     Args:
         request: HTTP request with its conditional headers.
@@ -122,7 +124,10 @@ async def immutable_file_response(request: Request, path: Path, *, tag: str, med
 
 
 def _pieces(opened: BinaryIO, start: int, end: int) -> Iterator[bytes]:
-    """Yields the bytes from `start` to `end` of an open file, then closes it; Starlette iterates over it in threads."""
+    """Yields the bytes from `start` to `end` of an open file in pieces, then closes the file.
+
+    Starlette runs the iterator in threads.
+    """
     with opened:
         opened.seek(start)
         while start < end and (piece := opened.read(min(PIECE, end - start))):

@@ -1,9 +1,10 @@
 """Checks of the Host and Origin headers, which prevent pages of other sites from using the service.
 
-Any web page can send requests to a server on the loopback interface of the machine that displays it. Headers
-that no page can forge reveal such requests. `Origin` is the site of the requesting page; `Sec-Fetch-Site` serves the
-same purpose for images and forms, whose requests omit Origin. `Host` is the name by which the client addresses the
-service. An unknown name indicates DNS rebinding, which makes another site's page appear to belong to the service.
+Any web page can send requests to a server on the loopback interface of the machine that displays
+the page. Headers that no page can forge reveal such requests. `Origin` is the site of the
+requesting page; `Sec-Fetch-Site` serves the same purpose for images and forms, whose requests omit
+Origin. `Host` is the name by which the client addresses the service. An unknown name indicates DNS
+rebinding, which makes another site's page appear to belong to the service.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Permissions granted by tokens; read-only permissions allow neither changes nor sending frames."""
+"""Permissions granted by tokens. A read-only permission does not allow changes or new frames."""
 
 from __future__ import annotations
 

@@ -8,7 +8,10 @@ from client.wire import Cluster, Node
 
 
 def merge_clusters(own: Cluster, others: Iterable[Cluster]) -> Cluster:
-    """Returns this service's view of the cluster, with the reservations and waiting processes of all services added."""
+    """Returns the cluster as this service sees it, with the reservations of all services added.
+
+    The waiting processes of all services are also included.
+    """
     nodes, waiting = {node.id: node for node in own.nodes}, list(own.waiting)
     for other in others:
         waiting += other.waiting

@@ -84,7 +84,11 @@ class Peers:
         await self.client.aclose()
 
     async def addresses(self) -> Sequence[str]:
-        """Returns the latest known addresses of the peers, and refreshes them in the background."""
+        """Returns the latest known addresses of the peers.
+
+        Outdated addresses are refreshed in the background. If no addresses are known yet, the
+        method waits for them, up to `LIST_S`.
+        """
         if self._listing is None and time.monotonic() - self._asked >= FRESH_S:
             self._listing = asyncio.get_running_loop().create_task(self._list())
         if self._listing is not None:

@@ -180,7 +180,10 @@ async def _forward_request(
 
 
 def _forwarded_headers(scope: Scope) -> Iterator[tuple[bytes, bytes]]:
-    """Yields the request headers to forward, unchanged."""
+    """Yields the request headers to forward.
+
+    If the client sent no Accept-Encoding, the header is added with the value `identity`.
+    """
     named = {part.strip() for name, value in scope["headers"] if name == b"connection" for part in value.split(b",")}
     asks = False
     for name, value in scope["headers"]:

@@ -266,7 +266,7 @@ class RepairQueue:
             timer.cancel()
 
     def _decide(self, index: int, reason: str) -> None:
-        """Queues a damaged state for recomputation from its images, or declares it lost."""
+        """Queues a damaged state for recomputation, or declares the state lost."""
         entry = self._ledger.frames[index]
         degraded = None if entry.record is None else entry.record.get("degraded")
         self.waiting[index] = reason
@@ -279,7 +279,10 @@ class RepairQueue:
             self._declare_unrecoverable(index, "the previous state cannot be read")
 
     def _base(self, index: int) -> int | None:
-        """Returns the committed frame that a frame is based on, or None if its state was deleted or never existed."""
+        """Returns the last committed frame before a frame, whose state the frame is based on.
+
+        Returns None if there is no such frame or its state was deleted.
+        """
         for before in range(index - 1, -1, -1):
             entry = self._ledger.frames[before]
             if entry.state == FrameState.COMMITTED:

@@ -33,7 +33,11 @@ log = logging.getLogger("scas4d.worker")
 
 
 def repair_at_start(history: History) -> list[str]:
-    """Rewrites damaged files that every frame needs, and damaged copies, and returns one message per file."""
+    """Rewrites damaged files that every frame needs, and damaged copies of these files.
+
+    Returns:
+        One message per rewritten file.
+    """
     try:
         mended = history.repair_fixed()
     except OSError as error:  # the states stay readable, so an unwritable disk must not prevent startup
@@ -46,7 +50,10 @@ def repair_at_start(history: History) -> list[str]:
 def repair_files(
     history: History, reconstruction: Reconstruction | None, message: RepairFiles
 ) -> Iterator[RepairResult]:
-    """Checks each file, rewrites it with identical content if possible, and yields the results."""
+    """Checks each file and, if the file is damaged, rewrites it with identical content if possible.
+
+    Yields one result per file.
+    """
     assert history.files is not None
     for name in message.names:
         try:
@@ -85,7 +92,7 @@ def _repair_file(
 
 
 def _rewrite_with_report(history: History, files: FrameFiles, index: int, message: RepairFiles) -> RepairOutcome:
-    """Rewrites a file whose report or time is damaged but whose state is intact."""
+    """Rewrites the file of a frame whose report or time is damaged, if its state is intact."""
     try:
         arrays = files.read(index, PER_FRAME, WHOLES)
         report = message.reports.get(index)
@@ -112,9 +119,10 @@ def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
 def recompute_state(
     spec: SceneSpec, history: History, message: RecomputeState, decode: Decode
 ) -> Iterator[RepairResult]:
-    """Recomputes a state from its images and yields the results; a failure does not affect the running scene.
+    """Recomputes a state from its images and yields the results.
 
-    Damage often affects neighbouring files, so the previous state is checked and repaired first.
+    Damage often affects neighbouring files, so the previous state is checked and repaired first. A
+    failure does not affect the running scene.
     """
     index = message.frame.index
     assert history.files is not None

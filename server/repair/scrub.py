@@ -1,7 +1,8 @@
-"""Scrubbing of a scene: slowly rereads all files and verifies their checksums to find damage before a file is needed.
+"""Scrubbing of a scene: slowly rereads all files and verifies their checksums.
 
-Files are read sequentially in pieces in a thread. Pauses limit the read rate to the configured value, or to a quarter
-of it while a frame is being updated. Pages that only the scrub needed are dropped from the page cache.
+Scrubbing finds damage before a file is needed. Files are read sequentially in pieces in a thread.
+Pauses limit the read rate to the configured value, or to a quarter of it while a frame is being
+updated. Pages that only the scrub needed are dropped from the page cache.
 """
 
 from __future__ import annotations
@@ -105,7 +106,15 @@ class Scrub:
         await self._scrub_frames()
 
     async def _read(self, pieces: Iterator[int], weight: int = 1) -> str | None:
-        """Reads a file to its end; returns its fault, `GONE` if the file is missing, or None if it is intact."""
+        """Reads a file to its end, at a limited rate.
+
+        Args:
+            pieces: iterator that reads and verifies the file, and yields the size of each piece.
+            weight: factor by which the pauses are longer than for a file of arrays.
+
+        Returns:
+            The fault of the file, `GONE` if the file is missing, or None if the file is intact.
+        """
         try:
             while (size := await asyncio.to_thread(next, pieces, None)) is not None:
                 counters.SCRUBBED.inc(size)

@@ -128,7 +128,10 @@ class Exports:
         self._known: dict[str, dict[str, Export]] = {}
 
     async def open(self) -> None:
-        """Removes files left by an earlier run of the service; the caller must hold the lock of the data folder."""
+        """Removes files left by an earlier run of the service.
+
+        The caller must hold the lock of the data folder.
+        """
         await asyncio.to_thread(shutil.rmtree, self._folder, ignore_errors=True)
 
     def of(self, scene: str) -> list[Export]:
@@ -156,9 +159,15 @@ class Exports:
     def begin(self, scene: Scene, request: ExportRequest, frames: tuple[int, ...]) -> Export:
         """Queues an export of committed frames.
 
+        Args:
+            scene: scene to export.
+            request: validated request.
+            frames: indices of the frames, in ascending order.
+
         Raises:
-            Problem: 409 if the scene has too many exports; 429 if too many exports are waiting; 507 if there is not
-                enough disk space.
+            Problem: 409 if the scene has too many exports; 429 if too many exports of the service
+                are unfinished; 503 if the reconstruction was restarted after the request had
+                arrived; 507 if there is not enough disk space.
         """
         self._scenes.check_current(scene)
         self._check(scene, request, len(frames))

@@ -1,4 +1,4 @@
-"""Restart of a scene's reconstruction: validates the request, and builds and journals the event."""
+"""Restart of a scene's reconstruction: validation of the request, and the event that starts it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger("scas4d.server")
 
 
 def restart_remedy(ledger: Ledger) -> str:
-    """Returns the remedy for a failed scene: restarting its reconstruction."""
+    """Returns the remedy for a failed scene, which is to restart its reconstruction."""
     number = ledger.reconstruction + 1
     return (
         f"restart its reconstruction: PUT /v1/scenes/{ledger.scene}/reconstructions/{number}, "
@@ -62,9 +62,9 @@ class NewReconstruction:
             folder: the scene's current folder.
 
         Raises:
-            Problem: 409 if `number` is not the next number, the reconstruction cannot start with the requested frame,
-                the scene is archived, or committed frames would be discarded without consent; 422 if depth cannot be
-                determined.
+            Problem: 409 if `number` is not the next number, or the scene is archived; 409 if the
+                reconstruction cannot start with the requested frame, or committed frames would be
+                discarded without consent; 422 if depth cannot be determined.
         """
         if self._is_repeated(ledger):
             return None
@@ -103,7 +103,11 @@ class NewReconstruction:
         )
 
     def _is_repeated(self, ledger: Ledger) -> bool:
-        """Returns whether the same request has already started the reconstruction."""
+        """Returns whether the same request has already started the reconstruction.
+
+        Raises:
+            Problem: 409 if the request is new and `number` is not the next number.
+        """
         now = ledger.reconstruction
         if self.number == now and ledger.begun is not None and ledger.begun.request == self.request:
             return True
@@ -120,7 +124,11 @@ class NewReconstruction:
         return False
 
     def _first_frame(self, ledger: Ledger) -> int:
-        """Returns the index of the first frame of the reconstruction."""
+        """Returns the index of the first frame of the reconstruction.
+
+        Raises:
+            Problem: 409 if the reconstruction cannot start with the requested frame.
+        """
         frames, index = ledger.frames, self.request.frame
         if index is None:
             sent = (i for i in range(frames.first, len(frames)) if _takes_part(frames[i]))
@@ -147,9 +155,10 @@ class NewReconstruction:
 
 
 async def journal_new_reconstruction(folder: SceneFolder, beginning: NewReconstruction) -> list[str]:
-    """Journals the restart of a stopped scene after validating the request again.
+    """Validates the request again and journals the restart of a stopped scene.
 
-    The second validation is necessary because another frame may have been committed since the first one.
+    The second validation is necessary because another frame may have been committed since the first
+    validation.
 
     Returns:
         One message for each fault found in the folder.

@@ -1,4 +1,8 @@
-"""Replays of a scene's newest frames with other budgets, one at a time; the results are kept in memory."""
+"""Replays of a scene: repetitions of its newest updates with other numbers of iterations.
+
+Replays measure the trade-off between accuracy and time. They run one at a time, and their results
+are kept in memory.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +101,15 @@ class Replays:
         )
 
     def _chosen(self, count: int) -> tuple[int, list[int]]:
-        """Returns the committed frame to start from and the frames to replay, the first of which is the warm-up."""
+        """Chooses the frames of a replay of `count` measured updates.
+
+        Returns:
+            The committed frame whose state the replay starts from, and the frames to replay. The
+            first of them warms up the process and is not measured.
+
+        Raises:
+            Problem: 409 if the states or images are not available.
+        """
         committed, frames = self._ledger.committed, self._ledger.frames
         if len(committed) < count + 2:
             raise Problem(

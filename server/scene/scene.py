@@ -216,11 +216,18 @@ class Scene:
         return not (self.users or closing or busy or self.log.lock.locked() or self._publisher.listeners)
 
     def camera(self, name: str) -> Camera:
-        """Returns a camera of the rig, with the refined calibration of frame 0 if enabled; see `camera_of`."""
+        """Returns a camera of the rig; see `camera_of`.
+
+        If the calibration was refined in the first frame, the camera has the refined calibration.
+        """
         return camera_of(effective_rig(self.rig, self.updates.first), name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
-        """Checks that a frame's state is readable and returns its index; None selects the last committed frame.
+        """Checks that a frame's state is readable and returns its index.
+
+        Args:
+            index: frame index; None selects the last committed frame.
+            field: name of the request's field, which a problem reports.
 
         Raises:
             Problem: 404 or 409 if there is no readable state; 503 if the state is being recomputed.

@@ -1,4 +1,8 @@
-"""Registry of all scenes; it creates, wakes, restarts and deletes them so that a power failure does no harm."""
+"""Registry of all scenes, which creates, wakes, restarts and deletes them.
+
+Creation, restart and deletion each take effect in a single step on disk. A power failure therefore
+never leaves a scene in an intermediate state.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +67,8 @@ class Scenes:
     async def open(self) -> None:
         """Locks the data folder, finds its scenes and starts to recover them.
 
-        Recovery runs in the background because a journal may cover a whole day.
+        The recovery runs in the background, because a journal may contain the events of a whole
+        day.
 
         Raises:
             RuntimeError: another service is using the data folder.
@@ -101,7 +106,9 @@ class Scenes:
 
     @asynccontextmanager
     async def use(self, id: str, *, place: bool = True) -> AsyncIterator[Scene]:
-        """Yields a scene for a request or a connection, waking it if necessary and keeping it awake inside the context.
+        """Yields a scene for a request or a connection. The scene is woken if it is asleep.
+
+        Inside the context, the scene does not fall asleep.
 
         Args:
             id: scene ID.
@@ -150,7 +157,10 @@ class Scenes:
         self._promised += 1
 
     async def put_to_sleep(self, scene: Scene) -> None:
-        """Stops a scene's processes and releases its slot if the scene is still idle; all its data is in its folder."""
+        """Stops a scene's processes and releases its slot, if the scene is still idle.
+
+        No data is lost, because all data of a scene is in its folder.
+        """
         if self.awake.get(scene.id) is scene and scene.id not in self._turns and scene.idle:
             self._turns.begin(scene.id, self._fall_asleep(scene))
         await self._turns.end(scene.id)
@@ -184,15 +194,19 @@ class Scenes:
                     log.exception("scene %s could not be put to sleep", scene.id)
 
     async def _register_stored(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
-        """Registers a stored scene as awake or asleep; returns False and records the reason if it cannot be read.
+        """Registers a stored scene as awake or asleep.
 
-        A scene with pending work always gets a slot, even beyond the limit. A recently used scene gets one if one is
-        free.
+        A scene with pending work always gets a slot, even beyond the limit. At startup, a recently
+        used scene gets a slot if one is free.
 
         Args:
             folder: scene folder.
             said: messages about damage that was found earlier.
             wake: whether to load the scene into memory even if it would be asleep.
+
+        Returns:
+            False if the scene cannot be read, otherwise True. In the first case, the reason is
+            stored in `unreadable`.
         """
         try:
             if (
@@ -243,7 +257,8 @@ class Scenes:
         Requests get 503 in the meantime. If the restart is refused, the scene is unchanged.
 
         Raises:
-            Problem: see `NewReconstruction.event`; 507 if the disk is full.
+            Problem: see `NewReconstruction.event`; 503 if another restart has begun in the
+                meantime; 507 if the disk is full.
         """
         id, current = scene.id, self[scene.id]
         if beginning.event(current.ledger, current.spec.folder) is None:
@@ -323,7 +338,9 @@ class Scenes:
         )
 
     async def delete(self, id: str) -> None:
-        """Stops a scene's processes and removes its folder; the deletion takes effect when the folder is renamed.
+        """Stops a scene's processes and removes its folder.
+
+        The deletion takes effect when the folder is renamed.
 
         Raises:
             Problem: see `refuse`.

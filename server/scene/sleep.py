@@ -1,6 +1,7 @@
-"""Sleep of idle scenes, which release their processes and slots until the next request wakes them.
+"""Sleep of idle scenes. A sleeping scene has no processes and no slot until a request wakes it.
 
-Only the status of a sleeping scene is in memory. To wake the scene, the service reads its folder as after a crash.
+Only the status of a sleeping scene is in memory. To wake the scene, the service reads the scene's
+folder as after a crash.
 """
 
 from __future__ import annotations
@@ -66,7 +67,10 @@ def check_interval(settings: ServerSettings) -> float | None:
 
 
 def idle_scenes(scenes: Iterable[Scene], settings: ServerSettings) -> list[Scene]:
-    """Returns the scenes that have been idle long enough to fall asleep; archived scenes have a shorter limit."""
+    """Returns the scenes that have been idle long enough to fall asleep.
+
+    Archived scenes may fall asleep earlier than other scenes.
+    """
     now = time.monotonic()
     return [scene for scene in scenes if now - scene.used >= _idle_limit(scene, settings.sleep_seconds) and scene.idle]
 
@@ -99,7 +103,8 @@ def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> 
     """Returns the least recently used idle scene, whose slot can be given to another scene.
 
     Raises:
-        Problem: 429 if no scene is idle.
+        Problem: 429 if no scene has been idle for `GRACE_S`, or if scenes never fall asleep on
+            their own.
     """
     here = [scene for scene in scenes if scene.has_place]
     grace = min(GRACE_S, settings.sleep_seconds)

@@ -32,7 +32,10 @@ class StartupRecovery:
         return id in self._left
 
     async def begin(self) -> None:
-        """Lists the scenes and starts to load them in the background, since a journal may cover a whole day."""
+        """Lists the scenes and starts to load them in the background.
+
+        Loading may take long, because a journal may contain the events of a whole day.
+        """
         self._left = await asyncio.to_thread(self._folders)
         self._count = len(self._left)
         self._task = asyncio.create_task(self._run())

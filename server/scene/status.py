@@ -57,7 +57,8 @@ class SceneFacts:
         warnings: warnings about the rig.
         trouble: reason why the scene is degraded, or None.
         at_work: whether a frame is being processed.
-        progress: progress of frame 0 while it is being reconstructed, otherwise None.
+        progress: progress of the first frame while it is being reconstructed, or of the compilation
+            of kernels before an update; otherwise None.
         worker_deaths: number of worker crashes since the scene was loaded.
         asleep: whether the scene has no slot and therefore no processes.
     """

@@ -20,9 +20,9 @@ from server.storage.layout import EXPORT, SceneFolder
 
 
 def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
-    """Writes the status cache of a sleeping scene, ignoring disk errors. Blocks.
+    """Writes the status cache of a sleeping scene. Disk errors are ignored. Blocks.
 
-    A damaged scene gets no cache, so that every startup checks it again.
+    A damaged scene gets no cache, so that every startup checks the scene again.
 
     Args:
         folder: scene folder.

@@ -22,8 +22,12 @@ NEAR = 0.1
 def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
     """Returns the reports of the updates whose duration is a valid measurement.
 
-    These updates were fully committed at the first attempt. The first frame is excluded. The first update is also
-    excluded, because it runs several times.
+    These updates were fully committed at the first attempt. The first frame is excluded. The first
+    update is also excluded, because it is run in several view orders.
+
+    Args:
+        reports: frame reports.
+        first: index of the first frame.
     """
     return [
         report
@@ -39,13 +43,16 @@ def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[Fram
 
 
 def commit_milliseconds(reports: Iterable[FrameReportModel]) -> float:
-    """Returns the median time to write a commit in milliseconds, or 0 if unknown."""
+    """Returns the median time to write a commit in milliseconds, or 0 if no report contains it."""
     known = [report.write_seconds for report in reports if report.write_seconds is not None]
     return 1000 * median(known) if known else 0.0
 
 
 def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
-    """Returns one point per pair of iteration count, rounded to two significant digits, and thread count."""
+    """Returns one point for each measured pair of a number of iterations and a number of threads.
+
+    The numbers of iterations are rounded to two significant digits.
+    """
     write = commit_milliseconds(reports)
     points = []
     for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
@@ -65,7 +72,11 @@ def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
 
 
 def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
-    """Returns the mean loss curve for each number of iterations."""
+    """Returns one mean loss curve for the updates with the same total number of iterations.
+
+    The losses are means, and the times are medians. All numbers of iterations are rounded to two
+    significant digits.
+    """
     steps = [
         (_rounded(report.iterations), _rounded(point.iterations), point)
         for report in reports
@@ -85,9 +96,13 @@ def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
 
 
 def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
-    """Fits a time model that is linear in the number of iterations; returns None if there are no loss curves.
+    """Fits a time model that is linear in the number of iterations.
 
-    The slope is fitted to the times within each update; the remaining time is assumed to be constant.
+    The slope is the median over all updates. The slope of one update is measured between the first
+    and the last point of its loss curve. The remaining time is assumed to be constant.
+
+    Returns:
+        The model, or None if no loss curve has two points.
     """
     slopes = []
     for report in reports:
@@ -106,7 +121,16 @@ def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
 def extrapolated_points(
     model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None
 ) -> list[TradeoffPoint]:
-    """Returns points with a time but no accuracy for iteration counts not yet measured with this number of threads."""
+    """Returns points with a predicted time for the iteration counts that have not been measured.
+
+    The points have no accuracy.
+
+    Args:
+        model: time model; None returns no points.
+        known: measured points.
+        threads: number of threads to which the model applies. Points with other numbers of threads
+            do not count as measured.
+    """
     if model is None:
         return []
     there = [point.iterations for point in known if point.threads == threads]
@@ -135,7 +159,10 @@ def _groups(items: Sequence[Any], key: Any) -> list[tuple[Any, list[Any]]]:
 
 
 def _rounded(iterations: int | None) -> int:
-    """Rounds to two significant digits, because the number of iterations varies slightly under a time budget."""
+    """Returns the number of iterations, rounded to two significant digits.
+
+    Under a time budget, the number of iterations varies slightly.
+    """
     if not iterations:
         return 0
     return round(iterations, min(0, 1 - floor(log10(iterations))))

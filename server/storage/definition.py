@@ -1,7 +1,7 @@
 """Scene definition: rig, settings and ingest rules, stored in `scene.json`.
 
-The file is written before the creation of the scene is acknowledged. It is rewritten after a restart of the
-reconstruction has been journalled.
+The file is written before the creation of the scene is acknowledged. The file is rewritten after a
+restart of the reconstruction has been journalled, and when the file is found damaged.
 """
 
 from __future__ import annotations
@@ -48,7 +48,12 @@ class Definition:
     begun: ReconstructionBegun | None = None
 
     def with_reconstruction(self, event: ReconstructionBegun | None) -> Definition:
-        """Returns the definition after a restart of the reconstruction; unchanged if it already includes the event.
+        """Returns a definition with the settings of a restart of the reconstruction.
+
+        The definition is returned unchanged if it already includes the restart or a later one.
+
+        Args:
+            event: event of the restart, or None if the reconstruction was never restarted.
 
         Raises:
             DefinitionError: the settings of the event are invalid in this version.
@@ -105,7 +110,7 @@ def reconstruction_of(data: Mapping[str, Any]) -> ReconstructionBegun | None:
 
 
 def write_definition(folder: SceneFolder, definition: Definition) -> None:
-    """Writes `scene.json`; the scene exists once this file does."""
+    """Writes `scene.json`. A scene exists as soon as its folder contains this file."""
     text = json.dumps(definition.as_json(), indent=1)
     path = folder.definition
     with open_atomically(path, path.with_suffix(".part")) as file:

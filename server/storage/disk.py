@@ -45,7 +45,7 @@ def free_bytes(path: Path) -> int:
 
 
 class FolderLock:
-    """Folder lock that one process can hold at a time; the kernel releases it when the process ends.
+    """Exclusive lock on a folder, based on a lock file. The kernel releases it if the process ends.
 
     Args:
         path: path of the lock file, which is created if missing.
@@ -86,8 +86,9 @@ def lock_data(data: Path) -> FolderLock:
 def lock_states(folder: SceneFolder) -> FolderLock | None:
     """Waits until no other worker can commit to a scene's states, and locks them for this process.
 
-    With an epoch, this only records the ID of this process and returns None without waiting. A worker on another
-    machine could hang while holding a lock, so each epoch commits to its own folder instead (`server.storage.fencing`).
+    If the folder has an epoch, the function only records the ID of this process and returns None
+    without waiting. A worker on another machine could hang while it holds a lock. The worker of
+    each epoch therefore commits to its own folder instead (`server.storage.fencing`).
     """
     path = folder.worker_lock
     if folder.epoch is not None:

@@ -1,4 +1,6 @@
-"""Journal events of a scene, the only record of its frames. The ledger is built from them in order.
+"""Events in the journal of a scene.
+
+The ledger, which contains the state of all frames, is built by applying the events in order.
 
 The `type` tag and the fields of each event are stored in `journal.log`, so changing them requires a new format version
 (`server.storage.definition.FORMAT`).
@@ -55,7 +57,7 @@ class CameraAccepted(_Event):
 
 
 class FrameMissing(_Event):
-    """Declaration that a frame is missing."""
+    """Declaration by a client that a frame is missing and will not be sent."""
 
     type: Literal["frame_missing"] = "frame_missing"
     index: int
@@ -81,7 +83,10 @@ class FrameFailed(_Event):
 
 
 class WorkerDied(_Event):
-    """Worker crash during a frame; `own` is set if the worker itself caused it rather than an external signal."""
+    """Crash of the worker while it was processing a frame.
+
+    `own` is true if the worker itself caused the crash, and false for an external signal.
+    """
 
     type: Literal["worker_died"] = "worker_died"
     index: int
@@ -130,7 +135,7 @@ class SceneEdited(_Event):
     exact_states: int | None = None
 
     def merged_with(self, before: SceneEdited) -> SceneEdited:
-        """Returns an earlier edit with this edit applied on top."""
+        """Returns the earlier edit `before` with the changes of this edit added."""
         given = {name: getattr(self, name) for name in self.__class__.model_fields if getattr(self, name) is not None}
         return before.model_copy(update=given)
 
@@ -141,7 +146,10 @@ class SceneEdited(_Event):
 
 
 class BudgetChanged(_Event):
-    """New budget from frame `index` on; a frame that is updated again keeps its earlier budget."""
+    """Change of the update budget that applies to frame `index` and all later frames.
+
+    An earlier frame that is updated again uses the budget that was set before this event.
+    """
 
     type: Literal["budget_changed"] = "budget_changed"
     index: int
@@ -153,7 +161,7 @@ class ReconstructionBegun(_Event):
 
     Attributes:
         number: reconstruction number; the original reconstruction has 0.
-        index: index of its first frame.
+        index: index of the first frame of the new reconstruction.
         points: number of the reconstruction whose initial points are used (`SceneFolder.points_of`), or None if there
             are no points.
         settings: complete settings of the scene after the restart.

@@ -116,7 +116,10 @@ def _wait_for(lock: Path) -> None:
 
 
 def _fill_folder(states: Path, epoch: int, before: int | None) -> None:
-    """Creates the folder of an epoch with all committed files of the epoch `before`, or empty if that is None."""
+    """Creates the folder of an epoch with all committed files of the epoch `before`.
+
+    If `before` is None, the folder contains no committed files.
+    """
     folder = epoch_folder(states, epoch)
     beside = folder.with_name(f"{folder.name}.{secrets.token_hex(4)}{PART}")
     try:
@@ -163,10 +166,13 @@ def _epoch_of(states: Path, path: Path) -> int | None:
 
 
 def _link_all(source: Path, target: Path) -> bool:
-    """Links all files of a folder into another; returns False if the source folder changed during the operation.
+    """Links all files of a folder into another folder. Compact files without an index are copied.
 
-    The worker of the source folder may still be running, so a frame that it commits, or moves to a compact file, must
-    be seen completely.
+    The worker of the source folder may still be running. The operation must not miss a frame that
+    the worker commits or moves to a compact file in the meantime.
+
+    Returns:
+        False if the source folder changed during the operation, otherwise True.
     """
     try:
         names = _names(source)
@@ -211,7 +217,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _is_closed(chunk: Path) -> bool:
-    """Returns whether a compact file already has its index; it is no longer written to after that."""
+    """Returns whether a compact file ends with its index, after which the file is never changed."""
     with chunk.open("rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - len(FOOTER_MAGIC)))
         return file.read() == FOOTER_MAGIC

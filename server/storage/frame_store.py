@@ -1,7 +1,9 @@
-"""Frame log of a scene: images as they were uploaded, one record per file, written while they are received.
+"""Frame log of a scene: the images as they were uploaded, with one record per file.
 
-A file gets its final name immediately and is treated as an orphan until the journal references it. No frame is copied
-or renamed, an interrupted write damages at most one record, and retention deletes whole files.
+A record is written to disk while its bytes are received. The file of a record has its final name
+from the start and counts as an orphan until the journal references it. Frames are therefore never
+copied or renamed. An interrupted write damages at most one record, and retention deletes whole
+files.
 """
 
 from __future__ import annotations
@@ -63,7 +65,7 @@ class StoredPictures:
 
 
 class Upload:
-    """Writer of one record while its bytes arrive. All methods block, so call them in a thread.
+    """Writer of one record of the frame log. All methods block, so call them in a thread.
 
     Writes bypass the page cache (O_DIRECT) if the file system supports it, because cached writes cost ten times the CPU
     time per frame. Direct writes need whole blocks from page-aligned memory; the remainder is kept for the next write.

@@ -1,7 +1,9 @@
-"""Columnar table of a scene's frames, without disk or clock access; one day at 30 fps is 2.6 million frames.
+"""Table of the frames of a scene, stored in columns. The table accesses neither disk nor clock.
 
-Each frame permanently takes 46 bytes. Rare properties (errors, frame log records, worker crashes) are stored in
-dictionaries. Commit records of the newest frames stay in memory; older ones are read from disk.
+A scene that runs for a day at 30 fps has 2.6 million frames, so each frame permanently takes only
+46 bytes. Rare properties (errors, names of frame log records, worker crashes) are stored in
+dictionaries. The commit records of the newest frames stay in memory. The commit records of older
+frames are read from disk.
 """
 
 from __future__ import annotations
@@ -38,12 +40,13 @@ FEW_STATES = 32
 
 
 class FrameTable:
-    """Table of one scene's frames, indexed without gaps.
+    """Table of the frames of one scene. The frame indices have no gaps.
 
     Attributes:
         counts: number of frames in each state.
         committed: indices of frames with a readable committed state, in ascending order.
-        first: first frame of the reconstruction. Earlier frames fail, except missing and skipped ones.
+        first: index of the first frame of the reconstruction. Earlier frames have the state FAILED,
+            unless they are missing or skipped.
     """
 
     def __init__(self, scene: str) -> None:
@@ -109,7 +112,15 @@ class FrameTable:
         return new
 
     def enqueue(self, index: int, time: float, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
-        """Queues an acknowledged frame."""
+        """Queues an acknowledged frame.
+
+        Args:
+            index: frame index.
+            time: time of the frame in seconds.
+            identity: identity from the receipt, a hexadecimal digest.
+            files: names of the frame's records in the frame log.
+            parts: uploads of the single cameras, or None if the frame was uploaded as a whole.
+        """
         self._times[index] = time
         self._flags[index] |= TIME | RECEIPT
         self._identities[IDENTITY * index : IDENTITY * (index + 1)] = bytes.fromhex(identity)
@@ -121,7 +132,10 @@ class FrameTable:
         self.set_state(index, FrameState.QUEUED)
 
     def set_state(self, index: int, state: FrameState) -> None:
-        """Sets the state of a frame."""
+        """Sets the state of a frame.
+
+        A frame before `first` gets the state FAILED instead of QUEUED or COMMITTED.
+        """
         if index < self.first and state in (FrameState.QUEUED, FrameState.COMMITTED):
             state = FrameState.FAILED
         before = STATES[self._states[index]]
@@ -155,7 +169,7 @@ class FrameTable:
             self.rare_properties(index).error = PICTURES_GONE
 
     def add_committed(self, index: int, time: float | None) -> None:
-        """Adds a committed state that has no journal event."""
+        """Marks a frame as committed whose state was found on disk but not in the journal."""
         if time is not None:
             self._times[index] = time
             self._flags[index] |= TIME
@@ -169,12 +183,16 @@ class FrameTable:
         self.set_state(index, STATES[self._states[index]])
 
     def skip(self, index: int, by: int) -> None:
-        """Marks the frame as skipped in favour of frame `by`."""
+        """Marks the frame as skipped because the queue was full when frame `by` arrived."""
         self._skipped_by[index] = by
         self.set_state(index, FrameState.SKIPPED)
 
     def delete_states(self, indices: Sequence[int]) -> int:
-        """Marks committed states as deleted and returns the number of newly marked ones."""
+        """Marks committed states as deleted.
+
+        Returns:
+            The number of states that were not marked as deleted before.
+        """
         new = 0
         for index in indices:
             new += not self._flags[index] & DELETED
@@ -187,7 +205,11 @@ class FrameTable:
         return new
 
     def restore_state(self, index: int) -> bool:
-        """Clears the flags of a frame that will be updated again, and returns whether its state was deleted."""
+        """Clears the flags and the error of a frame that will be updated again.
+
+        Returns:
+            Whether the state of the frame was marked as deleted.
+        """
         gone = bool(self._flags[index] & DELETED)
         self._flags[index] &= ~(DELETED | UNREADABLE)
         if index in self._notes:
@@ -195,7 +217,10 @@ class FrameTable:
         return gone
 
     def commit_up_to(self, last: int) -> None:
-        """Marks all queued and updating frames up to and including `last` as committed; used after startup."""
+        """Marks all queued and updating frames up to and including frame `last` as committed.
+
+        This method is called when the frames are reconciled with the committed states on disk.
+        """
         states = np.frombuffer(self._states, np.uint8)
         for state in (FrameState.QUEUED, FrameState.UPDATING):
             rows = np.flatnonzero(states[: last + 1] == CODES[state])
@@ -217,18 +242,24 @@ class FrameTable:
                 del self._notes[index]
 
     def rare_properties(self, index: int) -> RareProperties:
-        """Returns the rare properties of the frame for modification, and creates them if missing."""
+        """Returns the rare properties of the frame, which the caller may modify.
+
+        The properties are created if the frame has none.
+        """
         return self._notes.setdefault(index, RareProperties())
 
     def set_record(self, index: int, record: Mapping[str, Any]) -> None:
-        """Stores a commit record (`History.report`) and evicts the oldest one if the limit is exceeded."""
+        """Stores the commit record of a frame (`History.report`).
+
+        If more than `RECORDS_KEPT` records are stored, the oldest record is evicted.
+        """
         self._records[index] = record
         self._records.move_to_end(index)
         while len(self._records) > RECORDS_KEPT:
             self._records.popitem(last=False)
 
     def cache_record(self, index: int, record: Mapping[str, Any]) -> None:
-        """Stores the record of an older commit if there is space, without evicting newer ones."""
+        """Stores the record of an older commit if fewer than `RECORDS_KEPT` records are stored."""
         if record and index not in self._records and len(self._records) < RECORDS_KEPT:
             self._records[index] = record
             self._records.move_to_end(index, last=False)

@@ -1,8 +1,9 @@
 """Journal of a scene: one append-only file of events. An event is acknowledged once it is on disk.
 
-If the file is deleted or replaced while the service is running, events appended to the open descriptor would be lost.
-Each write therefore checks that the path still refers to the open file. If it does not, or if a scrub finds damage, the
-journal is rewritten from the ledger (`snapshot`): it is written to a temporary file, which is then renamed.
+If the file is deleted or replaced while the service is running, events appended to the open
+descriptor would be lost. Each write therefore checks that the path still refers to the open file.
+If the path refers to another file, or if a scrub finds damage, the journal is rewritten from the
+ledger (`snapshot`). The new journal is written to a temporary file, which is then renamed.
 """
 
 from __future__ import annotations
@@ -291,10 +292,11 @@ class Journal:
         return self.file_fault() if watched else None
 
     async def _rewrite_or_append(self, events: Sequence[JournalEvent]) -> None:
-        """Rewrites the journal, or only appends if the disk is too full for a rewrite and the open file is in place.
+        """Rewrites the journal with the given events added.
 
-        A damaged record loses one event, whereas a refused frame is lost completely. The next scrub will find the
-        damage again.
+        If the disk is too full for a rewrite, the events are appended to the damaged journal
+        instead, provided that the open file is still at its path. Otherwise, the frame that waits
+        for the write would be refused and lost. The next scrub finds the damage again.
         """
         try:
             await self._rewrite(events)

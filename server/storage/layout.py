@@ -33,12 +33,16 @@ class DataFolder:
 
     @property
     def deleted(self) -> Path:
-        """Folder for deleted scenes until they are removed from disk."""
+        """Folder for deleted scenes and other unneeded files until they are removed from disk."""
         return self.path / "deleted"
 
     @property
     def exports(self) -> Path:
-        """Folder of exports, with a subfolder per scene ID and, within it, one per export; emptied at startup."""
+        """Folder of exports, which is emptied at startup.
+
+        The folder contains one subfolder per scene, named by scene ID. The subfolder of a scene
+        contains one folder per export.
+        """
         return self.path / "exports"
 
     def scene(self, id: str) -> SceneFolder:
@@ -69,7 +73,10 @@ EXPORT = "export"
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Folder of one scene. Files of a reconstruction other than number 0 have its number in their names.
+    """Folder of one scene.
+
+    The names of files that belong to a reconstruction other than number 0 contain the number of the
+    reconstruction.
 
     Attributes:
         path: folder path.

@@ -1,6 +1,7 @@
 """Ledger of the frames of a scene, built from its journal events, and the log that journals every change.
 
-`Ledger.apply` is used both by a running scene and by one that is recovered after a service restart.
+`Ledger.apply` is called while a scene is running, and also when a scene is recovered from its
+folder.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ NO_FIRST_FRAME = "the scene failed at an earlier frame"
 
 
 def frame_identity(hashes: Hashes, time: float) -> str:
-    """Returns the BLAKE3 digest of the sorted (camera, kind, file digest) tuples and the time in seconds."""
+    """Returns the identity of a frame, which depends on its files and its time in seconds.
+
+    The identity is the BLAKE3 digest of the sorted (camera, kind, file digest) tuples and the time.
+    """
     parts = sorted((camera, str(kind), value) for camera, files in hashes.items() for kind, value in files.items())
     return blake3(json.dumps([parts, time]).encode()).hexdigest()
 
@@ -60,7 +64,8 @@ class Ledger:
         fatal: reason why the scene cannot continue, or None.
         failed_at: index of the frame that made the scene fail, or None.
         states_deleted: number of committed states that no longer exist.
-        budgets: (first frame, budget) pairs, in ascending order.
+        budgets: pairs of a frame index and the budget that applies from this frame on, in ascending
+            order.
         edited: accumulated changes to name, archive flag and retention since creation.
         begun: event that started the current reconstruction, or None for the original one.
     """
@@ -108,7 +113,10 @@ class Ledger:
         return self.counts[FrameState.UPDATING] > 0
 
     def apply(self, event: JournalEvent) -> None:
-        """Applies one event; events may be repeated, and earlier events may be missing."""
+        """Applies one event. Earlier events may be missing.
+
+        Events other than `WorkerDied` may be applied twice.
+        """
         match event:
             case FrameAccepted():
                 parts = self.open.pop(event.index, None)
@@ -268,7 +276,10 @@ class Ledger:
         return None
 
     def _grow_to(self, index: int) -> None:
-        """Grows the table up to a frame; unknown frames before it are marked as failed."""
+        """Grows the table so that it contains a frame. New frames have the state FAILED.
+
+        Open frames up to this frame are removed, because they are closed now.
+        """
         if index >= self.next_frame:
             for new in [new for new in self.open if new <= index]:
                 del self.open[new]
@@ -311,7 +322,10 @@ class SceneLog:
             self.ledger.apply(event)
 
     async def write(self, *events: JournalEvent) -> None:
-        """Appends mandatory events to the journal and retries until there is disk space; the caller applies them."""
+        """Appends events that must not be lost, and retries until there is disk space.
+
+        The events are only written to the journal. The caller applies them to the ledger.
+        """
         while True:
             try:
                 await self.journal.append(*events)
@@ -330,8 +344,9 @@ class SceneLog:
     def deletable(self, rule: Retention) -> list[int]:
         """Returns the frames whose images can be deleted under the retention rule, in ascending order.
 
-        Images of unfinished frames are kept. An interrupted scene may roll back to an earlier commit, so the images of
-        all later frames are kept too.
+        The images of unfinished frames are kept. An interrupted scene may roll back to one of its
+        `NEWEST_KEPT` newest commits. The images of all frames after the oldest of these commits are
+        therefore kept too.
         """
         ledger, pictures = self.ledger, self.pictures
         if len(ledger.committed) < NEWEST_KEPT or (rule.last is None and rule.bytes is None):

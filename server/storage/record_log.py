@@ -46,7 +46,7 @@ MAX_HEAD = 1 << 22
 
 
 class LogRecordKind(IntEnum):
-    """Record kinds."""
+    """Kind of a record."""
 
     EVENT = 1
     """Event of a frame or of the scene, stored completely in the head."""

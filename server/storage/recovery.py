@@ -91,6 +91,9 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         folder: scene folder.
         scene: scene ID.
         definition: definition as in `SceneCreated`; if None, the journal is not rewritten.
+
+    Raises:
+        DefinitionError: the committed states have an unsupported format.
     """
     frames, journal = folder.frames, folder.journal
     frames.mkdir(exist_ok=True)
@@ -180,7 +183,9 @@ def _deletes_states(definition: Mapping[str, Any], ledger: Ledger) -> bool:
 
 
 def _recomputable(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
-    """Returns frames whose committed states are unreadable but can be recomputed from their stored images.
+    """Returns the frames whose unreadable states can be recomputed from their stored images.
+
+    The result maps each of these frames to the reason why its state is unreadable.
 
     If events are lost, a frame without a state may never have been committed, so it is not included. If a rule deletes
     old states, missing states before the oldest one are ignored, because the journal may lack their deletion. The first
@@ -279,7 +284,10 @@ def _frame_event(index: int, name: str, pictures: StoredPictures, ledger: Ledger
 
 
 def _close_event(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:
-    """Returns the event of a committed frame whose cameras uploaded separately."""
+    """Returns the event that closes a frame whose cameras uploaded separately.
+
+    Returns None if the time of the frame is unknown or no record contains an image.
+    """
     hashes: Hashes = {}
     for pictures in parts.values():
         for camera, kinds in pictures.hashes.items():

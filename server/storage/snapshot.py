@@ -1,4 +1,4 @@
-"""Conversion of a ledger to events, to rewrite a damaged or deleted journal."""
+"""Conversion of a ledger back to events, from which a damaged or deleted journal is rewritten."""
 
 from __future__ import annotations
 
@@ -92,7 +92,11 @@ def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
 
 
 def _camera_events(frame: OpenFrame) -> Iterator[CameraAccepted]:
-    """Yields one event per file; the assignment of files to a camera with several files may change."""
+    """Yields one event per file.
+
+    The ledger does not record which file belongs to which camera. The files are assigned to the
+    cameras in order, so the assignment may be wrong if a camera has several files.
+    """
     cameras = list(frame.hashes)
     for place, file in enumerate(frame.files):
         camera = cameras[min(place, len(cameras) - 1)]

@@ -53,7 +53,9 @@ LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: Li
 
 
 class Subscriber:
-    """Subscriber to a scene on behalf of one client; the route that owns the connection drains its outbox.
+    """Subscriber to a scene on behalf of one client.
+
+    The WebSocket route sends the messages in the outbox.
 
     Attributes:
         closing: code and reason for closing the connection after the last message in the outbox.
@@ -133,7 +135,10 @@ class Subscriber:
         self.outbox.close_with(SceneGone(reason=reason))
 
     def on_restart(self) -> None:
-        """Handles a restart of the reconstruction; the client must reconnect, as after a restart of the service."""
+        """Handles a restart of the reconstruction.
+
+        The client must reconnect, as after a restart of the service.
+        """
         self.closing = (SCENE_RESTARTS, "the reconstruction is being restarted")
         self.outbox.close_with(None)
 

@@ -1,4 +1,7 @@
-"""Opens exports: numbered files in a folder or a .zip, a single file, or USD. Rejects formats without ids."""
+"""Opens numbered files in a folder or .zip, a single .glb or .ply file, or a USD file.
+
+Formats that do not identify Gaussians across frames are rejected.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ def open_export(path: Path | str, frames_per_second: float = DEFAULT_FPS) -> Exp
         frames_per_second: frame rate of numbered files; the time of frame n is n / frames_per_second.
 
     Raises:
-        InputError: if the path is not an export, or its format has no Gaussian ids.
+        InputError: if the path is not a readable export, or its format does not identify Gaussians.
 
     >>> open_export("scene.splat")
     Traceback (most recent call last):
@@ -140,9 +143,10 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
 
 
 class PlyRows:
-    """Reads numbered .ply files. If all files have the same rows, the rows identify Gaussians.
+    """The .ply files of one sequence.
 
-    A Gaussian's opacity never changes, so rows with different opacities are different Gaussians.
+    Row numbers identify Gaussians, so all files must have the same rows. Rows are compared by
+    opacity, because the opacity of a Gaussian never changes.
 
     Args:
         files: name of each file, and a function that returns its contents.

@@ -1,9 +1,10 @@
 """Reconstructs states from one cloud per frame: assigns rows to Gaussians, and detects births and retirements.
 
-A cloud contains the Gaussians present in its frame, with their ids. A Gaussian gets its row in the first frame that
-contains it, and is retired in each later frame that does not contain it. Data missing from the files is inferred: a
-Gaussian moves if its position changes. Its material rotation is the rotation of its covariance axes, which exports keep
-in the order of the transported axes.
+A cloud contains the Gaussians present in its frame, with their ids. A Gaussian gets its row in the
+first frame that contains it, and is retired in each later frame that does not contain it. Two
+properties are missing from the files and are inferred. A Gaussian counts as moving if its position
+changes. Its material rotation is the rotation of its covariance axes since its first frame; exports
+order and sign these axes so that they follow the material.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ class _GaussianTable:
 
 @dataclass(eq=False)
 class ExportedStates:
-    """Presents a sequence of clouds as states, keeping only one frame and the Gaussians' constant data in memory.
+    """A sequence of states that is read from one cloud per frame.
+
+    Only one frame, and the constant data of each Gaussian, are kept in memory.
 
     Attributes:
         frames: frame indices in increasing order.
@@ -52,7 +55,7 @@ class ExportedStates:
         head: header of the states; the origin of its world is zero, because files do not store one.
         part_of: maps each Gaussian id to its part label; empty if the file has no parts.
         remarks: sentences about lost or assumed information.
-        damage: always None; exists for compatibility with compact files.
+        damage: always None; exists for compatibility with ``CompactReader``.
 
     >>> from scas4d_core.exports.cloud import cloud_of
     >>> first = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)

@@ -46,7 +46,7 @@ def open_usd(path: Path) -> ExportedStates:
     codes = _codes(stage, prim)
     first, begin = int(origin.get("first_frame", 0)), float(origin.get("first_time_s", 0.0))
     frames = [first + round(code) for code in codes]
-    if len(set(frames)) < len(frames):  # several frames per time code, so the rate is not the frame rate
+    if len(set(frames)) < len(frames):  # indices collide, so the rate is not the frame rate
         frames = list(range(first, first + len(codes)))
     parts = primvars.GetPrimvar("scas4d:part").Get() if primvars.HasPrimvar("scas4d:part") else None
     part_of = {} if parts is None else dict(zip(reader.ids.tolist(), np.array(parts).tolist(), strict=True))
@@ -72,7 +72,7 @@ def _codes(stage: Any, prim: Any) -> list[float]:
 
 
 class _Reader:
-    """Reads the Gaussians present at a time code."""
+    """Reader of the Gaussians that are present at a time code."""
 
     def __init__(self, stage: Any, prim: Any, ids: NDArray[np.int64]) -> None:
         self._stage = stage  # the stage must outlive its prims
