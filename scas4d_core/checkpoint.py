@@ -159,8 +159,7 @@ class Checkpoints:
         for name, given in carry_over.effects.items():
             arrays |= {f"effect.{name}.{key}": array for key, array in given.items()}
         for view in carry_over.seen:
-            levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # exact: the source images are 8 bit
-            arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
+            arrays[f"seen.{view.name}"] = view.pixels
         # The list of names distinguishes arrays that were lost from arrays that were never written.
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)

@@ -65,6 +65,13 @@ class TrainingView:
     exposure: Array
     source: tuple[NDArray[np.uint8], NDArray[np.uint8] | None] | None = None
 
+    @property
+    def pixels(self) -> NDArray[np.uint8]:
+        """Image [H, W, 3] in levels of 255, which is exact if the view was created from an 8-bit image."""
+        if self.source is not None:
+            return self.source[0]
+        return np.ascontiguousarray(np.moveaxis(np.rint(255 * self.target[:3]).astype(np.uint8), 0, -1))
+
     @cached_property
     def mean(self) -> NDArray[np.float64]:
         """Mean RGB [3] of the image in 0…1, computed on first access."""
