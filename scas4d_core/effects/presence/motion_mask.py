@@ -134,7 +134,9 @@ def _changed_between(before: TrainingView, now: TrainingView) -> Array:
 
 def _with_surroundings(changed: NDArray[np.bool_]) -> Array:
     """Returns an [H, W] map that is 1 in and around the true pixels, and 0 elsewhere."""
-    return np.ascontiguousarray(_dilated(_dilated(changed).T).T, np.float32)
+    if changed.any():
+        changed = _dilated(_dilated(changed).T).T
+    return np.ascontiguousarray(changed, np.float32)
 
 
 def _dilated(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -157,12 +159,12 @@ def find_moving(
         renderer: renderer that accumulates pixel values onto Gaussians.
     """
     earlier = {view.name: view for view in before}
+    changes = [(view, _changed_between(earlier[view.name], view)) for view in now if view.name in earlier]
     says = np.zeros(len(gaussians), np.int64)
     asked = np.zeros(len(gaussians), np.int64)
-    for view in now:
-        if view.name not in earlier:
-            continue
-        changed = _changed_between(earlier[view.name], view)
+    if sum(bool(changed.any()) for _, changed in changes) < 2:  # no two cameras can agree
+        return says > 0
+    for view, changed in changes:
         planes = np.stack([np.ones_like(changed), changed])
         total, inside = renderer.gather(gaussians, view.camera, planes).T
         sees = total > SEEN_PIXELS
