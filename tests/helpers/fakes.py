@@ -25,6 +25,9 @@ LOOKED_AT = 246
 """A frame with that red takes long enough for a browser on a busy machine to show that it is at work."""
 WAITS = 247
 """A frame with that red is at work until the file exists that the variable FAKE_GO_ON names."""
+WRITES_LATE, CANNOT_BE_WRITTEN = 238, 239
+"""A frame with the first red is written once the file exists that the variable FAKE_GO_ON names; one with the second
+red, never."""
 PICKY, PICKED = 249, 77
 """A first frame with that red fails, unless static.iterations are those."""
 ITERATIONS = 100
@@ -70,6 +73,13 @@ def obey(frame):
     if red == DIES:
         os._exit(7)
     return red
+
+
+def write_late(red):
+    if red == CANNOT_BE_WRITTEN:
+        raise OSError("the fake disk is broken")
+    while not os.path.exists(os.environ["FAKE_GO_ON"]):
+        time.sleep(0.01)
 
 
 def state(points, index, before=None, red=0):
@@ -186,6 +196,8 @@ class FakeReconstruction:
         ]
         record["errors"] = {"previous": 0.5, "end": 1 / self.iterations}
         record |= {"candidate": record.get("candidate", "end"), "attempts": ["as set"], "threads": 2}
+        if red in (WRITES_LATE, CANNOT_BE_WRITTEN):
+            defer(lambda: write_late(red))
         self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record, defer=defer)
         return report
 
