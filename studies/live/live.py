@@ -7,11 +7,13 @@ that announces its commit, and is measured with an empty queue.
 from __future__ import annotations
 
 import io
+import shutil
 import statistics
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,11 +25,16 @@ from client.stream import FrameMessage, Stream, finished_frames
 from client.wire import FrameState
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
+from studies.machine import in_words, machine
 from studies.running.process import Service, StudyError
 
 JPEG_QUALITY = 90
 NOISE = 1.5
 """Standard deviation of the sensor noise, in levels of 255."""
+DIFFERENT_FRAMES = 8
+"""Number of different frames, which are played back and forth."""
+SETTINGS = {"static": {"iterations": 2000}, "update": {"skip_tolerance": -1}}
+"""Settings of the scene: a short fit of frame 0, and no skipped updates, because the scene is still."""
 FIRST = 2
 """Number of frames before the measurement: the first frame and the first update, which are slower."""
 
@@ -138,3 +145,34 @@ def _put(service: Service, scene: str, index: int, frames: Sequence[Mapping[str,
         if answer.status_code != 429:
             raise StudyError(answer.text)
         time.sleep(0.002)
+
+
+def run(capture: Capture, rig: Rig, count: int, work: Path) -> LiveResult:
+    """Starts a service with the null engine in an emptied folder and measures it; see `measure`."""
+    shutil.rmtree(work, ignore_errors=True)
+    (work / "data").mkdir(parents=True)
+    service = Service(work / "data", program=("-m", "studies.live.serve"))
+    service.start()
+    try:
+        return measure(service, rig, capture, noisy_frames(capture, rig, DIFFERENT_FRAMES), SETTINGS, count)
+    finally:
+        service.stop()
+
+
+def report(rig: Rig, result: LiveResult) -> str:
+    """Returns the result as a Markdown table."""
+    camera = rig.cameras[0]
+    stages = ", ".join(f"{name} {value:.0f}" for name, value in result.stages_ms.items())
+    return "\n".join(
+        [
+            f"Null engine, {len(rig)} cameras of {camera.width}×{camera.height} as JPEG, over HTTP "
+            f"({in_words(machine())}):",
+            "",
+            "| figure | value |",
+            "|---|---|",
+            f"| committed frames per second, queue never empty | {result.rate:.1f} |",
+            f"| last byte to commit event, queue empty, p50 / p95 | {result.quantile(0.5):.0f} / "
+            f"{result.quantile(0.95):.0f} ms |",
+            f"| mean time of each stage, in ms | {stages} |",
+        ]
+    )

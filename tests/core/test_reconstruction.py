@@ -19,7 +19,8 @@ from scas4d_core.kernels import neighbour_terms
 from scas4d_core.query.ply import read_ply
 from scas4d_core.reconstruction import FrameReport, Progress, Reconstruction, StepError
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings, Weights
-from scas4d_core.storage.history import History
+from scas4d_core.storage.history import History, run_now
+from scas4d_core.storage.npz import read_npz
 from studies.constants import varied
 
 BOX = make_box()
@@ -382,3 +383,33 @@ def test_the_report_shows_the_camera_whose_colours_changed() -> None:
     others = [shift for name, shift in red.items() if name != bumped]
     assert red[bumped] > 0.05 + max(others)  # the Gaussians' colours go part of the way, for all cameras
     assert all(5 < fit["psnr"] < 60 for fit in cameras.values())
+
+
+def test_a_deferred_commit_is_in_memory_at_once_and_on_disk_later(tmp_path):
+    """Two updates whose files are written late leave the same files as two that are written at once."""
+
+    def run(folder: Path, late: bool) -> Reconstruction:
+        scene = Reconstruction.start(training(), FRAMES[0], SETTINGS, points=points(), history=History(folder))
+        writes: list[Callable[[], None]] = []
+        for frame in FRAMES[1:]:
+            for write in writes:  # those of the frame before, which is needed only in memory
+                write()
+            writes.clear()
+            scene.step(frame, defer=writes.append if late else run_now)
+            assert scene.history.indices[-1] == frame.index
+            assert History.load(folder).indices[-1] == (frame.index - 2 if late else frame.index)
+        for write in writes:
+            write()
+        return scene
+
+    run(tmp_path / "late", True)
+    run(tmp_path / "at once", False)
+    late, at_once = (
+        {path.name: read_npz(path) for path in (tmp_path / name).glob("*.npz")} for name in ("late", "at once")
+    )
+    assert late.keys() == at_once.keys()
+    for name, arrays in late.items():
+        assert arrays.keys() == at_once[name].keys()
+        for key, array in arrays.items():
+            if key != "report":  # it has times
+                np.testing.assert_array_equal(array, at_once[name][key], err_msg=f"{name} {key}")

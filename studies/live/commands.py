@@ -1,0 +1,36 @@
+"""The command `scripts/bench live`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.options import Page, Repeated, write_page
+
+
+def live(
+    capture: Repeated,
+    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras; the first ones of the capture.")] = 24,
+    frames: Annotated[int, typer.Option(min=10, help="Number of frames for each of the two measurements.")] = 200,
+    work: Annotated[Path, typer.Option(help="Folder for the data folder and log; its contents are deleted.")] = Path(
+        "out/live"
+    ),
+    out: Page = None,
+) -> None:
+    """Measures the frame rate and latency of the service with an engine whose iterations take no time.
+
+    Example: scripts/bench live samples/robot --cameras 18
+    """
+    from client.cli.extras import need_server
+    from client.importers.open_source import open_source
+    from scas4d_core.cameras import Rig
+    from studies.live.live import report, run
+
+    need_server()
+    source = open_source(capture)
+    rig = Rig(source.full_rig.cameras[:cameras])
+    text = report(rig, run(source, rig, frames, work))
+    typer.echo(text)
+    write_page(out, text)
