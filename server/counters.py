@@ -46,6 +46,13 @@ for what in AlarmKind:
 UPDATE_SECONDS = Histogram(
     "scas4d_update_seconds", "Duration of each stage of an update.", ["stage"], buckets=SECONDS, registry=registry
 )
+FRAME_LATENCY = Histogram(
+    "scas4d_frame_latency_seconds",
+    "Latency of committed frames, by stage: queue, update, commit; total is from acknowledgement to commit.",
+    ["stage"],
+    buckets=SECONDS,
+    registry=registry,
+)
 QUERY_SECONDS = Histogram(
     "scas4d_query_seconds",
     "Time until a scene's reader answers a query, by outcome and kind: render, tracks, parts, labels, gaussians, ply, "

@@ -54,6 +54,15 @@ class MissingRequest(Model):
     reason: str = Field(default="", max_length=500, description="Human-readable reason.")
 
 
+class FrameLatency(Model):
+    """Latency of a committed frame in seconds, from its acknowledgement to the publication of its commit."""
+
+    queue: float = Field(description="From the acknowledgement until the update started.")
+    update: float = Field(description="From then until the new state was in memory.")
+    commit: float = Field(description="From then until the state was on disk and the commit was published.")
+    total: float = Field(description="Sum of the others.")
+
+
 class CameraFitModel(Model):
     """Match between a camera's image and the render; poor if the camera moved or changed."""
 
@@ -279,6 +288,9 @@ class FrameReportModel(Model):
     )
     seconds: dict[str, float] = Field(
         default_factory=dict, description="Duration of each stage in seconds, keyed by stage name."
+    )
+    latency: FrameLatency | None = Field(
+        default=None, description="Latency of the frame; null after a restart of the service and for old frames."
     )
     write_seconds: float | None = Field(
         default=None,

@@ -245,6 +245,10 @@ class SceneStatus(Model):
         description="Number of acknowledged but unfinished frames, including the one being reconstructed."
     )
     queue_limit: int
+    behind_seconds: float = Field(
+        default=0.0,
+        description="Seconds since the oldest unfinished frame was received; 0 if there is none, or after a restart.",
+    )
     committed: int = Field(description="Number of committed frames, which can be rendered and tracked.")
     first_committed: int | None
     last_committed: int | None

@@ -207,6 +207,7 @@ class Ingest:
         for index in (index for one in skipped for index in one.frames):
             self.publish_ended(index)
         counters.FRAMES.labels("acknowledged").inc()
+        self.updates.latencies.receive(event.index)
         if self.ledger.frames[event.index].finished:  # the frame precedes the first frame of the reconstruction
             self.publish_ended(event.index)
         receipt = self.ledger.frames[event.index].receipt

@@ -189,6 +189,7 @@ class Scene:
             warnings=self.warnings,
             trouble=self._trouble.sentence or self.repair_queue.current_repair,
             at_work=updates.at_work,
+            behind_seconds=updates.behind_seconds,
             progress=updates.progress,
             worker_deaths=updates.worker.deaths.count,
             asleep=not self.has_place,
@@ -271,7 +272,8 @@ class Scene:
 
     async def report(self, index: int) -> FrameReportModel | None:
         """Returns the report of a frame; see `FrameReports.of`."""
-        return await self._reports.of(index)
+        report = await self._reports.of(index)
+        return None if report is None else self.updates.with_latency(report)
 
     def budget(self) -> SceneBudget:
         """Returns the budget for the next frame whose update starts."""

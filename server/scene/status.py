@@ -57,6 +57,7 @@ class SceneFacts:
         warnings: warnings about the rig.
         trouble: reason why the scene is degraded, or None.
         at_work: whether a frame is being processed.
+        behind_seconds: seconds since the oldest unfinished frame was received.
         progress: progress of the first frame while it is being reconstructed, or of the compilation
             of kernels before an update; otherwise None.
         worker_deaths: number of worker crashes since the scene was loaded.
@@ -73,6 +74,7 @@ class SceneFacts:
     warnings: list[str]
     trouble: str | None
     at_work: bool = False
+    behind_seconds: float = 0.0
     progress: ProgressModel | None = None
     worker_deaths: int = 0
     asleep: bool = False
@@ -105,6 +107,7 @@ class SceneFacts:
             next_frame=ledger.next_frame,
             queued=ledger.unfinished,
             queue_limit=self.queue_limit,
+            behind_seconds=round(self.behind_seconds, 3),
             committed=len(committed),
             first_committed=committed[0] if committed else None,
             last_committed=committed[-1] if committed else None,

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from client.wire import FrameState, IngestSettings, ProgressModel, Retention
+from client.wire import FrameReportModel, FrameState, IngestSettings, ProgressModel, Retention
 from server import counters
 from server.background import Background
 from server.hub import Publisher
@@ -37,6 +37,7 @@ from server.processes.readers import Readers
 from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.storage.events import FrameFailed, PicturesDeleted, StatesDeleted, WorkerDied
 from server.storage.ledger import SceneLog
+from server.updates.latency import Latencies
 from server.updates.reports import FrameReports, first_frame_facts
 from server.updates.trouble import Trouble, last_trouble, trouble_in_report
 from server.updates.work_clock import WorkClock
@@ -68,6 +69,7 @@ class Updates:
 
     Attributes:
         clock: predictor of when the current update ends.
+        latencies: times of the newest frames.
         worker: supervisor of the worker process.
         progress: progress of the first frame while it is being reconstructed, or of the compilation
             of kernels before an update; otherwise None.
@@ -101,6 +103,7 @@ class Updates:
         self._keep_frames = keep_frames
         self._room_made: Callable[[], Awaitable[None]] | None = None
         self.clock = WorkClock()
+        self.latencies = Latencies()
         self.worker = worker
         self.progress: ProgressModel | None = None
         self.first = first
@@ -169,6 +172,7 @@ class Updates:
         ledger.set_state(index, FrameState.UPDATING)
         self._index, self._announced = index, None
         self.clock.begin(first=not ledger.committed)
+        self.latencies.start(index)
         self.worker.send(message)
         self._announce_next()
         self._publisher.publish_status()
@@ -213,6 +217,7 @@ class Updates:
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self._publisher.publish_status()
             case FrameSolved():
+                self.latencies.solve(message.index)
                 self._start_next(message.index)
             case FrameCommitted():
                 self._background.run(self._commit(message))
@@ -284,8 +289,9 @@ class Updates:
         else:
             self._writing.remove(message.index)
         self._ledger.set_state(message.index, FrameState.COMMITTED)
+        self.latencies.commit(message.index)
         self._record(message.index, message.report)
-        report = self._ledger.frames[message.index].report
+        report = self.with_latency(self._ledger.frames[message.index].report)
         self._trouble.sentence = trouble_in_report(report)
         self._readers.refresh((message.index,))
         self._publisher.publish_frame(report)
@@ -293,6 +299,18 @@ class Updates:
         await self._on_states_deleted(message.deleted)
         await self.retain()
         await self._make_room()
+
+    def with_latency(self, report: FrameReportModel) -> FrameReportModel:
+        """Returns the report of a frame with its latency, if it is known."""
+        latency = self.latencies.of(report.index) if report.state == FrameState.COMMITTED else None
+        return report if latency is None else report.model_copy(update={"latency": latency})
+
+    @property
+    def behind_seconds(self) -> float:
+        """Seconds since the oldest unfinished frame was received."""
+        return self.latencies.behind(
+            [*self._writing, *([] if self._index is None else [self._index]), *self._waiting()]
+        )
 
     async def _make_room(self) -> None:
         if self._ledger.open and self._room_made is not None:

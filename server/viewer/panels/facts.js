@@ -69,6 +69,9 @@ export function showEffects(list, words, effects) {
   ].join(" ");
 }
 
+/** How far the reconstruction is behind the cameras, if that is more than a moment. */
+const behind = (seconds) => (seconds >= 0.05 ? `, ${seconds.toFixed(1)} s behind the cameras` : "");
+
 /** Draws a box for each place in the queue, and describes the queue in words. */
 export function showQueue(box, words, status) {
   const places = Math.min(status.queue_limit, 24);
@@ -76,7 +79,7 @@ export function showQueue(box, words, status) {
   box.replaceChildren(...Array.from({ length: places }, (_, i) => node("span", { class: i < taken ? "taken" : "free" })));
   const full = status.queued >= status.queue_limit;
   words.textContent = status.queued
-    ? `${status.queued} of ${status.queue_limit} waiting or in progress${full ? "; the queue is full, so senders must wait" : ""}`
+    ? `${status.queued} of ${status.queue_limit} waiting or in progress${behind(status.behind_seconds)}${full ? "; the queue is full, so senders must wait" : ""}`
     : `Empty; frame ${status.next_frame} is next`;
   box.classList.toggle("full", full);
 }

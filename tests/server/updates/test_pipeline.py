@@ -59,10 +59,17 @@ def test_the_next_frame_is_updated_before_the_last_one_is_written(served, go_on)
     wait_for(lambda: state_of(http, id, 2) == "updating")
     assert [state_of(http, id, index) for index in (1, 2, 3)] == ["updating", "updating", "queued"]
     assert status(http, id)["committed"] == 1  # committed means written
+    assert status(http, id)["behind_seconds"] > 0
     assert http.get(f"/v1/scenes/{id}/render?camera=c0&frame=1").status_code == 404
     go_on.touch()
     finished(http, id, 3)
     assert [state_of(http, id, index) for index in range(4)] == ["committed"] * 4
+    assert status(http, id)["behind_seconds"] == 0
+    first, second = (http.get(f"/v1/scenes/{id}/frames/{index}").json()["latency"] for index in (1, 2))
+    for latency in (first, second):
+        assert latency["total"] == pytest.approx(latency["queue"] + latency["update"] + latency["commit"])
+    assert first["commit"] > second["queue"]  # the second was updated while the first was written
+    assert 'scas4d_frame_latency_seconds_count{stage="total"}' in http.get("/metrics").text
 
 
 def test_a_crash_while_a_state_is_written_repeats_both_frames(served, go_on):
