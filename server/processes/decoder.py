@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ Decoded = tuple[Frame, dict[str, str]]
 class FrameDecoder:
     """Decoder of a scene's frames, which decodes at most one frame in advance.
 
+    The next frame may be announced before the worker takes the one decoded before, so two frames may be in memory.
+
     Args:
         rig: cameras of the scene.
         folder: folder of the frame log.
@@ -38,13 +41,15 @@ class FrameDecoder:
         self._folder = folder
         self._cameras = ThreadPoolExecutor(min(DECODERS, os.cpu_count() or 1), thread_name_prefix="decode")
         self._frames = ThreadPoolExecutor(1, thread_name_prefix="decode-ahead")
-        self._ahead: tuple[FrameReady, Future[Decoded]] | None = None
+        self._ahead: dict[tuple[int, tuple[str, ...], str], Future[Decoded]] = {}
+        self._lock = threading.Lock()
 
     def begin(self, message: FrameReady) -> None:
-        """Starts to decode a frame in advance, instead of any other frame."""
-        if self._ahead is not None:
-            self._ahead[1].cancel()
-        self._ahead = message, self._frames.submit(self._decode, message)
+        """Starts to decode a frame in advance. Of the frames before it, only the last one is kept."""
+        with self._lock:
+            for old in list(self._ahead)[:-1]:
+                self._ahead.pop(old).cancel()
+            self._ahead[_key(message)] = self._frames.submit(self._decode, message)
 
     def decode(self, message: FrameReady) -> Decoded:
         """Decodes a frame, or returns it if it was decoded in advance.
@@ -52,11 +57,9 @@ class FrameDecoder:
         Raises:
             FrameDamage: the single record that contains the whole frame is damaged.
         """
-        ahead = self._ahead
-        if ahead is not None and _key(ahead[0]) == _key(message):
-            self._ahead = None
-            return ahead[1].result()
-        return self._decode(message)
+        with self._lock:
+            ahead = self._ahead.pop(_key(message), None)
+        return self._decode(message) if ahead is None else ahead.result()
 
     def _decode(self, message: FrameReady) -> Decoded:
         return self.decode_images(message, read(self._folder, message))
