@@ -24,8 +24,8 @@ def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
 
     Args:
         id: scene id.
-        budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, skip_tolerance. Fields that are
-            omitted or None default to the scene's settings.
+        budget: fields of `client.wire.Budget`: iterations, budget_ms, keep_up_fps, stop_gain, skip_tolerance. Fields
+            that are omitted or None default to the scene's settings.
 
     >>> found = client.set_budget(scene, iterations=50)
     >>> found.effective.iterations, found.since

@@ -10,6 +10,7 @@ from client.wire.base import Model
 
 MOST_ITERATIONS = 100_000
 LONGEST_MS = 3_600_000.0
+LOWEST_FPS = 1000 / LONGEST_MS
 
 Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 
@@ -29,6 +30,17 @@ class Budget(Model):
         description=(
             "Milliseconds per frame, including decoding and commit. The update runs as many iterations "
             "as fit, regardless of `iterations`."
+        ),
+    )
+    keep_up_fps: float | None = Field(
+        default=None,
+        strict=True,
+        ge=LOWEST_FPS,
+        le=1000,
+        allow_inf_nan=False,
+        description=(
+            "Frames per second to keep up with. It replaces `budget_ms`: each frame gets the time that this rate "
+            "leaves, and less while frames are waiting."
         ),
     )
     stop_gain: float | None = Field(
@@ -59,6 +71,7 @@ class BudgetFields(TypedDict, total=False):
 
     iterations: int | None
     budget_ms: float | None
+    keep_up_fps: float | None
     stop_gain: float | None
     skip_tolerance: float | None
 
@@ -67,7 +80,8 @@ class EffectiveBudget(Model):
     """The limits in effect, with defaults filled in."""
 
     iterations: int
-    budget_ms: float | None = Field(description="Milliseconds per frame; null for no limit.")
+    budget_ms: float | None = Field(description="Milliseconds per frame while no frame is waiting; null for no limit.")
+    keep_up_fps: float | None = Field(default=None, description="Frames per second to keep up with; null for none.")
     stop_gain: float
     skip_tolerance: float
 

@@ -269,7 +269,7 @@ class Worker:
                 began += wait_for_updates(self.spec.settings, self.send)  # compilation does not count
                 self._compiled = True
             if budget != self._budget:
-                self.reconstruction.set_budget(**budget.model_dump())
+                self.reconstruction.set_budget(**budget.model_dump(exclude={"keep_up_fps"}))
                 self._budget = budget
             notes = {
                 "budget": budget.model_dump(),

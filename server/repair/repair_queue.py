@@ -19,6 +19,7 @@ from scas4d_core.errors import without_paths
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
 from server import counters
 from server.background import Background
+from server.keep_up import with_time_limit
 from server.messages import FrameReady, RecomputeState, RepairFiles, RepairOutcome, RepairResult
 from server.storage.events import StatesDeleted
 from server.storage.ledger import SceneLog
@@ -189,7 +190,8 @@ class RepairQueue:
             if receipt is None or not entry.files:
                 self._declare_unrecoverable(index, "its images are no longer stored")
                 continue
-            frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
+            budget = with_time_limit(self._ledger.budget_of(index), waiting=0)
+            frame = FrameReady(index, receipt.time, entry.files, receipt.identity, budget)
             if self._to_worker(RecomputeState(frame, base)):
                 self.at_work = index
             break

@@ -155,8 +155,8 @@ def _recompute(spec: SceneSpec, history: History, message: RecomputeState, decod
         if len(frame.images) < spec.minimum_cameras:
             reason = f"only {len(frame.images)} cameras have images, but the minimum is {spec.minimum_cameras}"
             return RepairResult(name, RepairOutcome.LOST, reason)
-        budget = message.frame.budget.model_dump()
-        notes = {"budget": budget}
+        notes = {"budget": message.frame.budget.model_dump()}
+        budget = message.frame.budget.model_dump(exclude={"keep_up_fps"})
         report = recompute_core(
             spec.rig, spec.settings, history, message.base, frame, budget, dropped=dropped, notes=notes
         )

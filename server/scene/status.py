@@ -20,6 +20,7 @@ from scas4d_core.effects.effect import effect
 from scas4d_core.effects.switches import decode_switches, first_switches
 from scas4d_core.frame_outcome import first_warnings, timing_warnings
 from scas4d_core.settings import Settings
+from server.keep_up import with_time_limit
 from server.problems import Problem
 from server.scene.new_reconstruction import restart_remedy
 from server.storage.definition import Definition
@@ -139,7 +140,8 @@ class SceneFacts:
 
 def effective_budget(settings: Settings, asked: Budget) -> EffectiveBudget:
     """Returns a budget with missing fields filled in from the scene's settings."""
-    fields = {name: getattr(settings.update, name) if value is None else value for name, value in asked}
+    limited = with_time_limit(asked, waiting=0)
+    fields = {name: getattr(settings.update, name, None) if value is None else value for name, value in limited}
     return EffectiveBudget(**fields)
 
 

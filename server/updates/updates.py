@@ -16,6 +16,7 @@ from client.wire import FrameReportModel, FrameState, IngestSettings, ProgressMo
 from server import counters
 from server.background import Background
 from server.hub import Publisher
+from server.keep_up import with_time_limit
 from server.messages import (
     ChangeRetention,
     DecodeAhead,
@@ -181,7 +182,9 @@ class Updates:
         entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        return FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
+        waiting = sum(other > index for other in self._waiting())
+        budget = with_time_limit(self._ledger.budget_of(index), waiting)
+        return FrameReady(index, receipt.time, entry.files, receipt.identity, budget)
 
     def _announce_next(self) -> None:
         """Lets the worker decode the next frame while it is updating this one."""

@@ -38,6 +38,7 @@ export class Figures {
 /** Description of a budget change since the previous frame. */
 function change(before, now) {
   if (JSON.stringify(before) === JSON.stringify(now)) return "";
+  if (now.keep_up_fps) return before.keep_up_fps === now.keep_up_fps ? "" : `keeping up with ${now.keep_up_fps} frames/s from here on`;
   if (now.budget_ms !== null) return `${now.budget_ms} ms from here on`;
   return now.iterations !== null ? `${now.iterations} iterations from here on` : "another budget from here on";
 }

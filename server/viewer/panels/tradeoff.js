@@ -14,8 +14,8 @@ const REPLAY_EVERY_MS = 700;
 const REPLAYED = [25, 50, 200];
 const STEPS = 1000;
 // Ends of the logarithmic slider.
-const RANGES = { iterations: [5, 1000], budget_ms: [20, 20000] };
-const UNITS = { iterations: "iterations", budget_ms: "ms" };
+const RANGES = { iterations: [5, 1000], budget_ms: [20, 20000], keep_up_fps: [0.1, 60] };
+const UNITS = { iterations: "iterations", budget_ms: "ms", keep_up_fps: "frames/s" };
 const HOW = { measured: "measured on frames of the scene", replayed: "replayed", extrapolated: "extrapolated, time only" };
 
 /** Formats a time in milliseconds as ms or s. */
@@ -151,9 +151,10 @@ export class Tradeoff {
       kind.value = this.effectiveKind;
     }
     slider.hidden = this.$("budget-ends").hidden = !kind.value;
-    if (kind.value) RANGES[kind.value].forEach((end, i) => { this.$("budget-ends").children[i].textContent = kind.value === "iterations" ? end : spoken(end); });
+    if (kind.value) RANGES[kind.value].forEach((end, i) => { this.$("budget-ends").children[i].textContent = kind.value === "budget_ms" ? spoken(end) : end; });
     if (effective && kind.value) {
-      const known = this.effective[kind.value] ?? this.milliseconds(this.effective.iterations) ?? 1000;
+      const milliseconds = this.effective.budget_ms ?? this.milliseconds(this.effective.iterations) ?? 1000;
+      const known = this.effective[kind.value] ?? (kind.value === "keep_up_fps" ? 1000 / milliseconds : milliseconds);
       const [from, to] = RANGES[kind.value];
       slider.value = Math.round(STEPS * Math.log(known / from) / Math.log(to / from));
     }
@@ -173,13 +174,13 @@ export class Tradeoff {
     this.$("budget-value").textContent = effective && this.kind ? `${this.value} ${UNITS[this.kind]}` : "";
     this.$("budget-effect").textContent = effective ? this.effect() : "";
     if (!effective) return words.textContent = "";
-    const own = effective.budget_ms === null ? `${effective.iterations} iterations per frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
-    const now = `Now: ${own}${this.requested.iterations === null && this.requested.budget_ms === null ? ", as the scene was created" : `, from frame ${this.since} on`}.`;
+    const own = effective.keep_up_fps ? `keeping up with ${short(effective.keep_up_fps)} frames/s` : effective.budget_ms === null ? `${effective.iterations} iterations per frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
+    const now = `Now: ${own}${this.requested.iterations === null && this.requested.budget_ms === null && !this.requested.keep_up_fps ? ", as the scene was created" : `, from frame ${this.since} on`}.`;
     const model = this.model?.model;
     let then = "";
     if (this.moving && model) {
       then = this.kind === "iterations" ? ` Then: about ${spoken(this.milliseconds(this.value))} per frame.`
-        : ` Then: about ${Math.max(1, Math.round((this.value - model.fixed) / model.per_iteration))} iterations per frame.`;
+        : ` Then: about ${Math.max(1, Math.round(((this.kind === "keep_up_fps" ? 1000 / this.value : this.value) - model.fixed) / model.per_iteration))} iterations per frame.`;
     }
     else if (this.kind && this.kind !== this.effectiveKind) then = " Move the slider to change it.";
     words.textContent = now + then;
@@ -187,7 +188,7 @@ export class Tradeoff {
 
   /** Kind of the current budget, time or iterations; empty if it is the one with which the scene was created. */
   get effectiveKind() {
-    return this.effective.budget_ms !== null ? "budget_ms" : this.requested.iterations !== null ? "iterations" : "";
+    return this.effective.keep_up_fps ? "keep_up_fps" : this.effective.budget_ms !== null ? "budget_ms" : this.requested.iterations !== null ? "iterations" : "";
   }
 
   /** Effect of the last change: the frames since then compared with those before. */
@@ -216,7 +217,7 @@ export class Tradeoff {
   async put() {
     const { scene, opened } = this;
     this.putting = true;
-    const body = { ...this.requested, iterations: null, budget_ms: null };
+    const body = { ...this.requested, iterations: null, budget_ms: null, keep_up_fps: null };
     if (this.kind) body[this.kind] = this.value;
     try {
       const budget = await call("PUT", `${scenePath(scene)}/budget`, body);
