@@ -169,6 +169,10 @@ def budget(
             help="Time budget per frame in ms, including decoding and commit; runs as many iterations as fit.",
         ),
     ] = None,
+    keep_up: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=1000, help="Frames per second to keep up with; excludes --milliseconds."),
+    ] = None,
     stop_gain: Annotated[
         float | None,
         typer.Option(
@@ -187,13 +191,18 @@ def budget(
     token: Token = None,
 ) -> None:
     """Prints the compute budget for a scene's updates; with options, changes it from the next frame on."""
-    given = (iterations, milliseconds, stop_gain, skip_tolerance)
+    given = (iterations, milliseconds, keep_up, stop_gain, skip_tolerance)
     if reset and any(value is not None for value in given):
         raise ValueError("--reset cannot be combined with a budget; omit one of them")
     with Client(url, token=token, outage=0) as client:
         if reset or any(value is not None for value in given):
             budget_now = client.set_budget(
-                scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, skip_tolerance=skip_tolerance
+                scene,
+                iterations=iterations,
+                budget_ms=milliseconds,
+                keep_up_fps=keep_up,
+                stop_gain=stop_gain,
+                skip_tolerance=skip_tolerance,
             )
         else:
             budget_now = client.budget(scene)
@@ -203,6 +212,8 @@ def budget(
         if now.budget_ms is None
         else f"as many iterations as fit in {now.budget_ms:g} ms"
     )
+    if now.keep_up_fps is not None:
+        many = f"as many iterations as {now.keep_up_fps:g} frames per second allow"
     stops = f", or fewer: stop gain {now.stop_gain:g}" if now.stop_gain else ""
     console.print(
         f"{many} per frame{stops}; skip tolerance {now.skip_tolerance:g}; from frame {budget_now.since} on",

@@ -9,6 +9,7 @@ import pytest
 from running import Running, fake_settings
 from waiting import HANG_S
 
+from client.ingest import IngestSocket
 from client.rig import Lateness, Pace, Sequence, push
 from client.sdk import Client
 from client.wire import IngestSettings
@@ -204,3 +205,32 @@ def test_a_restart_of_the_service_is_waited_out(capture, tmp_path):
     finally:
         for service in back or [running]:
             service.stop()
+
+
+@pytest.mark.parametrize("websocket", [False, True])
+def test_a_rig_sends_several_frames_at_once(service, capture_folder, monkeypatch, websocket):
+    sent = []
+    sender = IngestSocket if websocket else Client
+    put_frames = sender.put_frames
+
+    def recorded(self, *arguments):
+        sent.append([frame.index for frame in arguments[-1]])
+        return put_frames(self, *arguments)
+
+    monkeypatch.setattr(sender, "put_frames", recorded)
+    pace = Pace(drop=0.4, seed=next(seed for seed in range(99) if _drops(seed) == {5}))
+    with Client(service.url) as client:
+        delivery = push(
+            open_capture(capture_folder), client, batch=2, frames=8, loop=True, pace=pace, websocket=websocket
+        )
+        assert sent == [[1, 2], [3, 4], [6, 7]]  # frame 0 goes alone, and the lost frame 5 is declared missing
+        assert delivery.lost == [5]
+        assert (delivery.status.committed, delivery.status.missing) == (7, 1)
+        assert len(delivery.lateness.late) == 8
+        client.delete_scene(delivery.scene)
+        with pytest.raises(ValueError, match="batch must be"):
+            push(open_capture(capture_folder), client, batch=2, per_camera=True)
+
+
+def _drops(seed):
+    return {index for index in range(8) if Pace(drop=0.4, seed=seed).drops(index)}

@@ -216,6 +216,8 @@ def test_a_budget_is_told_set_and_taken_back(service):
                 "--milliseconds", "500", "--stop-gain", "0.02"
             )
             assert client.budget(scene).requested.budget_ms == 500
+            assert "as 25 frames per second allow per frame" in said("--keep-up", "25")
+            assert client.budget(scene).effective.budget_ms == 36
             assert said("--iterations", "50").startswith("50 iterations per frame")
             assert said("--reset") == made
             refused = scas4d("budget", scene, "--reset", "--iterations", "5", "--url", service.url)
