@@ -25,7 +25,7 @@ TEXT_LENGTH = 200
 
 
 class ServiceError(RuntimeError):
-    """Error response of the service; `problem` contains the field, its value and a remedy."""
+    """Error response from the service; `problem` contains the field, its value and a remedy."""
 
     def __init__(self, problem: ProblemDetails) -> None:
         remedy = f" ({problem.remedy})" if problem.remedy else ""
@@ -107,7 +107,7 @@ def error_of(response: httpx.Response) -> ServiceError:
 def error_of_problem(problem: ProblemDetails) -> ServiceError:
     """Returns the exception for a problem document."""
     more = problem.model_extra or {}
-    # The 409 for a frame that was resent with different content has `expected` too, but also `identity`; it is no gap.
+    # The 409 for a frame resent with different content contains both `expected` and `identity`, and is not a gap.
     if problem.status == 409 and isinstance(more.get("expected"), int) and "identity" not in more:
         return FrameGap(problem)
     fallback = ServiceFault if problem.status >= 500 else ServiceError

@@ -97,7 +97,7 @@ class IngestSocket:
         return receipt
 
     def _send(self, chunks: list[bytes], count: int, *, refusals: bool = False) -> list[IngestAnswer]:
-        """Sends a message, again if its first frame must be retried, and returns its `count` answers.
+        """Sends a message, repeating it while its first frame must be retried, and returns its `count` answers.
 
         Raises:
             ServiceError: the first frame was refused. With `refusals`, this applies only to refusals that are retried.

@@ -119,8 +119,8 @@ class PartPoses:
         frames: frame indices [T].
         seconds: frame times [T] in seconds.
         motions: rigid transforms [P, T, 4, 4], float64, in the user's units. A point of part p at (x, y, z) in the
-            first frame is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN if no Gaussian of the part is
-            present.
+            first frame is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN in frames in which no Gaussian of the
+            part is present.
         residuals: RMS distances [P, T] between the Gaussians and the rigid motion, in the user's units.
     """
 
@@ -230,7 +230,7 @@ class Scene:
             yield State(index, seconds, gaussians, world)
 
     def tracks(self, ids: ArrayLike | None = None, frames: str | None = None) -> GaussianTracks:
-        """Returns the trajectories of Gaussians; they take 24 bytes per Gaussian and frame.
+        """Returns the trajectories of Gaussians, which occupy 24 bytes per Gaussian and frame.
 
         Args:
             ids: Gaussian ids [K]; None for all Gaussians that are moving in the last of these frames.

@@ -44,7 +44,7 @@ LONGEST_WAIT_S = 5.0
 UNREAD_MESSAGES = 2
 """Maximum number of messages to read ahead of the caller.
 
-It is small because the service replaces messages that it cannot send yet with newer ones.
+The limit is small because the service replaces messages that it cannot send yet with newer ones.
 """
 RETRIED_STATUSES = (429, 502, 503, 504)
 
@@ -151,7 +151,7 @@ def view(
     background: tuple[float, float, float] | None = None,
     parts: int | None = None,
 ) -> SubscriptionRequest:
-    """Returns a subscription to a view of every new frame or a fixed one; see `client.calls.render` for arguments.
+    """Returns a subscription to a view of every new frame or a fixed one; the arguments are as for `calls.render`.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("live", view(rig.cameras[0], format="png"))

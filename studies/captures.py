@@ -1,4 +1,4 @@
-"""Opens captures of any layout for studies and selects the cameras to measure on."""
+"""Opens captures of any layout for studies and selects the cameras on which results are measured."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class NewFrame:
     """A frame to send in a batch.
 
     Attributes:
-        index: frame index; with `numbering="next"`, only a name for the frame in answers.
+        index: frame index; with `numbering="next"`, only a label for the frame in answers.
         images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
         masks: PNG mask of each camera, keyed by camera name; empty for no masks.
         time: timestamp in seconds; index / frames_per_second if None.
@@ -62,7 +62,7 @@ class SendingBatch:
         self.answers: list[IngestAnswer] = []
 
     def record(self, batch: FrameBatch) -> float:
-        """Records the answers to `left` and returns the seconds to wait before the rest is sent again."""
+        """Records the answers to `left` and returns the seconds to wait before the remaining frames are sent again."""
         for answer in batch.answers:
             if answer.status in RETRIED:
                 return float(answer.retry_after or 1)
@@ -107,14 +107,14 @@ def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "give
     A frame that is refused because of its content does not stop the batch; its answer contains the problem. With
     `numbering="given"`, such a frame is declared missing if the batch continues with the next index.
 
-    The clients send frames again for which the queue had no room. A batch should therefore be smaller than the scene's
-    `ingest.queue_frames`; otherwise, its last frames are transferred several times.
+    Frames for which the queue had no room are sent again automatically. A batch should therefore be smaller than the
+    scene's `ingest.queue_frames`; otherwise, its last frames are transferred several times.
 
     Args:
         id: scene id.
         frames: the frames, in order.
-        numbering: "given" if the frames have their own indices; "next" to give them the next free indices, which
-            requires a time for each frame.
+        numbering: "given" if the frames have their own indices; "next" to assign the next free indices, which requires
+            a time for each frame.
 
     Raises:
         Busy: the queue has no room for the first frame.

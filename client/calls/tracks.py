@@ -58,7 +58,7 @@ def tracks_arrays(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[dict[str, NDArray[Any]]]:
-    """Returns trajectories as arrays, which is more efficient for large queries; takes the same arguments as `tracks`.
+    """Returns trajectories as arrays, which is more efficient for large queries; the arguments are those of `tracks`.
 
     >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
     (3, 2, 3)

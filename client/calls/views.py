@@ -57,7 +57,7 @@ def render_file(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[bytes]:
-    """Renders a view and returns the encoded file; takes the arguments of `render`, with any format of the service.
+    """Renders a view and returns the encoded file; accepts the arguments of `render`, and every format of the service.
 
     >>> client.render_file(scene, "c0", format="jpeg")[:2].hex()
     'ffd8'

@@ -20,14 +20,14 @@ def export(
     url: str,
     token: str | None,
 ) -> None:
-    """Exports frames to a file or folder, with only one state in memory at a time.
+    """Exports frames to a file or folder, keeping only one state in memory at a time.
 
     Args:
         source: source of the states; see `opened`.
         format: format name from docs/exports.md.
-        out: output folder or `.zip` for a format with one file per frame, otherwise the output file. If None, the name
-            is derived from the source and the format. The output is then written next to the source, or to the current
-            folder for a scene.
+        out: output folder or `.zip` for a format with one file per frame, otherwise the output file. If None, the
+            output is named after the source and format. It is written next to the source or, for a scene, to the
+            current folder.
         frames: inclusive range `A:B`, where A or B may be omitted; None for all frames.
         ids: ids of the Gaussians to export in the `tracks` format.
         rate: frame rate of a source that consists of numbered files; None for the default of 30 frames per second.

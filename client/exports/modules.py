@@ -1,7 +1,7 @@
 """Bundles JavaScript modules into one classic script, for pages opened from ``file://``.
 
 Browsers do not load modules from ``file://``. Each module therefore becomes a function that returns its exports. Only
-the forms of import and export matched below are supported.
+the import and export forms matched by the patterns below are supported.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def script(entry: Path, root: Path) -> str:
         Self-contained script that does not contain ``</script``.
 
     Raises:
-        ValueError: if a module uses an unsupported form of import or export, or there is an import cycle.
+        ValueError: if a module uses an unsupported form of import or export, or if imports are circular.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

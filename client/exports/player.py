@@ -26,7 +26,7 @@ VIEWER = Path(__file__).parents[2] / "server" / "viewer"
 PIECE = 3 << 18
 """Chunk size in bytes. It is a multiple of 3, so each base64 chunk can be decoded separately."""
 LARGE, LARGEST = 100 << 20, 1 << 30
-"""Total sizes of the compact files in bytes. Pages above the first open slowly, and pages above the second fail."""
+"""Size limits of the embedded data in bytes. Above the first, pages open slowly. Above the second, they do not open."""
 
 
 def export_player(source: str, out: Path, frames: str | None = None, *, url: str, token: str | None) -> None:
@@ -67,7 +67,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
 
 
 def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
-    """Writes an HTML page with embedded compact files, with only one chunk in memory at a time.
+    """Writes an HTML page with embedded compact files, keeping only one chunk in memory at a time.
 
     Args:
         out: HTML file to write.
@@ -106,7 +106,7 @@ def _pieces(file: Path) -> Iterator[str]:
 
 @contextmanager
 def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[Path]]:
-    """Yields the source's compact files, or a new one if there are none, or if they also contain other frames."""
+    """Yields the source's compact files, or a new one if it has none or they contain unrequested frames."""
     if isinstance(given.of, CompactStates) and count == _held(given.of.files):
         yield given.of.files
         return
@@ -128,7 +128,7 @@ def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[
 
 
 def _facing(points: NDArray[np.float64]) -> Camera:
-    """Returns a camera that views points [N, 3] in the user's world along +z, for sources without cameras.
+    """Returns a camera that looks along +z at points [N, 3] in the user's world, for sources without cameras.
 
     >>> camera = _facing(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5]]))
     >>> pixels, depth = camera.project(np.array([[0.5, 0.5, 5]]))

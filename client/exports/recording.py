@@ -24,7 +24,7 @@ SUFFIX = ".rrd"
 FAINT = 0.1
 """Opacity below which Gaussians are omitted. Points are drawn opaque, so haze would hide the surfaces behind it."""
 THIN = -0.7
-"""Radius of the track lines; the viewer interprets negative values as screen-space points."""
+"""Radius of the track lines. The viewer interprets negative radii as sizes in screen-space points."""
 PLANE = 0.15
 """Distance of a camera's image plane in the viewer, as a fraction of the rig's radius."""
 
@@ -40,7 +40,7 @@ def make_recording(
     url: str,
     token: str | None,
 ) -> Path:
-    """Writes a Rerun recording with only one state in memory at a time, and returns its path.
+    """Writes a Rerun recording, keeping only one state in memory at a time, and returns its path.
 
     Args:
         source: source of the states; see `opened`.
@@ -99,7 +99,7 @@ def _stream(target: Path) -> Iterator[Any]:
     look = blueprint.Blueprint(blueprint.Spatial3DView(origin="/world", name="scene"))
     with atomic_path(target) as beside:
         stream = rerun.RecordingStream("scas4d")
-        stream.set_log_time_enabled(False)  # the time of writing is irrelevant
+        stream.set_log_time_enabled(False)  # the time of recording is irrelevant
         stream.save(beside, default_blueprint=look)
         try:
             yield stream
@@ -136,7 +136,7 @@ def _log_what_stays(stream: Any, given: Source, labels: NDArray[np.int64] | None
 
 
 def _axes(rig: Rig | None) -> Any:
-    """Returns Rerun's view coordinates for the axis closest to the rig's up direction, or for y down without a rig."""
+    """Returns Rerun's view coordinates for the axis closest to the rig's up direction, or y down if there is no rig."""
     import rerun
 
     up = np.array([0.0, -1.0, 0.0]) if rig is None else RigView.of(rig).up
@@ -177,7 +177,7 @@ def _longer(
     """Appends the positions of a state to the trails and returns the positions within the last `trail` seconds.
 
     Returns:
-        Positions [S, K, 3] of K Gaussians in S states, with NaN where a Gaussian is not present.
+        Positions [S, K, 3] of K Gaussians in S states, with NaN where a Gaussian is absent.
     """
     places = given.head.world.to_user(state.means[rows])
     places[~state.present[rows]] = np.nan

@@ -104,7 +104,7 @@ class Source:
         return times
 
     def some(self, indices: Sequence[int]) -> list[Gaussians]:
-        """Returns the states of the first, middle and last given frame, without duplicates."""
+        """Returns the states of the first, middle and last of the given frames, without duplicates."""
         chosen = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
         return [state for index in chosen for _, _, state in self.states(index, index)]
 
@@ -121,7 +121,7 @@ class Source:
 def opened(
     source: str, low: int, high: int, parts: bool, url: str, token: str | None, rate: float | None = None
 ) -> Iterator[Source]:
-    """Opens and yields a source of states. The states of a scene are downloaded from the service.
+    """Opens a source of states, as a context manager. The states of a scene are downloaded from the service.
 
     Args:
         source: compact file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
@@ -149,7 +149,7 @@ def opened(
 
 
 def is_scene_id(source: str) -> bool:
-    """Returns whether a source is a scene id: a name without a suffix or folder that is not an existing path.
+    """Returns whether a source is a scene id: a bare name without a suffix that is not an existing path.
 
     >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
     (True, False, False, False)
@@ -160,7 +160,7 @@ def is_scene_id(source: str) -> bool:
 
 @dataclass(frozen=True)
 class CompactStates:
-    """States of one or several consecutive compact files, which are opened one at a time.
+    """States of one or more consecutive compact files, which are opened one at a time.
 
     Attributes:
         files: compact files in frame order.
@@ -179,7 +179,7 @@ class CompactStates:
 
     @classmethod
     def of(cls, files: Sequence[Path], first: int = 0) -> CompactStates:
-        """Returns the states of the files from frame ``first`` on. Earlier frames are only used for decoding."""
+        """Returns the states in the files from frame ``first`` onwards. Earlier frames are only used for decoding."""
         heads: list[FileHeader] = []
         times: dict[int, float] = {}
         damages: list[str] = []

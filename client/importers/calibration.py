@@ -14,7 +14,7 @@ from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
 STATIC_TOLERANCE = 1e-6
-"""Maximum relative difference between the images of a static camera in its pose, intrinsics or distortion."""
+"""Maximum relative difference in pose, intrinsics or distortion between images of a static camera."""
 
 
 NAMES = (
@@ -107,7 +107,7 @@ def calibration_of_cameras(
 ) -> Calibration:
     """Builds a calibration from cameras without image names.
 
-    Their images are expected in `images/<camera>/` or `videos/<camera>.mp4`.
+    The images are expected in `images/<camera>/` or `videos/<camera>.mp4`.
 
     Args:
         source: file or folder from which the calibration was read.

@@ -18,13 +18,13 @@ STEEP = 0.1
 """Smallest trusted slope of the radial profile, relative to the slope on the axis.
 
 No calibration points constrain a non-monotonic polynomial near its maximum. Where the slope is smaller than this value,
-a tenth of a pixel in the lens's image would be stretched over more than a pixel.
+undistortion would stretch a tenth of a pixel of the lens's image over more than a pixel.
 """
 NEWTON = 8
 ROUNDS = 60
 """Number of fixed-point iterations for the tangential part. They converge quickly because this part is small."""
 CLOSE = 1e-7
-"""Maximum residual, on the plane at distance 1, for a ray to count as a solution."""
+"""Maximum residual on the plane at distance 1 for a ray to be accepted as a solution."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Optional packages that only the importers need, imported on first use."""
+"""Optional packages of the extra `importers`, which are imported on first use."""
 
 from __future__ import annotations
 

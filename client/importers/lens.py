@@ -1,6 +1,6 @@
 """Camera models of calibration tools, and cameras with lens distortion. Requires only numpy.
 
-Pixel coordinates put the centre of the first pixel at (0.5, 0.5), as in COLMAP and nerfstudio.
+In pixel coordinates, the centre of the first pixel is at (0.5, 0.5), as in COLMAP and nerfstudio.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class LensCamera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether the camera is a pinhole camera. A fisheye with zero coefficients is not one."""
+        """Whether the camera is a pinhole camera. A fisheye with zero coefficients is not a pinhole camera."""
         return not self.fisheye and not self.distortion.any()
 
     def pinhole(self, intrinsics: Float | None = None) -> Camera:

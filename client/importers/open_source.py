@@ -1,4 +1,4 @@
-"""Opens captures in any supported layout, which is recognized by the files in the folder."""
+"""Opens captures in any supported layout, which is detected from the files in the folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PicturesFrom = Literal["images", "videos", "named"]
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Options for reading a capture, shared by all commands and studies. Each is an argument of `open_source`."""
+    """Options for reading a capture, shared by all commands and studies. All are arguments of `open_source`."""
 
     calibration: Path | None = None
     pictures: PicturesFrom | None = None
@@ -79,10 +79,10 @@ def open_source(
         calibration: transforms.json, COLMAP model folder, or calibration file of another tool
             (`client/importers/formats/`); None to search the folder.
         pictures: source of the images: `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
-            names. None to use the named files if there are several per camera, otherwise the source that exists.
+            names. If None, uses the named files if there are several per camera, otherwise whichever source exists.
         fps: frame rate that overrides the files; None for the files' frame rate, or 30 if they specify none.
         encoding: format in which undistorted images and video frames are encoded for sending or writing.
-        use_masks: whether to use the masks in `masks/` (`seg/`).
+        use_masks: whether to use the masks in `masks/` or, in the Dynamic3DGaussians layout, in `seg/`.
         use_points: whether to use the point cloud.
         image_scale: factor by which images, masks and cameras are resized when they are read.
         test: names of cameras to hold out for evaluation, in addition to those that the layout holds out.

@@ -83,7 +83,7 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "images") ->
     """Returns the files in ``root/<camera>/`` for each frame [T], keyed by camera name.
 
     Raises:
-        CaptureError: if a camera has no folder, or a folder lacks a frame that another folder has.
+        CaptureError: if a camera has no folder, or a frame is missing from some of the folders.
     """
     by_camera: dict[str, dict[str, Path]] = {}
     for camera in calibration.names:
@@ -126,8 +126,8 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
 def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
     """Returns the files listed in the calibration for each frame [T], keyed by camera name, and the frame times.
 
-    Frame t consists of the t-th image of each camera. Times are in seconds, and empty if any of them is unknown or if
-    there is only one frame.
+    Frame t consists of the t-th image of each camera. Times are in seconds. They are empty if any time is unknown, or
+    if there is only one frame.
 
     Raises:
         CaptureError: if a file is missing, cameras have different numbers of images, or the times within a frame

@@ -53,7 +53,7 @@ class RawReader(Protocol):
         """Returns the first file of a camera, for messages."""
 
     def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image file of a camera and frame, or None if there is none that the service accepts."""
+        """Returns the image file of a camera and frame, or None if no file is in a format that the service accepts."""
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Returns the decoded image [H, W, 3] of a camera and frame."""
@@ -113,7 +113,7 @@ class ImportedPictures:
         return bool(self._masks) and camera in self._masks[index]
 
     def mask(self, index: int, camera: str) -> Picture:
-        """Returns the undistorted mask, [H, W]."""
+        """Returns the undistorted mask [H, W]."""
         undistorter = self._undistorters[camera]
         size = (undistorter.lens.width, undistorter.lens.height)
         return undistorter.mask(decode_mask(self._masks[index][camera], size=size))
@@ -144,7 +144,7 @@ def fit_to_pictures(
         The adapted calibration, and a remark for each camera whose image size differs from the calibrated size.
 
     Raises:
-        CaptureError: if the aspect ratio of images differs from the calibrated one, and `size_mismatch` is not given.
+        CaptureError: if the aspect ratio of an image differs from the calibration, and `size_mismatch` is None.
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:

@@ -1,7 +1,7 @@
 """Undistorts images of perspective and fisheye lenses to pinhole images with the same pose and size, using OpenCV.
 
 The pinhole camera keeps the pixel aspect ratio of the lens and covers only rays that the lens saw, so there are no
-black corners. Its principal point follows from this region. If the distortion polynomial decreases before a corner, the
+black corners. These rays determine the principal point. If the distortion polynomial decreases before a corner, the
 field of view is narrowed to the rays for which the polynomial increases.
 
 OpenCV puts the centre of the first pixel at (0, 0), whereas this project and COLMAP put it at (0.5, 0.5). Principal
@@ -26,22 +26,22 @@ Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDEST_DEGREES = 120.0
-"""Maximum field of view of a pinhole camera in degrees. A wider one would stretch a fisheye image too much."""
+"""Maximum field of view of a pinhole camera in degrees. A wider view would stretch a fisheye image too much."""
 BORDER_POINTS = 64
 TOLERANCE_PIXELS = 0.01
-"""Maximum distance of the pinhole's border outside the image, in pixels. Interpolation hides such distances."""
+"""Maximum distance, in pixels, by which the pinhole's border may lie outside the image. Interpolation hides the gap."""
 NARROWING = 1.005
 """Factor by which the focal length grows per step while a lens with non-monotonic distortion is cropped."""
 MOST_NARROWED = 50.0
 """Maximum focal length in the search for a pinhole camera, as a multiple of the lens's focal length."""
 LEAST_KEPT = 0.25
-"""Minimum fraction of the image that must remain after cropping. A smaller one indicates a wrong calibration."""
+"""Minimum fraction of the image that must remain after cropping. A smaller fraction indicates a wrong calibration."""
 HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Undistorter:
-    """Undistorter for the images of one camera. Images without distortion are returned unchanged, without OpenCV.
+    """Undistorter for the images of one camera. Images without distortion are returned unchanged, without using OpenCV.
 
     Args:
         lens: calibrated camera with lens distortion.
@@ -88,15 +88,15 @@ class Undistorter:
         """Mask [H, W] of the undistorted pixels that the camera saw."""
         if self.lens.is_pinhole:
             return np.ones((self.lens.height, self.lens.width), dtype=bool)
-        u, v = self._maps  # OpenCV's pixels: image edges at −0.5 and size − 0.5
+        u, v = self._maps  # in OpenCV's coordinates, image edges are at −0.5 and size − 0.5
         inside = (u >= -HALF) & (u <= self.lens.width - HALF) & (v >= -HALF) & (v <= self.lens.height - HALF)
         return np.asarray(inside)
 
     def picture(self, picture: Picture) -> Picture:
         """Undistorts an image [H, W, 3] of the lens, and returns an image [H, W, 3] of the pinhole camera.
 
-        Uses Lanczos interpolation, which keeps painted dots within 0.03 pixels of their true position. Cubic
-        interpolation shifts them by up to 0.08 pixels, and linear interpolation blurs the image.
+        Lanczos interpolation is used, which keeps dots within 0.03 pixels of their true positions. Cubic interpolation
+        shifts them by up to 0.08 pixels, and linear interpolation blurs the image.
         """
         return self._remapped(picture, "INTER_LANCZOS4")
 
@@ -151,7 +151,7 @@ def _inscribed(lens: LensCamera) -> _View:
 
 
 def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
-    """Narrows a pinhole camera about the lens's axis until the distortion polynomial increases on its entire image.
+    """Narrows a pinhole camera about the lens's axis until the distortion polynomial increases across its entire image.
 
     Raises:
         CaptureError: if too little of the image remains.

@@ -22,7 +22,7 @@ from scas4d_core.captures.images import mixed_colours
 
 ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
 RATE_TOLERANCE = 1e-3
-"""Maximum relative difference between the frame rates of two cameras, about the difference between 29.97 and 30."""
+"""Maximum relative difference between the frame rates of two cameras, roughly that between 29.97 and 30."""
 NEAR = 8
 """Maximum number of frames to skip by decoding them. For larger steps, seeking to a keyframe is usually faster."""
 ALIKE = 0.05
@@ -36,7 +36,7 @@ class Video:
         times: [T] time of each frame in seconds, relative to the first.
         fps: mean frame rate.
         size: (width, height) in pixels.
-        grey: whether the pixel format is grayscale.
+        grey: whether the pixel format is greyscale.
 
     Raises:
         CaptureError: if the file has no video stream, is damaged, or has no frame with a timestamp.
@@ -81,9 +81,9 @@ class Video:
     def frame(self, index: int) -> Picture:
         """Returns frame `index` as a read-only array [H, W, 3] of sRGB values.
 
-        The most recent frame and the most recent frame reached by stepping back are cached. Scoring compares every
-        frame with frame 0. Without this cache, each comparison would decode everything since the preceding keyframe
-        again.
+        Two frames are cached: the most recent one, and the most recent one reached by stepping back. Scoring compares
+        every frame with frame 0. Without the cache, each comparison would decode all frames since the preceding
+        keyframe again.
 
         Raises:
             CaptureError: if the frame cannot be decoded, or the video's metadata rotates it.

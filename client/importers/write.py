@@ -111,7 +111,7 @@ def _write_meta(
 
 
 def _one_or_all(sizes: list[int]) -> int | list[int]:
-    """Returns the size shared by all cameras, or else a list of one size per camera. Such a list extends the layout."""
+    """Returns the image size shared by all cameras, or a list of one size per camera, which extends the layout."""
     return sizes[0] if len(set(sizes)) == 1 else sizes
 
 

@@ -17,8 +17,8 @@ from scas4d_core.engines.renderer import Renderer
 Device = Literal["cpu", "gpu"]
 
 WARP_DEVICE = "SCAS4D_WARP_DEVICE"
-"""Environment variable with the name of the Warp device that device "gpu" uses. Tests set it to "cpu", which runs the
-same kernels, slowly, without a GPU."""
+"""Environment variable that names the Warp device for device "gpu". Tests set it to "cpu", which runs the same kernels
+more slowly but without a GPU."""
 
 
 class DeviceError(ValueError):
@@ -55,7 +55,7 @@ def _hardware_fault(device: str) -> str | None:
         if warp.get_cuda_device_count() == 0:
             return "no NVIDIA GPU can be used, or the driver is older than the CUDA version of NVIDIA Warp requires"
         warp.get_device(device)
-    except Exception as error:  # a broken installation must not end the service
+    except Exception as error:  # a broken installation must not stop the service
         return f"NVIDIA Warp cannot use {device!r}: {error}"
     return None
 

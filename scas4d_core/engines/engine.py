@@ -38,7 +38,7 @@ Array = NDArray[np.float32]
 GAINS_MISSING = "begin was called without gains; enable UpdatePlan.camera_gains to estimate them"
 """Error message of ``UpdateEngine.gains`` if gains are not estimated."""
 REPORT = "report"
-"""Name of the stage in which an update compiles its report. The stage includes timings, colour shifts, I/O and
+"""Name of the stage in which an update compiles its report. This stage covers timings, colour shifts, I/O and
 publishing."""
 KEPT_PICTURES = 8
 """Maximum number of views with a rendering in the log. Effects evaluate these renderings."""
@@ -203,7 +203,7 @@ class IterationLog:
 
     Attributes:
         losses: total weighted loss of each iteration.
-        rendered: records of all renderings, in order.
+        rendered: records of all renderings, in chronological order.
         pictures: maps view indices to their most recent subsampled renderings, oldest first.
         guards: maps the name of each guard (see ``guards.GUARDS``) to the number of times it was triggered.
     """
@@ -270,7 +270,7 @@ class UpdateEngine(Protocol):
         """Freezes the camera gains of the views with the given indices, which the attempt no longer renders."""
 
     def wait(self, iteration: int) -> None:
-        """Waits until the device has almost caught up with an iteration. Host timings then reflect device work."""
+        """Waits until only a few iterations are pending, so that host timings reflect the work on the device."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """Returns the image loss of a state on each of the selected probe views.

@@ -36,8 +36,8 @@ class RenderingStatistics:
     """Per-Gaussian statistics for density control, accumulated since rows were last added or removed.
 
     Attributes:
-        screen_gradients: [N] sum of the norms of the gradients with respect to the projected mean, with the mean
-            measured in units of half the image size.
+        screen_gradients: [N] summed gradient norms with respect to the projected mean, where the mean is in units of
+            half the image size.
         rendered: [N] number of renderings in which the Gaussian was visible.
         factors: [N, 3, 3] covariance factors rendered in the last iteration, before its Adam step.
     """
@@ -109,7 +109,7 @@ class FitLoss(NamedTuple):
 
     Attributes:
         view: index of the rendered view.
-        loss: weighted sum of image and mask loss.
+        loss: weighted sum of the image and mask losses.
         psnr: PSNR of the rendering, in dB.
         exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset. The array may be a
             buffer that the next iteration overwrites.

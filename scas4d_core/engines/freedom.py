@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Freedom:
-    """Selection of the columns of the cluster tables and deltas that are optimized. All others stay exactly 0.
+    """Selection of the columns of the cluster tables and deltas that are optimized. All other columns stay exactly 0.
 
     Attributes:
         cluster_rotation: whether r is free for the clusters in all layers.

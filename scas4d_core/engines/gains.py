@@ -48,7 +48,7 @@ class GainEstimator:
         self._measured[row] = measured_gain(view.target, shown)
 
     def finish_round(self) -> None:
-        """Ends the current round, and updates the gains and exposures if it has enough measurements."""
+        """Ends the current round, and updates the gains and exposures if the round has enough measurements."""
         settled = update_gains(self.gains, self._measured, len(self._views))
         if settled is not None:
             self.gains = settled

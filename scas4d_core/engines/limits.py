@@ -22,7 +22,8 @@ class Limits(NamedTuple):
             least about one pixel.
         near: depth of the near plane, in metres. Closer Gaussians are culled.
         tangent_margin: margin around the image within which the projection's Jacobian is exact, as a fraction of half
-            the image width (for x/z) or height (for y/z). Beyond it, the Jacobian is evaluated at a clamped position.
+            the image width (for x/z) or height (for y/z). Beyond the margin, the Jacobian is evaluated at a clamped
+            position.
     """
 
     alpha_floor: float = guards.ALPHA_FLOOR
@@ -34,7 +35,7 @@ class Limits(NamedTuple):
 
 
 NEAR_SHARE = 0.1
-"""Depth of the near plane as a fraction of the rig's radius, used if the scene does not define one."""
+"""Depth of the near plane as a fraction of the rig's radius, used if the scene does not specify the depth."""
 
 
 def scene_limits(near: float | str, rig_radius: float) -> Limits:

@@ -1,4 +1,4 @@
-"""Plan of a scene's updates, which effects modify when they register, and structure of the moving Gaussians."""
+"""Plan of a scene's updates, which effects modify when they register, and the structure of the moving Gaussians."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ class UpdatePlan:
         floor_weight: weight of the floor loss, the mean depth below the floor.
         freedom: free parameters of the deformation.
         colours: colours to learn, or None if no colours are learned.
-        gloss: whether gloss and environment are learned (``effects.appearance.direction``).
+        gloss: whether the gloss and environment are learned (``effects.appearance.direction``).
         camera_gains: whether camera gains are estimated (``effects.appearance.camera_gain``).
         full_images: whether any pixel may change. If false, only pixels covered by moving Gaussians can change.
         disables_skip: whether frames that Θ_{t−1} already reproduces well must still be updated, because an effect
             learns from them.
-        learns_labels: whether moving Gaussians are detected from motion if no masks are given.
+        learns_labels: whether moving Gaussians are detected by their motion if no masks are given.
     """
 
     cameras: tuple[str, ...]

@@ -21,8 +21,8 @@ CHANNELS = 4
 BLOCK = 4
 """Side length in pixels of the blocks in ``Renderer.reached``."""
 PRIOR_PIXELS = 1.0
-"""Number of pixels added to each Gaussian's blending weight in ``Renderer.step_colours``, so that barely visible
-Gaussians keep their colours."""
+"""Constant, in pixels, that ``Renderer.step_colours`` adds to each Gaussian's total blending weight. It keeps the
+colours of barely visible Gaussians almost unchanged."""
 
 
 class Picture(NamedTuple):
@@ -96,7 +96,7 @@ class Renderer(Protocol):
         depth_channel: int = -1,
         background: Array | None = None,
     ) -> Picture:
-        """Renders RGB and label of a state from a camera, without applying the camera's exposure.
+        """Renders the colours and labels of a state from a camera, without applying the camera's exposure.
 
         Args:
             state: Gaussians to render.
@@ -111,7 +111,7 @@ class Renderer(Protocol):
         """Renders a state and compares it with the training image of a view; see ``render``."""
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """Returns [N, P] sums of ``planes`` [P, H, W] over all pixels, weighted by each Gaussian's blending weights.
+        """Returns the sums [N, P] of ``planes`` [P, H, W] over pixels, weighted by each Gaussian's blending weights.
 
         P is at most 4. For a plane of ones, the sum is the Gaussian's total blending weight, in pixels.
         """
@@ -181,7 +181,7 @@ def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians
     Args:
         before: state Θ_{t−1}.
         after: state Θ_t of the same Gaussians.
-        share: share of the motion to add; negative values move the state back.
+        share: fraction of the motion to add. A negative fraction moves the state back.
     """
     rows = np.flatnonzero(after.moving)
     arrays = {name: getattr(after, name).copy() for name in ("means", "factors")}

@@ -67,7 +67,7 @@ class TrainingView:
 
     @property
     def pixels(self) -> NDArray[np.uint8]:
-        """Image [H, W, 3] in levels of 255, which is exact if the view was created from an 8-bit image."""
+        """Image [H, W, 3] with values in 0…255, which are exact if the view was created from an 8-bit image."""
         if self.source is not None:
             return self.source[0]
         return np.ascontiguousarray(np.moveaxis(np.rint(255 * self.target[:3]).astype(np.uint8), 0, -1))
@@ -88,7 +88,7 @@ class TrainingView:
 
 
 def means(planes: Array) -> NDArray[np.float64]:
-    """Returns the mean [C] of each plane [C, H, W]. Sums rows in float32, which is twice as fast."""
+    """Returns the mean [C] of each plane [C, H, W]. Rows are summed in float32, which is twice as fast."""
     _, height, width = planes.shape
     result: NDArray[np.float64] = planes.sum(axis=2).sum(axis=1, dtype=np.float64) / (height * width)
     return result

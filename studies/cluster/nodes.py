@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 HEALTH = {"period_ms": 1000, "timeout_ms": 2000, "failure_threshold": 3, "initial_delay_ms": 1000}
-"""Ray's health checks. A silent node is declared lost after 3 to 9 s instead of the default of about a minute."""
+"""Settings of Ray's health checks, which declare a silent node lost after 3 to 9 s instead of about a minute."""
 REDIS, REDIS_S = "RAY_REDIS_ADDRESS", 10.0
 STORE_BYTES = 80 * 2**20
 """Size of each node's object store, which scenes do not use."""

@@ -46,8 +46,8 @@ class CompactFigures:
         exact: size of the exact states on disk, in bytes per frame.
         size: size of the compact file including its header, births and index, in bytes per frame.
         sizes: mean size of a record in bytes, keyed by record kind.
-        psnr: mean PSNR on the test cameras minus that of the exact states, over ``VIEWS`` frames, in dB. None without
-            test cameras.
+        psnr: mean PSNR on the test cameras minus that of the exact states, over ``VIEWS`` frames, in dB. None if there
+            are no test cameras.
         worst: lowest PSNR difference of a single frame, in dB.
         tracks: median distance, over points and frames, between decoded and exact tracks, in % of the moving extent.
         write: median CPU time to write a frame, in ms.
@@ -96,7 +96,7 @@ def measure(
         folder: capture folder.
         states: folder that contains the capture's committed states.
         frames: number of frames in the file.
-        bounds: changed error bounds, keyed by name.
+        bounds: error bounds that replace the defaults, keyed by name.
         key_every: frames between keyframes; the default if None.
 
     Raises:
@@ -109,7 +109,7 @@ def measure(
     if frames < len(history):
         raise InputError(f"frames is {frames}", f"use at least {len(history)}: every state is compared")
     grows = history.count > len(history.gaussians(history.indices[0]))
-    order = history.indices if grows else back_and_forth(history.indices, frames)  # births cannot be played back
+    order = history.indices if grows else back_and_forth(history.indices, frames)  # births cannot be reversed
     exact = float(np.mean([path.stat().st_size for path in states.glob("frame_*.npz")]))
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / "states.s4d"
@@ -241,6 +241,6 @@ def _scene(world: WorldFrame, states: Mapping[int, Gaussians], limits: Limits = 
     history = History()
     for index, state in states.items():
         known = history.ids if len(history) else state.ids
-        born = np.full(len(state) - len(known), UNBORN, np.int64)  # this history gives them new ids
+        born = np.full(len(state) - len(known), UNBORN, np.int64)  # the history assigns their ids
         history.append(index, float(index), state.replace(ids=np.concatenate([known, born])))
     return CommittedScene(history, world, limits)

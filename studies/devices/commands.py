@@ -23,7 +23,7 @@ def devices(
 ) -> None:
     """Compares images, tracks and times of updates on the CPU and on a GPU, from the same frame 0.
 
-    Without a GPU, the kernels of the GPU run on the CPU. The results are then comparable, but the times are not.
+    Without a GPU, the GPU kernels run on the CPU. The results are then comparable, but the times are not.
 
     Example: scripts/bench devices samples/robot
     """

@@ -1,7 +1,7 @@
 """Updates the same frames on both devices, from the same frame 0, and compares images, tracks and times.
 
-Without a GPU, the kernels of the GPU run on the CPU device of NVIDIA Warp. The results are then comparable, but the
-times are not.
+Without a GPU, the GPU kernels run on the CPU device of NVIDIA Warp. The results are then comparable, but the times are
+not.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def effort(
 ) -> None:
     """Measures the cost of reports, how closely time budgets are met, and how much the adaptive preset saves.
 
-    Needs an idle machine. The results become part of the page that `scripts/bench frontier --only page` writes.
+    Requires an idle machine. The results become part of the page that `scripts/bench frontier --only page` writes.
 
     Example: scripts/bench effort captures/robot --milliseconds 500
     """

@@ -27,15 +27,15 @@ from studies.quality.settings import settings_of
 TOLERANCE = 0.05
 """Fraction of the budget by which a frame's time may deviate, or one iteration if that takes longer."""
 FRAMES = 50
-"""Number of frames of a capture played back and forth."""
+"""Number of frames that are played back and forth from a capture."""
 FEW = 8
 """Maximum number of updates per capture with repeated or slowed frames."""
 SEEDS = 3
-"""Number of seeds for the updates of a capture as recorded."""
+"""Number of seeds for the updates of a capture that is played as recorded."""
 SEEN_DB = 45.0
-"""Cap of the PSNR. Differences above it are invisible, and slowed captures reach 54 dB."""
+"""Upper limit of the PSNR in dB. Differences above this limit are invisible, and slowed captures reach 54 dB."""
 COUNTED_FROM = 2
-"""First update that counts. Earlier ones have no previous motion to start from and no measured speed."""
+"""First update that is counted. Earlier ones have no previous motion to start from and no measured speed."""
 
 
 @dataclass

@@ -15,9 +15,10 @@ from studies.effort.report import TARGET
 KEPT = 0.95
 """Fraction of the frames that must meet a budget."""
 TIME, LOSS_DB, REPEATS = 0.60, 0.10, 0.10
-"""Targets of the adaptive preset compared with the fixed one.
+"""Targets for the adaptive preset, relative to the fixed one.
 
-These are the fraction of the time, the PSNR loss in dB, and the fraction of the time on repeated frames.
+The values are the fraction of the fixed preset's time, the PSNR loss in dB, and the fraction of the time on repeated
+frames.
 """
 
 

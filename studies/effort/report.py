@@ -1,9 +1,9 @@
-"""Cost of an update's report: the share of its stage in the time, and a check that the stage covers the whole cost.
+"""Cost of an update's report: its share of the update time, and a check that its stage covers the whole cost.
 
 The stage ``report`` covers the stage timers, losses that are computed only for the curve, the cameras' colour shifts,
 and assembling and writing the record. Publishing the record, as a worker does, is timed here and added to the stage.
 The work that is interleaved with the iterations can be switched off (``FrameUpdate.curve``). Running the same frames
-alternately with and without it measures its whole cost independently of the timers.
+alternately with and without this work measures its total cost independently of the timers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Frame sequences for testing updates: a capture back and forth, with repeated frames, and slowed down."""
+"""Frame sequences for testing updates: a capture played back and forth, with repeated frames, or slowed down."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterat
     source = started(capture, settings_of("scas4d"), out)
     for index in range(1, min(updates + 1, capture.frame_count)):
         source.step(capture.frame(index))
-    drawn = started(capture, settings_of("scas4d"), out)  # renders the states in between
+    drawn = started(capture, settings_of("scas4d"), out)  # renders interpolated states
     step = capture.frame(1).time - capture.frame(0).time
     number = 0
     for index in range(1, min(updates + 1, capture.frame_count)):

@@ -20,10 +20,10 @@ def exports(
     ] = None,
     page: Page = None,
 ) -> None:
-    """Exports the last state in every splat format, reads it with a third-party reader, and renders it for comparison.
+    """Exports the last state in every splat format, reads each file with a third-party reader, and renders the result.
 
     With ground truth, the moving parts in the `glb-parts` export of the whole capture are compared with the true poses.
-    Needs the extras `exports` and `dev`. Example: scripts/bench exports captures/robot out/robot/states
+    Requires the extras `exports` and `dev`. Example: scripts/bench exports captures/robot out/robot/states
     """
     from studies.exports.exports import measure, summarize
     from studies.exports.exports import sheet as sheet_of

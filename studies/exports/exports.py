@@ -57,7 +57,7 @@ class Found:
         """Converts the Gaussians to internal world coordinates.
 
         Args:
-            axes: signs that convert the file's axes to ours.
+            axes: signs that convert the file's axes to the internal ones.
             world: world frame of the scene.
             metres: whether the file is in metres rather than in the user's unit.
         """
@@ -90,10 +90,10 @@ class ExportFigures:
 
 
 def measure(folder: Path, states: Path) -> list[ExportFigures]:
-    """Exports the last committed state of a capture in every format, and renders what the readers return.
+    """Exports the last committed state of a capture in every format, and renders the Gaussians that the readers return.
 
     The views are those of the test cameras, or of the training cameras if there are none. In `glb-parts`, the last
-    state is the first one, moved to the end of the animation.
+    state is the first state at the end of the animation.
 
     Args:
         folder: capture folder.

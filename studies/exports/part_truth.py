@@ -1,9 +1,8 @@
 """Comparison of the moving parts of an exported asset, read back with pygltflib, with their true poses.
 
-True parts and nodes are matched one to one (Hungarian algorithm), so that nodes contain as many points of their parts
-in frame 0 as possible.
-The comparison covers the motion since frame 0: the angle of the residual rotation, and the mean position error over the
-points of the part.
+The Hungarian algorithm matches true parts and nodes one to one. It maximizes the number of points in frame 0 that
+belong to the node of their true part. The comparison covers the motion since frame 0: the angle of the residual
+rotation, and the mean position error over the points of the part.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class PartFigures:
 
     @property
     def covered(self) -> bool:
-        """Whether the matching node contains at least ``COVERED`` of the part's points."""
+        """Whether the matching node contains at least the share ``COVERED`` of the part's points."""
         return self.share >= COVERED
 
 
@@ -105,7 +104,7 @@ class AssetFigures:
 
 
 def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
-    """Exports the asset of a whole capture, first with the number of parts chosen by rule, then with the true number.
+    """Exports the asset of a whole capture, first with the number of parts chosen by rule, then with the true one.
 
     Args:
         folder: capture folder. Without ground truth of moving rigid parts, the result is empty.

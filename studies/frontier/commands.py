@@ -32,8 +32,8 @@ def frontier(
 ) -> None:
     """Measures accuracy against time: iterations of each method, and one setting at a time around the default.
 
-    Rows (accuracy) can be measured on a busy machine. Times are measured by alternating between settings and need an
-    idle machine. The page and its plots are then written from everything in the study's folder.
+    Rows, which contain the accuracy, can be measured on a busy machine. Times are measured by alternating between
+    settings and require an idle machine. The page and its plots are then written from everything in the study's folder.
 
     Example: scripts/bench frontier captures/robot --axes iterations --axes layers
     """

@@ -1,7 +1,7 @@
 """Convergence of an update: PSNR of the test cameras after some of its iterations.
 
-Learning rates and layer starts depend on the fraction of completed iterations, so the curve of a long update does not
-pass through the end points of shorter ones. The test cameras are only rendered. The update never uses them.
+Learning rates and layer starts depend on the fraction of completed iterations. The curve of a long update therefore
+does not pass through the end points of shorter updates. The update itself never uses the test cameras.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from studies.machine import core_version
 from studies.quality.first_frame import started
 
 CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
-"""Iterations after which the state is evaluated, if the update has that many. Its last state is always evaluated."""
+"""Iterations after which the state is evaluated, if the update has that many. The last state is always evaluated."""
 WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
 """Preset and number of iterations of the settings that are measured by default."""
 

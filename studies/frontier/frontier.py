@@ -1,10 +1,10 @@
-"""``scripts/bench frontier``: accuracy against time, setting by setting.
+"""``scripts/bench frontier``: accuracy against time for many settings.
 
-The study varies the iterations of each method, and one axis at a time around the default of 100 iterations of
-``scas4d``. A row is one capture, one setting and one seed over the same first updates, so that all rows of a capture
-are comparable. Rows are measured as in ``studies.quality``, and rows already on disk are not measured again. Frame 0 is
-fitted once per capture and Gaussian budget. The reported seconds come from ``studies.frontier.timing``, which measures
-settings alternately, so rows may be measured on a busy machine.
+The study varies the iterations of each method, and one axis at a time around the default, ``scas4d`` with 100
+iterations. Each row contains the results of one capture, one setting and one seed. All rows of a capture cover the same
+first updates, so they are comparable. Rows are measured as in ``studies.quality``, and rows already on disk are not
+measured again. Frame 0 is fitted once per capture and Gaussian budget. The reported seconds come from
+``studies.frontier.timing``, which measures settings alternately, so rows may be measured on a busy machine.
 """
 
 from __future__ import annotations
@@ -78,14 +78,14 @@ def _changed(label: str, name: str, value: object, *more: str) -> Variant:
 
 
 DEFAULT = Variant("scas4d 100")
-"""Setting around which the other axes vary, and the reference for times."""
+"""Default setting, around which the other axes vary and to which times are relative."""
 
 AXES: Mapping[str, tuple[Variant, ...]] = {
     "iterations": tuple(Variant(f"{name} {count}", name, count) for count in ITERATIONS for name in METHODS),
     "adaptive": tuple(
         Variant(f"{name} {PRESETS[name].update.iterations}", name, PRESETS[name].update.iterations)
         for name in PRESETS
-        if name not in METHODS and not PRESETS[name].effects  # docs/effects.md has presets per kind of scene
+        if name not in METHODS and not PRESETS[name].effects  # docs/effects.md lists presets per kind of scene
     ),
     "layers": (
         _changed("K=1: 64", "update.clusters", [64]),
@@ -160,7 +160,7 @@ def measure_frontier(
         report: callback that prints progress messages.
 
     Returns:
-        The rows measured by this call; failed rows have an ``error`` and are retried next time.
+        The rows measured by this call; failed rows have an ``error`` and are retried on the next call.
 
     Raises:
         ValueError: an axis is unknown.
@@ -187,8 +187,8 @@ def measure_variants(
 def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) -> Row | None:
     """Returns the row of a setting on a capture, or None if it was not measured.
 
-    A row belongs to a setting if its stored settings equal the current ones exactly, and if it covers exactly the given
-    number of updates, or the whole capture.
+    A row belongs to a setting if its stored settings equal the current ones exactly. The row must also cover exactly
+    the given number of updates, or the whole capture.
     """
     settings = variant.record
     for row in rows:

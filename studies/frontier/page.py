@@ -26,11 +26,11 @@ from studies.frontier.tradeoff import (
 from studies.machine import in_words
 
 PREVIEW_LOSS_DB = 4.0
-"""Largest PSNR loss of a preview relative to the default."""
+"""Largest PSNR loss allowed for a preview, relative to the default."""
 LIVE_GAIN_DB = 1.0
-"""A live show moves to a slower setting while each doubling of the time gains at least this much."""
+"""PSNR that each doubling of the time must gain for a live show to use a slower setting."""
 ARCHIVE_GAIN_DB = 0.1
-"""An archive uses the fastest setting within this distance of the best."""
+"""Largest PSNR loss allowed for an archive, relative to the best setting. The fastest such setting is used."""
 STAGE_ROWS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 100", "dynamic3dgs 200")
 """Labels of the settings whose stages are plotted."""
 AXIS_WORDS: Mapping[str, str] = {
@@ -51,7 +51,7 @@ COLUMNS = (
     ("2D %", "mte_2d", ".2f"),
     ("parts ARI", "parts_ari", ".3f"),
 )
-"""Column heading, name in ``Point.scores``, and number format."""
+"""Columns of the score table, each with a heading, a name in ``Point.scores``, and a number format."""
 
 
 class NothingMeasured(ValueError):

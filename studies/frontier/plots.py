@@ -50,7 +50,7 @@ STAGES = {
 }
 """Colours of the stages (Paul Tol's "muted"), distinct from those of the methods."""
 ABOUT = (0.7, 1.6)
-"""Range of times relative to the default. Settings within it get a panel of their own."""
+"""Range of times relative to the default. Settings within this range get a panel of their own."""
 COLUMN, PAGE = 3.45, 7.0
 """Widths of the figures in inches."""
 STYLE = {
@@ -354,7 +354,7 @@ def _key(plt: Any, marker: str, colour: str, words: str, line: bool = False) -> 
 
 
 def _log_seconds(axes: Any, label: bool = True) -> None:
-    """Makes the time axis logarithmic. Without a label, it gets fewer ticks, for a small panel."""
+    """Makes the time axis logarithmic. Without a label, the axis gets fewer ticks, as suits a small panel."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -396,7 +396,7 @@ def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
 
 
 def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Sequence[Any] = ()) -> None:
-    """Labels points on the side where the name hides the fewest points and lines.
+    """Labels each point on the side where its name hides the fewest points and lines.
 
     Args:
         axes: axes to draw on.

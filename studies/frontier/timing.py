@@ -1,9 +1,9 @@
 """Times of settings, measured alternately so that other load on the machine affects all of them equally.
 
-Each setting has its own reconstruction, all in one process, starting from the frame 0 that the rows of the study share.
-In each round, every setting processes the next frame, in an order that rotates from round to round. The first round is
-not counted, because it loads kernels and has no motion to start from. Settings with many iterations are counted once.
-The result is the median time, and the median over the rounds of the ratio to the first setting.
+Each setting has its own reconstruction. All of them run in one process and start from the frame 0 that the rows of the
+study share. In each round, every setting processes the next frame, in an order that rotates from round to round. The
+first round is not counted, because it loads kernels and has no motion to start from. Settings with many iterations are
+timed only once. The result is the median time, and the median over the rounds of the ratio to the first setting.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MANY_ITERATIONS = 500
 
 @dataclass
 class TimedVariant:
-    """A setting during the measurement: its reconstruction, and the seconds of each counted update."""
+    """A setting that is being timed: its reconstruction, and the seconds of each counted update."""
 
     variant: Variant
     reconstruction: Any
@@ -121,7 +121,7 @@ def read_times(out: Path, capture: str) -> Row | None:
 
 
 def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
-    """Returns the results that only an earlier run has, scaled to the current times.
+    """Returns the results that only an earlier run measured, scaled to the current times.
 
     The result is empty if the two runs have different baselines.
     """
@@ -156,7 +156,7 @@ def time_of(times: Row | None, variant: Variant) -> Row | None:
 
 
 def _distinct(variants: Sequence[Variant]) -> list[Variant]:
-    """Returns one setting of each group that differs only in seeds and frame counts, which do not affect the time."""
+    """Returns one of all settings that differ only in seed and frame count, which do not affect the time."""
     by_settings = {json.dumps(_unseeded(v.record), sort_keys=True): v for v in variants[::-1]}
     chosen = set(by_settings.values())
     return [variant for variant in variants if variant in chosen]

@@ -1,10 +1,10 @@
 """Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal time.
 
 Accuracy comes from the rows, which cover the same updates for all settings of a capture. Seconds come from
-``studies.frontier.timing``. For a setting that was not timed, the seconds of its row are used: CPU seconds if the row
-ran on one thread, because other load on the machine hardly affects them. If the default was timed on the capture, these
-seconds are scaled by the ratio of its timed seconds to the seconds of its row, so that all times of a capture are
-comparable.
+``studies.frontier.timing``. If a setting was not timed, the seconds in its row are used. These are CPU seconds if the
+row ran on one thread, because other load on the machine hardly affects CPU time. If the default was timed on the
+capture, the row seconds are scaled by the default's ratio of timed seconds to row seconds. This makes all times of a
+capture comparable.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SCORES = (
 )
 """Names of the scores in a row."""
 BUDGETS = (25, 50, 100, 200, 300)
-"""Iteration counts of the baseline. The methods are compared at the times that these take."""
+"""Iteration counts of the baseline whose run times are the times at which the methods are compared."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]
 
 
 def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]:
-    """Returns the means over captures of the settings that were measured on all of these captures."""
+    """Returns the mean over captures of each setting that was measured on all captures."""
     by_variant: dict[Variant, dict[str, Point]] = {}
     for point in points:
         by_variant.setdefault(point.variant, {})[point.capture] = point
@@ -123,8 +123,8 @@ def undominated(points: Sequence[Point]) -> list[Point]:
 def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
     """Returns the PSNR of a curve in dB at a given time, interpolated in log time, or None outside the curve.
 
-    Settings that take longer than a better one are excluded. With very few iterations, updates end so far from the
-    solution that the search for lost objects takes longer than the iterations that would have found them.
+    A setting that is slower than a more accurate one is excluded. With very few iterations, updates end far from the
+    solution. Searching for lost objects then takes longer than more iterations would have.
     """
     ordered = undominated(points)
     if not ordered or not ordered[0].seconds <= seconds <= max(point.seconds for point in points):

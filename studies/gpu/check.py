@@ -31,7 +31,7 @@ SIZES = (
     Size(gaussians=107_000, width=1280, height=720, cameras=16, moving=1.0),
     Size(gaussians=517_000, width=1920, height=1080, cameras=12, moving=1.0),
 )
-"""Scene sizes with which the prototype was measured: a small object, a stage, and a large stage."""
+"""Scene sizes at which the prototype was measured: a small object, a stage, and a large stage."""
 VIEWS = (1, 2, 4)
 """Numbers of views per iteration."""
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}

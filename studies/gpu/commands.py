@@ -27,9 +27,9 @@ def gpu_check(
         bool, typer.Option(help="Use small sizes and few frames, to try the check without a GPU.")
     ] = False,
 ) -> None:
-    """Checks the GPU engine on this machine: tests, accuracy, times per kernel and frame, spread of identical runs.
+    """Checks the GPU engine on this machine: tests, accuracy, times per kernel and frame, and spread over runs.
 
-    Needs no network. Each part is written as soon as it is measured. Without a GPU, the kernels run on the CPU.
+    Requires no network. Each part is written as soon as it is measured. Without a GPU, the kernels run on the CPU.
     """
     from studies.devices.devices import use_cpu_without_gpu
     from studies.gpu import check

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Values = dict[str, NDArray[Any]]
 
 REFERENCE = "float64"
-"""Backend against which the others are compared: the torch reference in float64."""
+"""Backend with which the others are compared: the PyTorch reference in float64."""
 CPU, TORCH = "cpu", "torch float32"
 
 

@@ -1,4 +1,4 @@
-"""Hard cases of deformations: saturated factors, folds, half turns, and clusters with one Gaussian or none."""
+"""Hard cases for deformations: saturated factors, folds, half turns, and clusters with one Gaussian or none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COUNT, COARSE, FINE = 120, 3, 12
 
 
 def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: float = 0.05) -> Deforming:
-    """Creates a cloud 1 m wide, in nested clusters of similar size. All parameters are near the identity."""
+    """Creates a cloud 1 m wide in nested clusters of similar size. All deformations are near the identity."""
     rng = np.random.default_rng(count)
     means = rng.uniform(-0.5, 0.5, (count, 3))
     fine = np.arange(count) * sizes[-1] // count if sizes else np.zeros(count)
@@ -74,7 +74,7 @@ def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[st
 
 
 def _fold(strength: float) -> Deforming:
-    """Creates one cluster in which c·y ranges from −strength to strength. Above 1, the map folds."""
+    """Creates one cluster in which c·y ranges from −strength to strength. The map folds if strength exceeds 1."""
     rng = np.random.default_rng(8)
     made = ordinary(64, (1,), 0.0)
     means = rng.uniform(-1, 1, (64, 3)).astype(np.float32)
@@ -94,7 +94,7 @@ def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]
 def _straight_back(steepness: float) -> Deforming:
     """Creates a map that folds along c, which is a half turn without a defined plane.
 
-    At steepness 2, the cosine is also 0.
+    With a steepness of 2, the cosine of the rotation is also 0.
     """
     made = ordinary(2, (1,), 0.0)
     means = np.array([[-1, 0, 0], [1, 0, 0]], np.float32)
@@ -122,7 +122,7 @@ def _own_turn(r: float) -> Deforming:
 
 
 def _through_a_half_turn(sign: float) -> Deforming:
-    """Creates two layers that rotate by 100° each, so that the product passes 180° and must keep w ≥ 0."""
+    """Creates two layers that rotate by 100° each, so that their product exceeds 180° but must still have w ≥ 0."""
     made = ordinary()
     angle = np.tan(np.radians(50.0) * sign)
     for clusters in made.clusters:
@@ -160,7 +160,7 @@ def _of_one(sizes: tuple[int, ...]) -> Deforming:
 
 
 def _unbalanced(count: int) -> Deforming:
-    """Creates one cluster with nearly all Gaussians, and ten with one each."""
+    """Creates one cluster with nearly all Gaussians, and ten clusters with one Gaussian each."""
     made = ordinary(count, (1, 11))
     labels = np.maximum(0, np.arange(count) - (count - 11)).astype(np.int32)
     return replace(made, labels=[np.zeros(count, np.int32), labels])
@@ -169,7 +169,7 @@ def _unbalanced(count: int) -> Deforming:
 def _place(metres: float) -> Deforming:
     """Moves the cloud far from the internal origin, where the resolution of float32 is about 6e-8 of the distance."""
     made = ordinary()
-    # Pivots and offsets are differences of large numbers, so results agree to the local spacing times the layers.
+    # Pivots and offsets are differences of large numbers: tolerance is the float spacing times the number of layers.
     spacing = max(1e-5, 1e-6 * metres)
     return replace(
         made, means=(made.means + np.float32(metres)).astype(np.float32), value=spacing, turn=max(1e-4, spacing),
@@ -212,7 +212,7 @@ def _not_finite(value: float, what: str = "means", count: int = 3) -> Deforming:
 
 
 def _apart(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that rows that are held back have no gradient with respect to their own parameters."""
+    """Checks that the gradients of rows that are held back are 0 with respect to their own parameters."""
     own = outcomes[CPU].gradients["own"][problem.bad]
     return [] if np.all(own == 0) else ["cpu: a row that is held back has a nonzero gradient"]
 

@@ -1,4 +1,4 @@
-"""The command `scripts/bench stability`: the catalogue of hard cases, hard frames, and the soak test."""
+"""The commands `scripts/bench stability` (hard cases, frame cases and the soak test) and `timing`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def stability(
         typer.Option(min=1, help="Process this many frames of a small scene instead; continues an interrupted run."),
     ] = None,
 ) -> None:
-    """Runs the catalogue of hard cases on every available backend and counts how often the guards acted.
+    """Runs the catalogue of hard cases on every available backend and counts how often the guards were triggered.
 
     Examples: scripts/bench stability --cases NaN --cases fold; scripts/bench stability --captures captures/robot;
     scripts/bench stability --service; scripts/bench stability --soak 10000
@@ -66,7 +66,7 @@ def timing(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Shifts two cameras of a capture in time and reports which time offsets are found.
+    """Shifts two cameras of a capture in time and reports the estimated time offsets.
 
     Writes timing.md to the study's folder. Runs that were already measured are not repeated.
     """
@@ -78,14 +78,14 @@ def timing(
 def _frame_studies(
     captures: Sequence[Path], store: Path, cases: Sequence[str], *, service: bool, soak: int | None
 ) -> None:
-    """Runs the soak test, or the frame cases on synthetic footage or captures. Exits with 1 if a check fails.
+    """Runs the soak test, or the frame cases on synthetic footage or captures. The exit code is 1 if a check fails.
 
     Args:
         captures: folders of captures for the frame cases; synthetic footage if empty.
         store: results folder. A soak test is resumed from it; everything else starts from scratch.
         cases: substrings of the names of the cases to run; all if empty.
         service: whether to run the frame cases through a service.
-        soak: number of frames of the soak test, or None.
+        soak: number of frames of the soak test; None to run the frame cases.
     """
     if soak is not None:
         from studies.hard_frames.soak import Soak, table, violations

@@ -43,13 +43,12 @@ class Deforming:
         labels: [M] ascending cluster labels per layer, coarse to fine and nested.
         clusters: [K, 10] cluster parameters per layer.
         deltas: [M, 9] parameters of each Gaussian.
-        bad: [M] mask of rows with non-finite values. They stay unchanged, and the other rows behave as if they were
-            absent.
+        bad: [M] mask of rows with non-finite values. Such rows stay unchanged and must not affect the others.
         guards: expected counts of the guards; None accepts any counts.
-        value: tolerance of the means in metres; 100 times this value is the relative tolerance of the factors.
-            No check if None.
-        turn: tolerance of the rotations in radians. No check if None.
-        gradient: relative tolerance of the gradients. No check if None.
+        value: tolerance of the means in metres; 100 times this value is the relative tolerance of the factors. Neither
+            is checked if None.
+        turn: tolerance of the rotations in radians; not checked if None.
+        gradient: relative tolerance of the gradients; not checked if None.
         bound: largest allowed gradient.
         kind: cluster map to use.
     """
@@ -68,7 +67,7 @@ class Deforming:
     kind: Literal["centred", "published"] = "centred"
 
     def weights(self) -> tuple[Array, Array]:
-        """Returns the random loss weights of the means [M, 3] and factors [M, 3, 3], which are 0 for invalid rows."""
+        """Returns random loss weights for the means [M, 3] and factors [M, 3, 3], which are 0 for invalid rows."""
         rng = np.random.default_rng(7)
         pulls = rng.normal(size=(len(self.means), 3)), rng.normal(size=(len(self.means), 3, 3))
         by_mean, by_factor = (pull.astype(np.float32) for pull in pulls)

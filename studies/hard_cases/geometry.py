@@ -1,4 +1,4 @@
-"""Hard cases of Gaussians: unusual positions, sizes and opacities, and non-finite values."""
+"""Hard cases for Gaussians: unusual positions, sizes and opacities, and non-finite values."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _culled_as_behind(count: int) -> Rendering:
 
 
 def _near_plane(near: float) -> Rendering:
-    """Places Gaussians just in front of the near plane, on it, and just behind it, with a width of 2 % of its depth."""
+    """Places Gaussians just before, on and just behind the near plane, with a width of 2 % of its depth."""
     z = np.float32(near)
     depths = np.array([np.nextafter(z, np.float32(0)), z, np.nextafter(z, np.float32(9))])
     limits = Rendering.limits._replace(near=float(z))
@@ -123,7 +123,7 @@ def _at_one_pixel(count: int) -> Rendering:
     rng = np.random.default_rng(3)
     depths = rng.uniform(1, 4, count)
     means = np.stack([0.02 * depths, 0.01 * depths, depths], -1)
-    # Thousands of factors 1 − alpha are multiplied, so errors of float32 accumulate.
+    # Thousands of factors 1 − alpha are multiplied, so float32 rounding errors accumulate.
     return among(count, means=means, factors=0.01 * np.eye(3), opacities=0.02, value=2e-3, gradient=2e-2, bound=1e8)
 
 
@@ -191,7 +191,7 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
 
 
 class Culled(Rendering):
-    """A case that only checks culling, on the CPU."""
+    """Problem that checks only culling, on the CPU."""
 
     def run(self, backend: str) -> BackendResult | None:
         """Renders the Gaussians on the CPU, or returns None for other backends."""
@@ -209,7 +209,7 @@ def _equal_depths(count: int) -> Rendering:
 
 
 def _by_row(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Checks that row order breaks ties: swapping tied rows changes the image, and rendering it again does not."""
+    """Checks that ties are broken by row order: swapping tied rows changes the image, but rendering again does not."""
     again = problem.run(CPU)
     assert again is not None
     same = np.array_equal(again.values["features"], outcomes[CPU].values["features"])
@@ -253,7 +253,7 @@ def _far_and_near(far: float) -> Rendering:
 
 
 def _few(count: int) -> Rendering:
-    """Creates Gaussians whose last group of sixteen may be incomplete and ends with an invalid one."""
+    """Creates Gaussians whose last group of sixteen may be incomplete and ends with an invalid Gaussian."""
     made = ordinary(count)
     made.means[-1] = np.nan
     made.bad[-1] = True

@@ -1,8 +1,8 @@
 """Mutation test of guards: disables each guard in a copy of the sources and records which cases fail.
 
-The value in the copy's ``guards.py`` is replaced with the guard's ``without``. If the guard is a comparison without a
-value, the edits in ``PATCHES`` are made instead. Compiled kernels of the copies are discarded. Results are stored per
-digest of the sources, so an interrupted study can be continued.
+The value in the copy's ``guards.py`` is replaced with the guard's ``without`` value. If the guard is a comparison
+without a value, the edits in ``PATCHES`` are made instead. Compiled kernels of the copies are discarded. Results are
+stored under a digest of the sources, so an interrupted study can be resumed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CORE = Path(scas4d_core.__file__).parent
 SECONDS = 900
 """Time limit of a run in seconds. A run that takes longer counts as failing."""
 CONTROL = "nothing"
-"""Name of the copy without changes, on which all cases must pass."""
+"""Name of the unchanged copy, on which all cases must pass."""
 
 PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "not_finite": (
@@ -55,7 +55,7 @@ PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("structure/hierarchy.py", "finite = np.isfinite(means).all(axis=1)", "finite = np.ones(len(means), bool)"),
     ),
 }
-"""Edits per guard: file, text that occurs once in it, and replacement."""
+"""Edits that disable each guard: a file, a text that occurs in it exactly once, and its replacement."""
 
 SECTIONS = (
     (("projection", "tiles", "limits", "twin"), "geometry"),
@@ -84,7 +84,7 @@ class MutationError(RuntimeError):
 
 
 def mutants() -> Iterator[Guard]:
-    """Yields every guard and convention."""
+    """Yields every guard and convention that the study disables."""
     yield from GUARDS.values()
     yield from CONVENTIONS.values()
 

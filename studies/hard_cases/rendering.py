@@ -1,4 +1,4 @@
-"""Forward and backward pass of rendering a set of Gaussians, on every backend."""
+"""Forward and backward rendering passes for a set of Gaussians, on every backend."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class Rendering:
         opacities: [N] float32 opacities.
         features: [N, 4] float32 features.
         camera: camera in internal world coordinates.
-        bad: [N] rows that must be excluded: they receive no gradient, and the other rows behave as if they were absent.
+        bad: [N] mask of rows that must be excluded. They receive no gradient and must not affect the other rows.
         guards: expected counts of the CPU guards; None accepts any counts.
-        value: tolerance of a pixel against float64, relative to the range of the features. No check if None.
-        gradient: tolerance of each gradient against float64, relative to its norm. No check if None.
-        bound: largest allowed gradient, for weights of 1.
+        value: tolerance of a pixel compared with float64, relative to the range of the features; not checked if None.
+        gradient: tolerance of each gradient compared with float64, relative to its norm; not checked if None.
+        bound: largest allowed gradient if all pixel weights are 1.
         weight: standard deviation of the pixel weights.
         limits: rasterizer limits.
-        why: reason for not checking agreement, if it is not checked.
+        why: reason why agreement is not checked, if it is not.
     """
 
     means: Array
@@ -59,7 +59,7 @@ class Rendering:
     why: str = ""
 
     def weights(self) -> tuple[Array, Array]:
-        """Returns the random loss weights of the features [4, H, W] and of alpha [H, W]."""
+        """Returns the random loss weights for the features [4, H, W] and for alpha [H, W]."""
         rng = np.random.default_rng(5)
         shape = (4, self.camera.height, self.camera.width)
         return (

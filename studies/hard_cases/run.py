@@ -42,7 +42,7 @@ class CaseResult:
 
 
 def backends() -> list[str]:
-    """Returns the available backends, the float64 reference in PyTorch first."""
+    """Returns the available backends, starting with the float64 reference in PyTorch."""
     return [CPU] if find_spec("torch") is None else [REFERENCE, CPU, TORCH]
 
 
@@ -97,12 +97,12 @@ def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = p
 
 
 def in_words(guards: dict[str, int]) -> str:
-    """Formats the counts of the guards, largest first."""
+    """Formats the guard counts, largest first."""
     return ", ".join(f"{name} {count:,}" for name, count in sorted(guards.items(), key=lambda item: -item[1]))
 
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
-    """Returns a Markdown table with one row per section: numbers of cases and of their sizes, and failing cases."""
+    """Returns a Markdown table with one row per section: numbers of cases and sizes, and failing cases."""
     text = ["| section | cases | counting sizes | failures |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
         names = {case.name for case in cases}

@@ -1,4 +1,4 @@
-"""Hard cases of whole scenes: unusual rigs and units, from frame 0 through two updates."""
+"""Hard cases for whole scenes: frame 0 and two updates with unusual rigs and units."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SIZE, BALL = 32, 400
 
 @dataclass(frozen=True, eq=False)
 class HardScene:
-    """A ball that moves over a floor, for two updates that start from the true frame 0.
+    """Scene of a ball that moves over a floor, with two updates that start from the true frame 0.
 
     Attributes:
         rig: rig for which the images are rendered, in the world in which the ball has a radius of 0.25 m.
         user: conversion between that world and the user's coordinates.
         metres_per_unit: setting ``scene.metres_per_unit`` as given by the user.
-        least: minimum PSNR in dB of the last update on its own views, close to the PSNR of the same scene in metres.
+        least: minimum PSNR in dB of the last update on its own views, close to that of the same scene in metres.
     """
 
     rig: Rig
@@ -51,7 +51,7 @@ class HardScene:
         world = cameras.world_frame(self.metres_per_unit)
         settings = Settings.model_validate(
             {
-                "scene": {"metres_per_unit": self.metres_per_unit, "background": (0, 0, 0)},  # as in the images
+                "scene": {"metres_per_unit": self.metres_per_unit, "background": (0, 0, 0)},  # as in the renders
                 "update": {"iterations": 60, "clusters": [4, 16]},
             }
         )

@@ -1,4 +1,4 @@
-"""Hard cases of the remaining steps: Adam, parameters of frame 0, neighbours, losses, clustering."""
+"""Hard cases for the other steps of the method: Adam, frame 0 parameters, neighbours, losses and clustering."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class HardStep:
-    """A function of arrays, computed on the CPU and, if there is a reference for it, in float64.
+    """Function of arrays that is computed on the CPU and, if it has a reference implementation, in float64.
 
     Attributes:
         compute: functions that compute the result, keyed by backend.
-        agreement: tolerance of each array against float64, relative to its norm. No check if None.
+        agreement: tolerance of each array compared with float64, relative to its norm; not checked if None.
         bound: largest allowed gradient.
         guards: expected counts of the guards; None accepts any counts.
         more: function that returns violations of further requirements.
@@ -73,11 +73,11 @@ class HardStep:
 
 STEPS = 20
 LARGEST = EXPONENT * np.log(2.0)
-"""Largest argument of an exponential."""
+"""Largest argument that the guards pass to an exponential."""
 
 
 def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, **changes: Any) -> HardStep:
-    """Runs twenty steps of Adam on a table in which ``gradient(step, table)`` replaces some gradients."""
+    """Runs twenty Adam steps on a table, with some gradients replaced by ``gradient(step, table)``."""
 
     def start() -> tuple[Array, list[Array]]:
         rng = np.random.default_rng(11)
@@ -151,7 +151,7 @@ def _decaying(outcomes: Mapping[str, BackendResult]) -> list[str]:
 def _activation(
     columns: slice, value: Any, guards: dict[str, int], agreement: float | None = 1e-4, pull: float = 1.0
 ) -> HardStep:
-    """Activates 300 rows of parameters of frame 0, with some columns replaced by ``value`` in every tenth row."""
+    """Activates 300 rows of frame 0 parameters, with some columns replaced by ``value`` in every tenth row."""
     rng = np.random.default_rng(12)
     table = rng.normal(size=(300, activation.COLUMNS)).astype(np.float32)
     table[::10, columns] = value
@@ -191,7 +191,7 @@ def _activation(
 
 
 def _opposite(scale: float) -> HardStep:
-    """Compares quaternions q and −q of any length, which must give the same Gaussian and opposite gradients."""
+    """Compares quaternions q and −q of any length, which must yield the same Gaussian and opposite gradients."""
     rng = np.random.default_rng(13)
     table = rng.normal(size=(64, activation.COLUMNS)).astype(np.float32)
     table[:, 3:7] *= np.float32(scale)
@@ -296,7 +296,7 @@ MILLION_MB = 600
 
 
 def _megabytes_of_clustering(count: int) -> float:
-    """Returns the increase of the peak memory by ``build_hierarchy`` for ``count`` points on a sphere, in MB."""
+    """Returns the increase in peak memory, in MB, caused by ``build_hierarchy`` for ``count`` points on a sphere."""
     rng = np.random.default_rng(16)
     means = rng.normal(size=(count, 3)).astype(np.float32)
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -334,7 +334,7 @@ def _graph(points: NDArray[Any]) -> HardStep:
 
 
 def _split(lengths: tuple[float, float, float]) -> HardStep:
-    """Splits factors into rotation and lengths, as for export, and checks Σ, even for nearly equal lengths."""
+    """Splits factors into rotations and lengths, as for exports, and checks Σ, even for nearly equal lengths."""
 
     def on_cpu() -> BackendResult:
         rng = np.random.default_rng(15)

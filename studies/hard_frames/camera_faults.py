@@ -1,7 +1,7 @@
 """Faults of a single camera: the faulty frames, and checks that an alarm names the camera.
 
-Lenses lose focus and get dirty, gain and white balance jump, and a frame grabber repeats its last image. The update may
-hardly suffer, but the operator must be alerted while the recording can still be saved.
+Lenses lose focus or get dirty, gain or white balance jumps, or a frame grabber repeats its last image. Such faults may
+hardly affect the update, but the operator must be alerted while the recording can still be saved.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Cost of the checks: their share of an update according to its stage timers, compared with the target."""
+"""Cost of the checks: their share of the update time according to the stage timers, compared with the target."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Share = tuple[float, float, float]
 
 
 def shares(reports: Sequence[FrameReport]) -> Share:
-    """Returns medians over updates: seconds per update, share of the checks, and share of comparing start and end.
+    """Returns medians over updates: seconds per update, and shares of the checks and of comparing start and end.
 
-    The checks are the stage ``judge``: exposure of the images, the gate, plausibility, fits, and views of cameras
-    that are left out. Start and end are compared on the probe views. This comparison is part of the update and
-    allows it to end at any moment.
+    The checks make up the stage ``judge``: exposure of the images, the gate, plausibility, fits, and views of cameras
+    that are left out. Start and end are compared on the probe views. This comparison is part of the update and allows
+    it to end at any moment.
     """
     totals = [sum(report.seconds.values()) for report in reports]
     checks = [report.seconds["judge"] / total for report, total in zip(reports, totals, strict=True)]

@@ -27,9 +27,9 @@ Pictures = Mapping[str, NDArray[np.uint8]]
 CAMERAS, SIZE = 10, 64
 """Number of cameras in the synthetic rig, and width and height of its images in pixels."""
 ANGLE = 0.08
-"""Angle by which the ball circles per frame, in radians, which corresponds to 11 mm and 5 degrees."""
+"""Angle in radians through which the ball circles per frame: about 5 degrees, or 11 mm."""
 NOISE = 3.0
-"""Standard deviation of the noise in the training images, in levels of 255."""
+"""Standard deviation of the noise in the training images, in 8-bit levels."""
 RATE = 30.0
 """Frames per second."""
 
@@ -49,7 +49,7 @@ class SyntheticFootage:
     name = "synthetic"
     count = 24
     constants = (("scas4d_core.preparation.NEIGHBOUR_FALLOFF", 200.0),)
-    """Constants to change when a scene starts or resumes, as pairs of dotted name and value.
+    """Constants that are overridden when a scene starts or resumes, as pairs of dotted name and value.
 
     The neighbour weights are changed because the Gaussians are far apart.
     """
@@ -119,7 +119,7 @@ class CapturedFootage:
     """Footage of a capture with test cameras. Frame 0 is fitted once and stored.
 
     Args:
-        capture: the capture.
+        capture: capture that provides the frames.
         settings: reconstruction settings.
         study: study folder in which frame 0 is stored, such as the one of ``scripts/bench quality``.
     """

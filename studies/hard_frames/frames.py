@@ -1,8 +1,8 @@
 """Cases of faulty frames: the frames that each case sends, and the checks that its result must pass.
 
-A case replaces the frames of undisturbed footage from some frame on, first with faulty frames and then with good ones.
-In every case, all values must be finite, the report must explain what is wrong, and the third good frame must be as
-good as in the undisturbed run.
+From a certain frame on, a case replaces the frames of undisturbed footage, first with faulty frames and then with good
+ones. In every case, all values must be finite, and the report must explain what is wrong. The third good frame must be
+as good as in the undisturbed run.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ Pictures = Mapping[str, Picture]
 AFTER = 3
 """Number of good frames after the faulty ones. The last good frame is compared with the undisturbed run."""
 WITHIN_DB = 0.5
-"""Largest PSNR loss of the last good frame relative to the undisturbed run."""
+"""Largest allowed PSNR loss of the last good frame relative to the undisturbed run."""
 NEAR_DB = 1.0
-"""Largest PSNR loss, relative to the undisturbed run, of a faulty frame that can still be tracked."""
+"""Largest allowed PSNR loss, relative to the undisturbed run, of a faulty frame that can still be tracked."""
 JUMPED_DB = 3.0
-"""Largest PSNR loss three frames after a jump, which reveals other sides of the object and changes its shading."""
+"""Largest allowed PSNR loss three frames after a jump, which reveals other sides of the object and new shading."""
 
 
 class Footage(Protocol):
@@ -181,7 +181,7 @@ def unchanged(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Checks that the first frame is reported as degraded, and that the last one is within ``JUMPED_DB`` of usual."""
+    """Checks that the first frame is reported as degraded, and that the last one loses at most ``JUMPED_DB``."""
     faults = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
     if not last.psnr >= last.usual - JUMPED_DB:
@@ -207,7 +207,7 @@ def good(footage: Footage, index: int) -> Sent:
 
 
 def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame], Frame]) -> list[Sent]:
-    """Returns ``count`` changed frames from ``at`` on, followed by good frames. The scene continues meanwhile."""
+    """Returns ``count`` changed frames from ``at`` on, followed by good frames, while the scene continues to move."""
     faulty = [
         Sent(change(number, footage.frame(at + number)), at + number, footage.truth(at + number), False)
         for number in range(count)
@@ -222,7 +222,7 @@ def each(frame: Frame, change: Callable[[str, Picture], Picture]) -> Frame:
 
 
 def filled(value: int) -> Make:
-    """Returns a function that sends constant images, for as many frames as the size specifies."""
+    """Returns a function that sends ``size`` frames of constant images."""
     return lambda footage, at, size: replaced(
         footage, at, size, lambda number, frame: each(frame, lambda name, picture: np.full_like(picture, value))
     )
@@ -302,7 +302,7 @@ def still(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def stuck(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Repeats the images of the previous frame in ``size`` frames while the scene continues."""
+    """Repeats the images of the previous frame in ``size`` frames while the scene continues to move."""
     before = footage.frame(at - 1)
     return replaced(footage, at, size, lambda number, frame: before)
 

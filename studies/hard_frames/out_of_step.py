@@ -84,7 +84,7 @@ def run(
 
     Args:
         captures: capture folders.
-        out: study folder, which stores each finished run; a second call continues.
+        out: study folder, which stores each finished run; a second call resumes the study.
         updates: updates per capture.
         masks: whether the masks are used.
         changes: changes to the settings.
@@ -128,7 +128,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
     """Returns frame ``index`` of a stream that plays a subsampled capture back and forth.
 
     Args:
-        capture: the capture.
+        capture: capture to play.
         index: frame index in the stream.
         step: number of capture frames per stream frame.
         shifts: capture frames by which a camera is ahead (+) of the others or behind (−), keyed by camera name.
@@ -174,7 +174,7 @@ def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
 
     Args:
         reports: reports of all frames of the run.
-        true: true time offset of each camera in frames; cameras that are not listed are synchronized.
+        true: true time offset of each camera in frames; cameras that are not keys are synchronized.
     """
     last = reports[-1].timing
     named = [{name for name, one in report.timing.items() if one["out_of_step"]} for report in reports]

@@ -1,7 +1,7 @@
 """Soak test with thousands of frames of a small scene: static Gaussians, rotations, sizes and memory must not drift.
 
-A ball circles a vertical axis six times in 500 frames, spins six times about itself meanwhile, and then moves all the
-way back. This round trip is repeated. Next to the ball are a resting ball that is labelled as moving, and a static
+A ball circles a vertical axis six times in 500 frames, while spinning six times about its own axis. It then moves all
+the way back. This round trip is repeated. Next to the ball are a resting ball that is labelled as moving, and a static
 floor. After each round trip, the truth is bit-identical to that of frame 0.
 """
 
@@ -50,7 +50,7 @@ RESTING_M = 4 * PIXEL_M
 """Target: largest RMS distance of the resting ball from its start, in any row. An update locates a ball of ten pixels
 with some error, and several errors in a row may have the same direction."""
 RESTING_MEAN_M = PIXEL_M
-"""Target: largest mean, over a run, of the resting ball's RMS distance from its start."""
+"""Target: largest RMS distance of the resting ball from its start, averaged over a run."""
 RETURN_M = PIXEL_M
 """Target: largest RMS distance of the moving ball from its start when it has returned there."""
 TREND = 1.5

@@ -21,7 +21,7 @@ from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, named, violations
 
 AT = 5
-"""Index of the frame at which each case begins. By then, the usual values are known."""
+"""Index of the frame at which each case begins. By then, the checks have learned the usual values."""
 UNIT = 1e-5
 """Largest deviation of a rotation's norm from 1."""
 

@@ -21,9 +21,10 @@ def kernels(
     repeats: Annotated[int, typer.Option(min=1, help="Repetitions of the rasterizer and its arithmetic.")] = 9,
     changes: Changes = None,
 ) -> None:
-    """Measures the CPU kernels: the rasterizer against its arithmetic, an update against its passes, and peak memory.
+    """Compares rasterizer time with that of its arithmetic, and update time with rasterizer time, on the CPU.
 
-    Needs an idle machine. NUMBA_NUM_THREADS sets the number of threads. Frame 0 is fitted again to measure its memory.
+    Also measures peak memory, for which frame 0 is fitted again. Requires an idle machine. NUMBA_NUM_THREADS sets the
+    number of threads.
     """
     from studies.kernels import kernels as study
     from studies.quality.settings import settings_of
@@ -63,7 +64,7 @@ def moving(
     frames: Annotated[int, typer.Option(min=2, help="Updates per share; the first one is not counted.")] = 8,
     out: Page = None,
 ) -> None:
-    """Measures how the time of an update depends on the share of moving pixels, on synthetic footage."""
+    """Measures how the update time depends on the share of moving pixels, on synthetic footage."""
     from scas4d_core.warm_up import compile_in_processes
     from studies.kernels import moving as study
 

@@ -26,7 +26,7 @@ class KernelUse:
         architecture: compute capability times 10.
         registers: registers per thread.
         stack: stack frame in bytes.
-        spills: bytes written to and read from memory for lack of registers.
+        spills: bytes written to and read from memory because registers ran out.
     """
 
     name: str
@@ -43,7 +43,7 @@ def uses_of(ptxas: Path, file: Path, architecture: int) -> list[KernelUse]:
         RuntimeError: the file cannot be assembled, for example because ptxas is older than NVIDIA Warp's compiler.
     """
     with tempfile.NamedTemporaryFile(suffix=".ptx") as clean:
-        clean.write(file.read_bytes().replace(b"\0", b""))  # Warp writes the terminator of a C string
+        clean.write(file.read_bytes().replace(b"\0", b""))  # Warp also writes the null terminator
         clean.flush()
         command = [str(ptxas), "-v", f"-arch=sm_{architecture}", "-o", "/dev/null", clean.name]
         done = subprocess.run(command, capture_output=True, text=True, check=False)

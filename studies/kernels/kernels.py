@@ -1,9 +1,9 @@
-"""``scripts/bench kernels``: cost of the kernels, compared with their arithmetic alone.
+"""``scripts/bench kernels``: cost of the kernels, compared with the cost of their arithmetic.
 
 1. The rasterizer, forward and backward, is compared with a micro-kernel that does only the arithmetic of the same
-   number of blended pairs (``studies.kernels.pairs``). The two alternate in this process, on the same threads. They run
-   on all views of frame 0, and on a cloud of wider Gaussians, where the pairs cost more than the Gaussians.
-2. Updates are compared with their own rasterizer passes: the seconds of ``Reconstruction.step``, including decoding and
+   number of blended pairs (``studies.kernels.pairs``). The two alternate in one process, on the same threads. The
+   rasterizer renders all views of frame 0, and a cloud of wider Gaussians, in which pairs dominate the cost.
+2. Updates are compared with their own rasterizer passes. The seconds of ``Reconstruction.step``, including decoding and
    committing, are divided by those of its stages "render" and "render backward".
 3. The peak memory of these updates, including the fit of frame 0, is measured in a fresh process.
 """
@@ -46,14 +46,14 @@ CLOUD_GAUSSIANS, CLOUD_SIZE = 20_000, 256
 CLOUD_WIDTH = 2.1
 """Standard deviation of the cloud's Gaussians in pixels.
 
-It results in about 145 pixels per Gaussian and 2.9 million pairs per image.
+With this width, there are about 145 pixels per Gaussian and 2.9 million pairs per image.
 """
 
 
 def study(
     folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
 ) -> Row:
-    """Takes all three measurements on a capture, prints them, writes them to ``store/kernels.json``, and returns them.
+    """Makes all three measurements on a capture, prints them, writes them to ``store/kernels.json``, and returns them.
 
     Args:
         folder: capture folder.
@@ -65,7 +65,7 @@ def study(
 
     Raises:
         ValueError: fewer than 3 frames were requested.
-        BrokenProcessPool: the process of the run ended early.
+        BrokenProcessPool: the process that runs the updates ended early.
     """
     if frames < 3:
         raise ValueError(f"frames must be at least 3, because the first update is not counted; got {frames}")
@@ -75,7 +75,7 @@ def study(
     compile_in_processes()
     timed = in_a_process(run_and_time, folder, settings, frames, first_file)
     kept = load_first_frame(first_file)
-    assert kept is not None  # the run has stored it
+    assert kept is not None  # stored by the run
     world = capture.rig.world_frame(settings.scene.metres_per_unit)
     rig = rig_inside(world, capture.rig.scaled(settings.scene.image_scale).cameras)
     report(f"running the rasterizer and the micro-kernel {repeats} times, in alternation")
@@ -188,7 +188,7 @@ def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
 
 
 def update_figures(updates: Sequence[Row]) -> Row:
-    """Returns the seconds of the updates and of their rasterizer passes, and their ratio, excluding the first update.
+    """Returns the seconds of updates and of their rasterizer passes, and the ratio, without the first update.
 
     Args:
         updates: updates in order, each with the ``seconds`` of the whole step and of its ``stages``.

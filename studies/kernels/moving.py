@@ -1,4 +1,4 @@
-"""Time of an update depending on the share of moving pixels, on synthetic footage.
+"""Update time as a function of the share of moving pixels, measured on synthetic footage.
 
 Cameras in a row see a textured wall. A square in the middle of the wall slides, and its size depends on the share. All
 variants have the same Gaussians, cameras and settings, and are updated alternately.

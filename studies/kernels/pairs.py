@@ -3,7 +3,7 @@
 A pair is blended if the Gaussian's alpha is at least the floor and the pixel is not finished. For each pair, the
 micro-kernel computes what ``kernels.blend`` does forward and backward (exp, alpha, transmittance, four channels; the
 products and sums of the gradients), in the same blocks of 16 pixels. Its Gaussians cover a whole tile and stay in
-cache. It needs no projection, sorting, lists, partly covered blocks or reduction of the sums.
+cache. There is no projection, sorting, list traversal or reduction, and no block is partly covered.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CHANNELS = 4
 SIDE = 16
 """Width and height of the micro-kernel's tile in pixels."""
 PAIRS = GAUSSIANS * SIDE * SIDE
-"""Number of pairs in one round over the micro-kernel's tile. Every lane is a pair."""
+"""Number of pairs in one round over the micro-kernel's tile. Every SIMD lane computes a pair."""
 SUMS = 6 + CHANNELS
 
 
@@ -57,9 +57,9 @@ def blended_pairs(
         limits: rasterizer limits.
 
     Returns:
-        The number of pairs; the number of pixels in the 4×4 blocks that a support touches, which is the least that a
-        block-wise kernel computes; and the remaining light [H, W], which equals the rasterizer's ``transmittance`` if
-        the count is correct.
+        The number of pairs; the number of pixels in the 4×4 blocks that a support touches; and the remaining light,
+        shape [H, W]. A block-wise kernel computes at least these pixels. If the count is correct, the remaining light
+        equals the rasterizer's ``transmittance``.
     """
     visible = np.flatnonzero(counts > 0)
     order = visible[np.argsort(splats[visible, DEPTH], kind="stable")]

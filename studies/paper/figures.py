@@ -1,7 +1,7 @@
-"""Figures of the paper (SCas4D, TMLR 06/2025) per scene, as printed in its tables.
+"""Figures per scene from the paper (SCas4D, TMLR 06/2025), as printed in its tables.
 
-Only scenes with a counterpart among the captures are included: five of FastParticle, and Basketball of Panoptic. The
-captures have the same names, but contain different images and motions.
+Only scenes with a counterpart among the captures are included: five from FastParticle, and Basketball from Panoptic.
+The captures have the same names, but contain different images and motions.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PSNR_BASELINE_300 = _scenes(27.66, 27.16, 26.67, 29.57, 30.41)
 SSIM_BASELINE_300 = _scenes(0.95, 0.95, 0.93, 0.96, 0.97)
 """PSNR in dB and SSIM at equal wall-clock time.
 
-From the table "our method trained with 100 iterations per time frame against Dynamic3DGS".
+The source is the table "our method trained with 100 iterations per time frame against Dynamic3DGS".
 """
 
 PSNR_LAYERS: Mapping[int, Figures] = {
@@ -43,7 +43,7 @@ PSNR_LAYERS: Mapping[int, Figures] = {
 }
 """PSNR in dB by number of layers K.
 
-From the tables "Ablation study for the number of cluster layers" and "More ablation study".
+The sources are the tables "Ablation study for the number of cluster layers" and "More ablation study".
 """
 
 PSNR_FIRST_LAYER: Mapping[int, Figures] = {
@@ -54,7 +54,7 @@ PSNR_FIRST_LAYER: Mapping[int, Figures] = {
 }
 """PSNR in dB by number of clusters N in the first layer.
 
-From the table "varying the number of clusters in the first layer".
+The source is the table "varying the number of clusters in the first layer".
 """
 
 PSNR_MAX_SCALE_2 = _scenes(15.86, 19.86, 22.42, 18.86, 21.53)

@@ -1,4 +1,4 @@
-"""Writes the page of the paper's tables: our figures next to the paper's, and whether they agree."""
+"""Writes the page that compares our figures with the paper's tables."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from studies.paper.paper import (
 )
 
 DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ari": 3}
-"""Number of decimals of each score."""
+"""Number of decimals shown for each score."""
 
 
 def write_paper_page(

@@ -1,8 +1,8 @@
-"""``scripts/bench paper``: each experiment of the paper on the available captures, next to the paper's figures.
+"""``scripts/bench paper``: repeats each experiment of the paper on the available captures.
 
-Every experiment compares one setting with another, by one score. The outcome agrees in sign if the difference of the
-means has the same sign as in the paper. It agrees in size if the two differences are also within a factor of two.
-Differences that are small on both sides agree as well. If the paper shows only an image, only the sign is compared.
+Every experiment compares one setting with another by a single score. The outcome agrees in sign if the difference of
+the means has the same sign as in the paper. It agrees in size if the two differences are also within a factor of two.
+Two differences that are both small also agree. If the paper shows only an image, only the sign is compared.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
 """Experiments in the order of the page."""
 
 Measured = Mapping[tuple[Variant, str], Figures]
-"""Maps each setting and score to our figure of each capture."""
+"""Maps each setting and score to our figure for each capture."""
 
 AgreementWord = Literal["sign and size", "sign", "no", "not measured"]
 
@@ -216,8 +216,8 @@ class ClaimResult:
         paper: the paper's mean gain over the captures used by both; None if the paper prints no figures.
         own: our mean gain over the same captures; None if not measured.
         captures: captures over which the gains are averaged.
-        same_sign: number of these captures whose own gain agrees with the paper.
-        agrees: whether the mean gains agree in sign and size, only in sign, or not.
+        same_sign: number of these captures for which the sign of our gain agrees with the paper.
+        agrees: whether the mean gains agree in sign and size, only in sign, or not at all.
     """
 
     claim: Claim
@@ -231,8 +231,8 @@ class ClaimResult:
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
     """Returns our figures from the frontier study.
 
-    For captures without figures there, the PSNR of ``scas4d`` and ``dynamic3dgs`` is taken from the quality study, over
-    the updates that both cover.
+    For captures without figures in that study, the PSNR of ``scas4d`` and ``dynamic3dgs`` is taken from the quality
+    study, over the updates that both cover.
     """
     by_variant: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
@@ -283,7 +283,7 @@ def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> ClaimResul
 
 
 def _agrees(own: float, paper: float, small: float) -> AgreementWord:
-    """Returns whether two gains agree in sign and size, only in sign, or not. Two small gains agree in both."""
+    """Returns whether two gains agree in sign and size, only in sign, or not at all. Two small gains always agree."""
     if abs(own) < small and abs(paper) < small:
         return "sign and size"
     if own * paper <= 0:

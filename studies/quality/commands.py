@@ -38,11 +38,11 @@ def quality(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Measures images, tracks, parts and times of captures, and prints a table.
+    """Measures the images, tracks, parts and update times of captures, and prints a table.
 
-    Reconstructs every capture with every preset, number of iterations and seed, each row in a separate process, and
-    measures it on the capture's test cameras and ground truth. Rows on disk are not measured again. Writes table.md, a
-    JSON file per row, a line per frame, and images (truth | render | difference) to the study's folder.
+    Reconstructs every capture with every preset, number of iterations and seed, each combination in a separate process.
+    The results are measured on the capture's test cameras and ground truth. Rows on disk are not measured again. Writes
+    table.md, a JSON file per row, a line per frame, and images (truth | render | difference) to the study's folder.
 
     Example: scripts/bench quality captures/robot --preset scas4d --preset dynamic3dgs --iterations 100
     """
@@ -80,7 +80,7 @@ def refit(
 ) -> None:
     """Fits a later frame from scratch, as an upper bound for the updates, and reports how far they fall short of it.
 
-    The figures of the updates come from `scripts/bench quality` in the same folder, with the same settings. Writes
+    The figures for the updates come from `scripts/bench quality` in the same folder, with the same settings. Writes
     refit.md and a JSON file per row to the study's folder.
 
     Example: scripts/bench refit captures/visit --frame -1
@@ -118,11 +118,11 @@ def effects(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Compares each effect pinned off, pinned on or removed from the registry with auto, in dB, time and bits.
+    """Compares pinning or removing each effect with mode auto, by PSNR, update time and bit identity.
 
     The two reconstructions start from the same frame 0 and are updated alternately. Each finished run is stored in a
-    file. Effects that are on in every scene are only tested off. "removed" shows what an effect costs while it is off.
-    Writes effects.md to the study's folder.
+    file. Effects that are on in every scene are tested only in mode "off". Mode "removed" shows what an effect costs
+    while it is off. Writes effects.md to the study's folder.
 
     Example: scripts/bench effects captures/robot --name entering --name leaving --frames 8
     """
@@ -175,7 +175,8 @@ def targets(
 ) -> None:
     """Measures the rows that the targets need. `scripts/bench table` compares them with the targets.
 
-    The most expensive runs come last. dynamic3dgs-2000 takes 20 times as long as the others. --frames shortens it.
+    The most expensive runs come last. The run dynamic3dgs-2000 takes 20 times as long as the others; use --frames to
+    shorten it.
     """
     from studies.quality.runs import measure_runs
 
@@ -192,8 +193,8 @@ def table(
 ) -> None:
     """Prints which targets the measured rows reach, as a Markdown table.
 
-    Only rows with the settings of the current presets are used. Of several such rows, the one with the most frames
-    counts.
+    Only rows with the settings of the current presets are used. If several rows qualify, the one with the most frames
+    is used.
     """
     from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
 
@@ -218,10 +219,10 @@ def processors(
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for the updates on this processor.")] = 4,
     changes: Changes = None,
 ) -> None:
-    """Compares a capture's result on this processor with that on less capable ones, and with the spread over seeds.
+    """Compares results on this processor with those on less capable ones, and with the spread over seeds.
 
-    Kernels, numpy and BLAS compute as on a processor with only AVX2, and as on an x86-64 processor from 2008. Exits
-    with 1 if the bits of a state differ.
+    The kernels, NumPy and BLAS compute as if on a processor with only AVX2, and as if on an x86-64 processor from 2008.
+    The exit code is 1 if the states are not bit-identical.
     """
     from studies.quality import processors as study
 

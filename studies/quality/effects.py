@@ -1,8 +1,9 @@
-"""``scripts/bench effects``: benefit and cost of each effect compared with `auto`, measured alternately.
+"""``scripts/bench effects``: benefit and cost of each effect, compared with mode `auto`.
 
-Two reconstructions start from the same frame 0 and are updated alternately, frame by frame, in one process. One
-follows `auto`; in the other, effects are pinned. An effect that waits for evidence is tested "on", "off" and "removed".
-"removed" means without its line in the registry, and shows what the effect costs while it is off.
+Two reconstructions start from the same frame 0 and are updated alternately, frame by frame, in one process. One uses
+`auto` for every effect; in the other, some effects are pinned. An effect that waits for evidence is tested in the modes
+"on", "off" and "removed". In mode "removed", the effect is missing from the registry, which shows what it costs while
+it is off.
 """
 
 from __future__ import annotations
@@ -68,11 +69,11 @@ def run(
 
     Args:
         captures: capture folders.
-        out: study folder, which stores each finished run; a second call continues.
-        names: effect names; all if empty, unless there are ``pins``.
-        pins: further variants, each with effects that are pinned together.
+        out: study folder, which stores each finished run; a second call resumes the study.
+        names: effect names; all effects if empty, unless there are ``pins``.
+        pins: additional variants, each given as the effects that it pins together.
         preset: preset that both reconstructions share.
-        seeds: seeds of frame 0 and the updates; every seed is measured.
+        seeds: seeds for frame 0 and the updates; every seed is measured.
         frames: number of frames; all if None.
         changes: changes to the settings that both reconstructions share.
         again: whether to repeat the runs that ``out`` already contains.
@@ -106,7 +107,7 @@ def run(
 def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
     """Returns one variant for each effect and mode that the settings allow.
 
-    Effects that are always on are only pinned off.
+    For effects that are on in every scene, the only mode is "off".
 
     Raises:
         ValueError: an effect is unknown.
@@ -196,7 +197,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
     assert rig is not None
     for index in range(1, count):
         shown = truth.test_frame(index).images
-        for which in (0, 1) if index % 2 else (1, 0):  # the second one finds the images in the cache
+        for which in (0, 1) if index % 2 else (1, 0):  # the second reconstruction finds the images in the cache
             frame = capture.frame(index)
             with without(taken[which]):
                 began, spent = perf_counter(), process_time()
@@ -224,7 +225,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
 
 
 def _words(scene: Reconstruction, pins: Pins) -> str:
-    """Describes, for each pinned effect, whether it is on in auto at the end and since which frame."""
+    """Describes whether `auto` has each pinned effect switched on at the end, and since which frame."""
     record: Any = scene.history.report(scene.history.indices[-1]).get("effects", {})
     switches = {name: record[name] for name in pins if name in record}
     return ", ".join(f"on since {one['since']}" if one["on"] else "off" for one in switches.values())

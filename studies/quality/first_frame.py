@@ -24,16 +24,16 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 VERSION = 5
-"""Increase this if frame 0 changes for the same images and settings, so that stored results are fitted again."""
+"""Version of the fit of frame 0. Increase it if the result changes for the same images and settings."""
 
 CLOUD_VERSION = 4
-"""Increase this if initial point clouds that are computed from the images change."""
+"""Version of the initial point clouds computed from images. Increase it if they change."""
 
 ARRAYS = tuple(field.name for field in fields(Gaussians))
 
 
 def first_frame_key(capture: Capture, settings: Settings) -> str:
-    """Returns a name for a capture's frame 0, which depends on cameras, images, masks, points and settings.
+    """Returns the key of a capture's frame 0, computed from its cameras, images, masks, points and settings.
 
     Args:
         capture: capture as passed to the method, without withheld inputs.
@@ -72,7 +72,7 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
 
 
 def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
-    """Stores a frame 0 and its fitting time in seconds, atomically."""
+    """Atomically stores a frame 0 and its fitting time in seconds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names, evidence = sorted(result.exposures), result.evidence or {}
     beside = path.with_suffix(f".{os.getpid()}.part")
@@ -114,10 +114,10 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
     """Returns a reconstruction after frame 0, which is read from the study or fitted and stored on first use.
 
     Args:
-        capture: the capture.
+        capture: capture to reconstruct.
         settings: reconstruction settings.
         out: study folder.
-        states: empty folder to commit to; in memory if None.
+        states: empty folder for committed states; None to keep them in memory.
     """
     static = first_of(capture, out, settings)
     history = History() if states is None else History.open(states)

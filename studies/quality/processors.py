@@ -1,9 +1,9 @@
-"""``scripts/bench processors``: variation of a capture's result between processors and seeds.
+"""``scripts/bench processors``: variation of a capture's results between processors and seeds.
 
-The first frames of a capture are processed on this processor, as on one with only AVX2, and as on one from 2008. This
-applies to kernels (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``). For
-comparison, the updates are also run with other seeds. Each row runs in a separate process, including frame 0. Rows
-already on disk are run again only if the core has changed.
+A capture's first frames are reconstructed three times: without restrictions, with only AVX2, and as on a processor from
+2008. Environment variables restrict the kernels (``NUMBA_CPU_NAME``), NumPy (``NPY_DISABLE_CPU_FEATURES``) and BLAS
+(``OPENBLAS_CORETYPE``). For comparison, the updates are also run with other seeds. Each row, including its frame 0, is
+computed in a separate process. Rows already on disk are recomputed only if ``scas4d_core`` has changed.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ PROCESSORS: Mapping[str, Mapping[str, str]] = {
         "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
     },
 }
-"""Environment variables that make this processor, an x86-64, compute like a less capable one."""
+"""Environment variables that make an x86-64 processor compute like a less capable one."""
 
 
 def run(
     captures: Sequence[Path], out: Path, *, frames: int, seeds: int, changes: Sequence[str] = (), report: Report = print
 ) -> bool:
-    """Measures each capture on each processor in ``PROCESSORS`` with seed 0, and on this one with the other seeds.
+    """Measures each capture on all ``PROCESSORS`` with seed 0, and on this processor with the other seeds.
 
     Args:
         captures: folders of captures with test cameras.
-        out: study folder; a second call with the same folder continues.
+        out: study folder; a second call with the same folder resumes the study.
         frames: updates per run.
-        seeds: number of seeds of the updates, starting at 0.
+        seeds: number of seeds for the updates, starting at 0.
         changes: changes to the settings, such as ``update.iterations=20``.
         report: callback that prints progress messages.
 

@@ -1,9 +1,9 @@
-"""``scripts/bench quality``: scores of images, tracks and parts of captures, and seconds per update.
+"""``scripts/bench quality``: scores of each capture's images, tracks and parts, and seconds per update.
 
-There is one row for every capture, preset, number of iterations and seed. Each row runs in a separate process, so that
-its peak memory can be measured. Rows already on disk are not run again. Rows of a capture with the same scene and
-frame 0 settings share one frame 0 (``first/`` in the study folder), which is fitted only once. An interrupted row is
-restarted from frame 0.
+There is one row for every combination of capture, preset, number of iterations and seed. Each row runs in a separate
+process, so that its peak memory can be measured. Rows already on disk are not run again. Frame 0 is fitted only once
+for all rows of a capture with the same scene and frame 0 settings. It is stored in the study folder under ``first/``.
+An interrupted row is restarted from frame 0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
 
 OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
-"""Captures for which the table also contains the mean scores."""
+"""Captures over which the table also contains the mean scores."""
 LATER = ("scas4d_core.update.", "scas4d_core.robust.", "scas4d_core.structure.")
 """Prefixes of constants that do not affect frame 0. Rows share a frame 0 only if they agree in all other constants."""
 
@@ -51,22 +51,22 @@ def run(
     Args:
         captures: capture folders. Captures without test cameras are measured on their training cameras, and their rows
             are marked.
-        out: folder for rows, per-frame lines and images; a second call with the same folder continues.
+        out: folder for rows, per-frame lines and images; a second call with the same folder resumes the study.
         presets: preset names.
-        iterations: numbers of iterations per update, all of which are measured; the preset's own if empty.
-        seeds: seeds of frame 0 and of the updates; every seed is measured.
+        iterations: numbers of iterations per update, all of which are measured; the preset's own number if empty.
+        seeds: seeds for frame 0 and the updates; every seed is measured.
         changes: further settings, such as ``"update.clusters=[64]"``, with a JSON value after the equals sign.
         frames: number of frames per capture; all if None.
-        masks: whether the method is given the masks.
-        points: whether the method is given the initial point cloud.
-        pictures: frames to save as truth | render | difference; negative numbers count from the end.
+        masks: whether the masks are passed to the method.
+        points: whether the initial point cloud is passed to the method.
+        pictures: frames for which images (truth | render | difference) are saved; negative numbers count from the end.
         lpips: whether to measure LPIPS, if its weights are installed.
         again: whether to repeat rows that are already on disk.
         options: options for reading the captures.
         report: callback that prints progress messages.
 
     Returns:
-        The requested rows, in order; a failed row has an ``error`` and is retried next time.
+        The requested rows, in order; a failed row has an ``error`` and is retried on the next call.
 
     Raises:
         ValueError: a preset or setting is unknown, or a value is out of range.
@@ -143,10 +143,10 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
 
 
 def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label: str = "mean of objects") -> list[Row]:
-    """Returns the rows, followed by the means of each variant that has all captures in ``over``.
+    """Returns the rows, followed by the means of each variant that was measured on all captures in ``over``.
 
-    Rows with the same ``variant`` value form a variant. Floating-point scores that all of its rows have are averaged,
-    except the worst PSNR and the peak memory.
+    Rows with the same ``variant`` value form a variant. The means cover the floating-point scores that all of its rows
+    contain, except the worst PSNR and the peak memory.
     """
     result = list(rows)
     for variant in dict.fromkeys(row["variant"] for row in rows if "error" not in row):

@@ -1,8 +1,8 @@
-"""``scripts/bench refit``: upper bound for the updates, obtained by fitting a later frame like frame 0.
+"""``scripts/bench refit``: upper bound on the quality of updates, obtained by fitting a later frame like frame 0.
 
 A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. The
-gap to the updates at that frame shows what they still miss: changes that no effect explains, and quality lost over the
-frames. The figures of the updates are read from the rows of ``scripts/bench quality`` in the same folder.
+updates score lower at that frame if they miss changes that no effect models, or if they have lost quality over the
+frames. Their scores are read from the rows of ``scripts/bench quality`` in the same folder.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ def run(
 
     Args:
         captures: capture folders.
-        out: quality study folder; a second call continues.
+        out: quality study folder; a second call resumes the study.
         frame: frame to fit; negative numbers count from the end.
         preset: settings preset.
-        seeds: seeds of the fit; every seed is measured.
+        seeds: seeds for the fit; every seed is measured.
         points: whether to start from the point cloud of the capture's first frame, instead of the images alone.
         changes: changes to the settings, such as ``"effects.direction=off"``.
         again: whether to repeat fits that ``out`` already contains.
@@ -104,7 +104,7 @@ def _refitted(
 
 
 def _measured(capture: Capture, index: int, settings: Settings) -> Row:
-    """Fits a frame on its own and returns its row."""
+    """Fits a frame independently of all others and returns its row."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
     scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
@@ -124,7 +124,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
 
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
-    """Returns the PSNR of the updates at the same frame and its difference from the fit; empty if not measured."""
+    """Returns the PSNR of the updates at the same frame and its difference from the fit, if available."""
     wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])

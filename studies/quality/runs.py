@@ -19,24 +19,24 @@ CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """Maps a capture to settings that it needs in every run, such as a Gaussian budget or a floor.
 
-These settings must not tune a method.
+These settings must not be used to tune a method.
 """
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
-"""The non-default cluster map."""
+"""Name of the cluster map that is not the default."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Configuration for reconstructing some captures.
+    """Configuration with which certain captures are reconstructed.
 
     Attributes:
         captures: names of the capture folders.
         preset: preset name.
         iterations: iterations per update.
         changes: further settings, such as ``"update.clusters=[64]"``.
-        masks: whether the method is given the masks.
-        points: whether the method is given the initial points.
+        masks: whether the masks are passed to the method.
+        points: whether the initial points are passed to the method.
         frames: number of frames; all if None.
     """
 
@@ -137,7 +137,7 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
     """Returns the stored row of each run and capture; of several rows, the one with the most frames.
 
     A row belongs to a run if its settings equal the run's current settings exactly. If only frame 0 is needed, update
-    settings are ignored. Pairs of a run and a capture without such a row are missing from the result.
+    settings are ignored. Combinations of run and capture without such a row are omitted.
     """
     rows = [row for row in store.rows() if "error" not in row]
     by_run: dict[tuple[str, str], Row] = {}

@@ -1,4 +1,4 @@
-"""Settings of a study's row: a preset, its iterations and seed, and changes given as text."""
+"""Settings for one row of a study: a preset, its iterations and seed, and changes given as text."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def settings_of(
     seed: int = 0,
     changes: Sequence[str] = (),
 ) -> Settings:
-    """Returns a preset with changes. Frame 0 has no time limit, so results do not depend on the load of the machine.
+    """Returns a preset with changes. Frame 0 has no time limit, so results do not depend on the machine's load.
 
     Args:
         name: preset name.
         iterations: iterations per update; the preset's if None.
-        seed: seed of frame 0 and of the updates.
+        seed: seed for frame 0 and the updates.
         changes: changes such as ``"update.clusters=[64]"``, which override everything else.
 
     Raises:

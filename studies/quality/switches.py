@@ -47,10 +47,10 @@ def run(
 
     Args:
         captures: capture folders.
-        out: study folder, which stores each finished run; a second call continues.
+        out: study folder, which stores each finished run; a second call resumes the study.
         updates: updates per capture.
         preset: settings preset.
-        seeds: seeds of frame 0 and the updates; every seed is measured.
+        seeds: seeds for frame 0 and the updates; every seed is measured.
         changes: changes to the settings.
         again: whether to repeat finished runs.
         report: callback that prints progress messages.
@@ -88,7 +88,7 @@ def _row(folder: Path, out: Path, key: str, settings: Settings, seed: int, updat
 
 
 def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Row:
-    """Plays a capture and returns the switches of the effects that need evidence."""
+    """Plays a capture and returns when effects that need evidence were switched on or off."""
     scene = started(capture, settings, out)
     auto = [name for name in EFFECTS if effect(name).auto]
     on = [{name: bool(scene.history.report(0)["effects"].get(name, {}).get("on")) for name in auto}]

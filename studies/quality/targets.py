@@ -1,4 +1,4 @@
-"""Targets of the method, as data, and their comparison with measured rows."""
+"""Targets for the method, and their comparison with measured rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from studies.quality.quality import OBJECT_CAPTURES
 from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
 
 KERNELS = "kernels"
-"""Value of ``Target.run`` for figures of the kernel study (``studies.kernels``), which has no run."""
+"""Value of ``Target.run`` for figures from the kernel study (``studies.kernels``), which has no run."""
 MAPS = f"{preset('scas4d').update.cluster_map} − {OTHER_MAP} cluster map"
 K1 = ("clusters-64", "clusters-320", "clusters-1280")
 
@@ -35,7 +35,7 @@ class Target:
         metric: name of a value in the row. "psnr" is averaged over the updates that all compared rows have. "loss" and
             "loss_worst" are the mean and the worst loss of the updates against frame 0.
         captures: captures that must each reach the target, or whose mean must reach it.
-        sense: how the figure must compare with the threshold.
+        sense: operator with which the figure is compared with the threshold.
         threshold: threshold in ``unit``; if None, the figure is only reported.
         unit: unit of the figure.
         over: if given, the figure is the difference from the best of these runs (higher is better).
@@ -125,8 +125,8 @@ class Verdict:
     Attributes:
         target: target that was evaluated.
         capture: capture name, or "mean of …".
-        value: the figure; None if a part of it is not measured.
-        parts: figures of the run and of the run it is compared with; None if the target is not a difference.
+        value: the figure; None if any value that it depends on was not measured.
+        parts: figures for the run and for the run with which it is compared; None if the target is not a difference.
         updates: number of updates that the figure covers, as text; "frame 0" if there are none.
         reached: whether the target is reached; None without a figure or threshold.
     """
@@ -156,7 +156,7 @@ class Figure:
 
 
 def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
-    """Evaluates every target, with one verdict per capture, or one verdict for a mean."""
+    """Evaluates every target and returns one verdict per capture, or a single verdict for a mean."""
     verdicts = []
     for target in targets:
         figures = {capture: figure_of(target, capture, rows) for capture in target.captures}
@@ -235,7 +235,7 @@ def left_out(folder: Path, rows: Rows) -> int:
 
 
 def page(rows: Rows) -> str:
-    """Returns the Markdown page with commands, machine, date, the table of the targets, and the underlying rows."""
+    """Returns a Markdown page with the commands, machine and date, the table of targets, and the underlying rows."""
     verdicts = compare(rows)
     known = list(rows.values())
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
@@ -291,7 +291,7 @@ def _value(row: Row, metric: str, updates: int) -> float | None:
 
 
 def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
-    """Returns, as text, which updates a figure covers: the shared ones for PSNR, otherwise those of each row."""
+    """Describes which updates a figure covers: those that all rows share for PSNR, otherwise those of each row."""
     if metric == "psnr_first":
         return "frame 0"
     if "capture_frames" not in rows[0]:

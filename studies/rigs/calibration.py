@@ -95,7 +95,7 @@ def run(
 
     Args:
         captures: capture folders.
-        out: study folder, which stores each finished run; a second call continues.
+        out: study folder, which stores each finished run; a second call resumes the study.
         fit: whether to also fit frame 0 to faulty rigs.
         changes: changes to the settings.
         again: whether to repeat finished runs.
@@ -134,7 +134,7 @@ def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
 
 
 def _measured(name: str, matches: Matches) -> list[Row]:
-    """Returns a row with the residuals of the given rig, and one for each fault, added to each camera in turn."""
+    """Returns one row with the residuals of the given rig, and one per fault, added to each camera in turn."""
     given, off = measure_residuals(matches)
     known = np.array([fit.pixels for fit in given.values()])
     rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]

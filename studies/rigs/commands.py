@@ -48,7 +48,7 @@ def drift(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Updates captures in which two cameras or none drift, with and without the effect pose_drift.
+    """Updates captures with two drifting cameras or none, with and without the effect pose_drift.
 
     Writes drift.md to the study's folder. Runs that were already measured are not repeated.
     """

@@ -1,8 +1,9 @@
 """Comparison of tracks with optical flow, for captures without ground truth.
 
-Corners of frame 0 are followed in each camera independently, and as tracks of the scene. The optical flow is that of
-Lucas and Kanade, and a corner is kept only if following it back returns to the start. A correct track stays on its
-corner. If a second camera sees the same point, its own corner stays on the epipolar line of the first camera's corner.
+Corners of frame 0 are followed in each camera independently, and as tracks of the scene. The optical flow is computed
+with the Lucas–Kanade method. A corner is kept only if following it backwards leads to its start. A correct track stays
+on its corner. If a second camera sees the same point, its own corner stays on the epipolar line of the first camera's
+corner.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row
         count: number of frames.
 
     Returns:
-        ``flow_px`` and ``epipolar_px``, in pixels of the images of ``capture``, each None if there are too few
-        positions or most are lost; and ``flow_points``.
+        ``flow_px`` and ``epipolar_px`` in image pixels of ``capture``, and ``flow_points``. A distance in pixels is
+        None if there are too few positions or most are lost.
     """
     rig, indices = capture.rig, list(range(count))
     films: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in rig.names}

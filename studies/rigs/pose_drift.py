@@ -1,7 +1,8 @@
 """``scripts/bench drift``: captures with two drifting cameras, with and without pose tracking.
 
-A drifting camera's images are resampled as if it rotated, because a rotation requires no depth. One camera rotates
-across and one down, by a number of pixels per frame, up to a maximum. Test cameras do not move.
+The images of a drifting camera are resampled as if the camera rotated, because resampling for a rotation requires no
+depth. One camera rotates horizontally and another one vertically, by a number of pixels per frame, up to a maximum.
+Test cameras do not move.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def run(
 
     Args:
         captures: capture folders.
-        out: study folder, which stores each finished run; a second call continues.
+        out: study folder, which stores each finished run; a second call resumes the study.
         updates: updates per capture.
         pixels: drift of a camera per frame, in pixels of the capture's files.
         most: largest drift, in pixels of the capture's files.
@@ -133,7 +134,7 @@ def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
 
 
 def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float64]]) -> Frame:
-    """Returns a frame with some cameras rotated by pixels across, down and around the axis (``pixel_offset``)."""
+    """Returns a frame with some cameras rotated by pixels across, down and around the axis (see ``pixel_offset``)."""
     frame = capture.frame(index)
     images, masks = dict(frame.images), dict(frame.masks)
     for name, offset in offsets.items():

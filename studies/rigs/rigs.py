@@ -1,9 +1,9 @@
-"""``scripts/bench rigs``: captures of third-party rigs, read from their folders, with default settings.
+"""``scripts/bench rigs``: reconstructs captures of third-party rigs from their folders, with default settings.
 
 Frame 0 keeps its time limit, because its duration is measured. The study should run on an otherwise idle machine. With
-five or more cameras, one is held out. Its image is also compared with the nearest training image shown in its place. In
-all captures, tracks are compared with optical flow (``flow.py``). If a folder has a ``joints.npz`` (``points3d``
-[T, J, 3], in the calibration's world), its points are also tracked from frame 0.
+five or more cameras, one is held out. As a baseline, the image of the nearest training camera is also compared with
+that of the held-out camera. For all captures, tracks are compared with optical flow (``flow.py``). If a folder has a
+``joints.npz`` (``points3d`` [T, J, 3], in the calibration's world), its points are also tracked from frame 0.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def run(
 
     Args:
         captures: capture folders.
-        out: study folder; a second call continues.
+        out: study folder; a second call resumes the study.
         frames: maximum number of frames.
         longer: maximum length of the longer side of the largest image, in pixels.
         changes: changes to the settings, such as ``"static.seconds=60"``.

@@ -24,7 +24,7 @@ def scale(
     picture: Annotated[Path | None, typer.Option(help="File of the plot, such as scale.png.")] = None,
     out: Page = None,
 ) -> None:
-    """Measures how time and memory grow with pixels, Gaussians, cameras, the share that moves and frames.
+    """Measures how time and memory grow with pixels, Gaussians, cameras, moving content and frames.
 
     Growth is reported as an exponent.
 

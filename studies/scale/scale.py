@@ -1,4 +1,4 @@
-"""``scripts/bench scale``: time and memory while one size at a time grows. Each size runs in a separate process."""
+"""``scripts/bench scale``: time and memory as one size at a time grows. Each size runs in a separate process."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ FRAMES = (100, 1_000, 10_000)
 TURN = 16
 """Number of frames after which the footage of the memory measurement reverses."""
 KEPT = {"a folder": True, "the process": False}
-"""Maps each place where the memory measurement stores its states to whether it is a folder."""
+"""Places where the memory measurement stores its states, mapped to whether the place is a folder."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
 
 
 def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) -> dict[str, Any]:
-    """Measures the figures that are missing in ``work`` and returns all of them, under "sweeps" and "frames"."""
+    """Measures the figures missing in ``work`` and returns all figures under the keys "sweeps" and "frames"."""
     work.mkdir(parents=True, exist_ok=True)
     for name in sweeps:
         for size in SWEEPS[name]:
@@ -193,7 +193,7 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
 def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
     """Returns the figures of a size or of several frame counts, measured in a new process unless they are stored."""
     name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
-    ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # distinguishes other settings
+    ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # changes with the settings
     file = work / f"{name}-{ways:08x}.json"
     if not file.exists():
         done = subprocess.run(

@@ -1,7 +1,7 @@
 """Attacks a service with connections that a client without a token keeps open: `python -m studies.service.attack`.
 
 One lightweight process sends an endless header, half-sent headers and stalled uploads, all at once. It writes one line
-of JSON when the service has closed the last connection, or when its patience has run out.
+of JSON when the service has closed the last connection, or when the maximum waiting time has passed.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def attack(port: int, path: str, header: int, halves: int, uploads: int, patienc
     began = time.monotonic()
     ended, sent = began, 0
     with selectors.DefaultSelector() as waiting:
-        # The endless header comes last, because the first connections give way when a cap is reached.
+        # The endless header comes last, because the service closes the oldest connections when it reaches a limit.
         plans = [(HALF, 0)] * halves + [(upload(path), 0)] * uploads + [(HALF, header)] * (header > 0)
         for first, more in plans:
             connection = socket.socket()

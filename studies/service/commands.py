@@ -45,10 +45,10 @@ def faults(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Kills the service and its workers, damages its files, fills its disk, and compares with an undisturbed run.
+    """Kills the service and its workers, damages files and fills the disk, and compares with an undisturbed run.
 
-    Then clients without a token attack it during updates, with an endless header, half-sent headers and stalled
-    uploads.
+    Then clients without a token attack the service during updates, with an endless header, half-sent headers and
+    stalled uploads.
 
     Example: scripts/bench faults samples/robot --set static.iterations=300 --set update.iterations=20
     """
@@ -110,7 +110,7 @@ def ingest(
     work: Annotated[Path, typer.Option(help="Folder on the disk to measure.")] = Path("out/ingest"),
     out: Page = None,
 ) -> None:
-    """Measures ingest over the loopback interface, alternating with plain fsynced writes of the same records."""
+    """Compares the ingest rate over the loopback interface with that of plain fsynced writes of the same records."""
     from client.cli.extras import need_server
     from studies.service import ingest as of_ingest
 
@@ -139,7 +139,7 @@ def views(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Measures live views during updates: their latency under an open-loop load, and what they cost the updates.
+    """Measures live views during updates: their latency under an open-loop load, and how much they slow the updates.
 
     Example: scripts/bench views captures/robot
     """
@@ -170,9 +170,9 @@ def crossing(
         Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with points and test cameras.")
     ] = Path("samples/robot"),
 ) -> None:
-    """Lists the source files that a frame runs through from PUT to commit, and those of a render.
+    """Lists the source files that run for a frame, from PUT to commit, and those that run for a render.
 
-    Fails if there are too many.
+    Fails if there are too many files.
     """
     from client.cli.extras import need_server
     from studies.service.crossing import run
@@ -207,7 +207,7 @@ def sleeping(
         "out/sleeping"
     ),
 ) -> None:
-    """Measures memory, listing and first views of sleeping scenes, and prints the result as JSON.
+    """Measures the memory, listing time and first views of sleeping scenes, and prints the result as JSON.
 
     The scenes are copies of one scene.
     """

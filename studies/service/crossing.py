@@ -1,9 +1,10 @@
-"""Source files that a frame runs through from PUT to commit, and a render from request to response.
+"""Source files that run while a frame passes from PUT to commit, or a render from request to response.
 
-These are the files that a reader must open to follow a frame or a render. A file counts if one of its functions runs,
-in any process, for each of two frames or of two renders, so that unrelated work is ignored. Also ignored are `__init__`
-files, the kernels, the groups of effects (of which a scene has only a few) and `server/repair` (which checks the disk
-every few seconds in any case). The service runs as usual, with a profiler in each process.
+These are the files that a reader must open to follow a frame or a render. A file counts if at least one of its
+functions runs, in any process, in both of two frames or of two renders. Unrelated work is thus ignored. Also ignored
+are `__init__` files, the kernels, and the groups of effects, of which a scene has only a few. `server/repair` is
+ignored because it checks the disk every few seconds in any case. The service runs as usual, with a profiler in each
+process.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from studies.running.process import Service, wait_until
 
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26
-"""Largest allowed numbers of files; the current numbers are 62 and 26.
+"""Largest allowed numbers of files for a frame and for a render; the current numbers are 62 and 26.
 
-Unfinished work from before a frame would add files of its own.
+Unfinished earlier work would add further files.
 """
 LATER = (3, 4)
 """Frames that are traced. Frame 0 and the first updates do additional work."""
@@ -36,8 +37,10 @@ SETTINGS = {
 }
 COMMITTED_S = 120.0
 SETTLE_S = 0.3
-"""Pause before and after each phase, in which the processes finish related work. It is short, because background work
-that runs every few seconds does not belong to the frame."""
+"""Pause in seconds before and after each phase, in which the processes finish related work.
+
+The pause is short, because background work that runs every few seconds does not belong to the frame.
+"""
 
 PROFILER = """
 import os, sys, threading, time
@@ -64,11 +67,11 @@ threading.Thread(target=follow, daemon=True).start()
 threading.setprofile(profile)
 sys.setprofile(profile)
 """
-"""`sitecustomize.py` of the service's processes, which records the called code in each phase."""
+"""`sitecustomize.py` of the service's processes, which records the code that is called in each phase."""
 
 
 def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
-    """Returns the sorted files that a later "frame" and a "render" run through, relative to the checkout.
+    """Returns the sorted files that run for a "frame" and for a "render", relative to the checkout.
 
     Args:
         folder: folder for the service's data, created if missing.

@@ -2,7 +2,7 @@
 
 One scene is sent frame by frame. Before each frame, one bit of one file is flipped, while the service runs or while it
 is down. The study then requests views, sends the next frame, and compares everything with an undisturbed run. If the
-service could not repair the bit, the study does, so that the next flip is again the only one.
+service cannot repair the bit, the study restores it, so that only one bit is wrong at a time.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ class _Flip:
             self.faults.append("a response contains a path on the server")
 
     def _put_right(self, flipped: bytes) -> None:
-        """Repairs the byte if the service could not, so that the next flip is the only one."""
+        """Repairs the byte if the service could not, so that only one bit is wrong at a time."""
         try:
             with self.file.open("r+b") as opened:
                 opened.seek(self.at)

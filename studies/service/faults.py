@@ -1,7 +1,7 @@
 """Kills, truncation, bit flips, a full disk and attackers: no acknowledged frame may be lost, and no bit may differ.
 
-Each scenario runs the whole service in a separate process. The undisturbed run comes first. The other runs are compared
-with it, state by state and bit by bit.
+Each scenario runs the whole service in a separate process. The undisturbed run comes first. The states of the other
+runs must be bit-identical to those of the undisturbed run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from studies.service.beginnings import beginnings
 from studies.service.strangers import Attack, strangers
 
 TURN_S = 15.0
-"""Duration of updates without strangers. With strangers, updates continue until the last connection is closed."""
+"""Seconds of updates without an attack. Updates under attack continue until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
 """Maximum number of worker kills per frame. At the sixth kill, the service would rightly fail the frame."""
 
@@ -67,7 +67,7 @@ def kills(
             thread.join()
         service.finish(scene, len(study.frames))
         service.kill()
-        service.start()  # and once more: everything must be restored
+        service.start()  # after a second restart, everything must be restored
         service.finish(scene, len(study.frames))
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         lost = len(study.frames) - len(sender.receipts)
@@ -104,9 +104,9 @@ def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
 def damaged_log(
     study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Truncates log files or flips a bit while the service is down. It must then start, report this and continue.
+    """Truncates log files or flips a bit while the service is down. It must then start, report the damage and continue.
 
-    Half of the frames are committed and the other half are waiting, as after a kill.
+    Half of the frames are committed and the other half are waiting, as they would be after a kill.
     """
     random_ = random.Random(seed)
     service = study.service("log")
@@ -213,7 +213,7 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
                 faults.append("a frame was accepted but not acknowledged")
         worker = service.worker_pid(scene)
         assert worker is not None
-        before = service.status(scene).error  # it may still say that the service had no room
+        before = service.status(scene).error  # possibly still the error that the service had no room
         with _no_room(worker):
             sender.send(half)
             until = time.monotonic() + PATIENCE_S

@@ -36,9 +36,9 @@ from studies.options import Echo
 from studies.running.process import PATIENCE_S, Service
 
 FARTHEST = 1.0
-"""Largest jump of the object, in multiples of its size. A jump of twice its size would leave the images."""
+"""Largest jump of the object, in multiples of its size. With a jump of twice its size, it would leave the images."""
 BETWEEN = 2
-"""Number of good frames between the last frame that counts for one case and the first frame of the next."""
+"""Number of good frames between the last frame that is checked for one case and the first frame of the next case."""
 AGAIN_S = 0.05
 
 
@@ -123,7 +123,7 @@ def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent
 def study(
     footage: AnyFootage, folder: Path, names: Sequence[str] = (), echo: Echo = print
 ) -> tuple[list[ServiceCaseResult], list[str]]:
-    """Runs the cases whose name contains one of ``names``, or all.
+    """Runs the cases whose name contains one of ``names``, or all cases if it is empty.
 
     Returns:
         The result of each case, and the faults of the service itself.
@@ -162,7 +162,7 @@ class Pushed:
 
     Attributes:
         committed: committed states of the scene.
-        count: number of frames that were to be sent.
+        count: number of frames to send.
     """
 
     committed: CommittedScene

@@ -1,8 +1,8 @@
 """Ingest rate over the loopback interface, compared with plain fsynced writes of the same records.
 
-Everything is measured alternately in one run, because a disk's speed drifts and heavy writing slows later writes. A
-record contains the encoded images of one frame. The scene is paused, so only ingest is measured, that is, receiving,
-checking the structure of each image, hashing, writing, syncing and acknowledging.
+All rates are measured alternately in one run, because a disk's speed drifts and heavy writing slows later writes. A
+record contains the encoded images of one frame. The scene is paused, so only ingest is measured: receiving, checking
+the structure of each image, hashing, writing, syncing and acknowledging.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
 
 
 def _plain(folder: Path, bodies: Sequence[bytes], frames: int, first: int) -> float:
-    """Returns the seconds to write and sync each record to a new file. Files are kept, because reuse is faster."""
+    """Returns the seconds to write and sync each record to a new file, because overwriting files is faster."""
     folder.mkdir(exist_ok=True)
     began = time.perf_counter()
     for number in range(first, first + frames):

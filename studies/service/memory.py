@@ -1,8 +1,8 @@
 """Peak memory of a reconstruction compared with the service's estimate (server/health/estimate.py).
 
-Frame 0 and two updates of a ball in the middle of a ring of cameras are reconstructed with few iterations, on which
-memory does not depend. Another study measures a service whose scenes all sleep: its memory, and the times to list the
-scenes and to render a first view.
+The scene is a ball in the middle of a ring of cameras. Frame 0 and two updates are reconstructed with few iterations,
+because memory does not depend on their number. A second study measures a service whose scenes are all asleep: its
+memory, and the times to list the scenes and to render a first view.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float
         work: data folder; its contents are deleted.
 
     Returns:
-        Memory per scene in MB; seconds from startup to the list of scenes, both for folders that are new to the service
-        and for known ones; and the median and longest time to the first view of a scene, in seconds.
+        Memory per scene in MB; seconds from startup until the scenes are listed, for new and for known folders; and
+        median and longest seconds until the first view of a scene is rendered.
     """
     shutil.rmtree(work, ignore_errors=True)
     empty, full = work / "empty", DataFolder(work / "full")

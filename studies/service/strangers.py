@@ -1,4 +1,4 @@
-"""Measures `/health/live`, memory and updates, alternately with and without an attack by clients without a token.
+"""Measures `/health/live`, memory and updates, both normally and during an attack by clients without a token.
 
 The attack is `studies.service.attack`, in a separate process. One service runs with a token and one without. The scene
 is updated continuously. A turn with the attack lasts until its last connection is closed.
@@ -26,7 +26,7 @@ from studies.running.study import Study, Updates
 P99_MS, MEMORY_MB, CLOSED_S, SLOWER = 50.0, 50.0, 60.0, 1.1
 TOKEN = "of-the-study-and-of-nobody-else"
 EVERY_S = 0.05
-"""Interval between two requests to `/health/live`, each over its own connection."""
+"""Interval in seconds between two requests to `/health/live`, each over its own connection."""
 PATIENCE_S = 120.0
 AT_ONCE = 4
 WARM_UP = 3
@@ -54,7 +54,7 @@ class AttackTimes:
 
     Attributes:
         health: response time of each request to `/health/live`, in ms.
-        lost: number of these requests without a response of 200.
+        lost: number of these requests that did not return status 200.
         memory: largest memory of the service's process, in MB.
         updates: seconds of each update.
     """

@@ -1,9 +1,9 @@
-"""Live views during updates: how much updates and an open-loop load of renders slow each other.
+"""Live views during updates: how much updates and an open-loop load of renders slow each other down.
 
 A service runs in a separate process. For each rate, the study measures views while nothing is updated, updates without
-views, and both together. It alternates between them, because a machine's speed drifts. Requests start at fixed times,
-regardless of earlier requests. Latency is measured from the time at which a request was due, so that a service that
-falls behind is noticed.
+views, and both together. The study alternates between the three, because a machine's speed drifts. Requests start at
+fixed times, regardless of earlier requests. Latency is measured from the time at which a request was due, so that a
+service that falls behind is noticed.
 """
 
 from __future__ import annotations

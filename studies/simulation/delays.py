@@ -1,4 +1,4 @@
-"""Delays and sizes of the model, with sources. A pair of seconds is the range of a uniform distribution."""
+"""Delays and sizes of the model, with their sources. A pair of seconds is the range of a uniform distribution."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ It is chosen so that a scene continues 14 to 18 s after the failure, as measured
 """
 
 HEAD_S: Range = (3.0, 5.5)
-"""How long the head does not respond after its end, measured by `scripts/bench head` with Redis and a supervisor."""
+"""Time for which a killed head does not respond, measured by `scripts/bench head` with Redis and a supervisor."""
 
 # From Ray.
 
@@ -27,7 +27,7 @@ PLACED_PER_S = 550.0
 The source is `many_actors` of Ray's release tests, with 10,000 actors on 64 nodes.
 """
 TOP_SHARE, SPREAD_ABOVE = 0.2, 0.5
-"""Ray's scheduler draws from the emptiest fifth of the nodes. Nodes that are less than half full count as empty."""
+"""Share of the nodes, emptiest first, from which Ray's scheduler draws, and load below which a node counts as empty."""
 WAIT_S = 3.0
 """`WAIT_S` of server/cluster/ray_placement.py, which cannot be imported without Ray."""
 MESSAGE_S: Range = (0.001, 0.02)
@@ -36,23 +36,23 @@ MESSAGE_S: Range = (0.001, 0.02)
 # Assumed, not measured.
 
 STOPPING_S: Range = (0.1, 1.0)
-"""How long a worker takes to stop on request."""
+"""Time that a worker takes to stop on request."""
 LATE_S: Range = (0.5, 10.0)
-"""How long actors keep running after their service has ended."""
+"""Time for which actors keep running after their service has ended."""
 ADRIFT_S: Range = (1.0, 120.0)
-"""How long an abandoned worker keeps running. A real worker ends within 0.5 s of its parent's end."""
+"""Time for which an abandoned worker keeps running. A real worker ends within 0.5 s of its parent's end."""
 ADRIFT_UPDATE_S: Range = (0.5, 5.0)
 """Seconds per update of an abandoned worker. Its updates are fast, so it writes many files that must not be read."""
 PAUSE_S: Range = (1.0, 240.0)
-"""How long a node is stopped or cut off, sometimes for less than Ray takes to notice."""
+"""Time for which a node is stopped or cut off, which may be too short for Ray to notice."""
 REPLACED_S: Range = (30.0, 120.0)
-"""Delay before a new node joins, after one was killed or came back too late."""
+"""Delay before a new node joins to replace one that was killed or came back too late."""
 DOWN_S: Range = (1.0, 20.0)
 """Delay from the service's end to its next start."""
 RECOVER_S = 5.0
 """Seconds within which the service recovers all its scenes after its start."""
 JOURNAL_S: Range = (0.001, 0.01)
-"""How long the service takes to write a worker's death to the journal."""
+"""Time that the service takes to record a worker's death in the journal."""
 QUICKEST_S, LONGEST_SHARE = 2.0, 0.6
 """Bounds of an update's duration, which is drawn log-uniformly.
 

@@ -16,7 +16,7 @@ AGAIN_S = 5.0
 
 
 class Failure(StrEnum):
-    """A kind of failure, in words."""
+    """Kind of failure, with its description as the value."""
 
     KILLED = "a node killed"
     STOPPED = "a node stopped and continued"

@@ -48,7 +48,7 @@ class Placed(Protocol):
 
 @dataclass(eq=False)
 class Node:
-    """A machine of the cluster.
+    """A machine in the cluster.
 
     Attributes:
         number: node number.
@@ -98,14 +98,15 @@ class Node:
 
 
 class Capacity:
-    """Measures the seconds during which a running, reachable node had room, per kind of resource needs.
+    """Measures the seconds during which a running, reachable node had room, for each kind of resource needs.
 
     Args:
         kinds: kinds of resource needs.
         now: function that returns the current time.
 
     Attributes:
-        listed: number of nodes with room per kind that Ray considers alive, including silent ones not yet lost.
+        listed: number of nodes with room per kind that Ray considers alive, including silent ones that are not yet
+            declared lost.
     """
 
     def __init__(self, kinds: Sequence[ResourceNeeds], now: Callable[[], float]) -> None:

@@ -1,14 +1,14 @@
 """Record of a simulation: acknowledged, committed and reported frames, and times of placement and recovery.
 
-A frame is **run twice** if one worker's commit was reported to the service, and later another worker's commit was
-reported, or no commit was left. A commit is reported by `FrameCommitted` or `Ready` of the scene's worker, or when a
-new service finds it. From then on, clients see it. Two processes of one scene that run at the same time, neither given
-up, are counted as well. A worker is **given up** for the folder of states once the service has started the next worker.
-Until then, its commits are taken over and kept.
+A frame is **run twice** if, after one worker's commit was reported to the service, another worker's commit is reported
+or no commit is left. A commit is reported by `FrameCommitted` or `Ready` of the scene's worker, or when a new service
+finds it. From then on, clients see it. Two processes of one scene that run at the same time are also counted, unless
+one was given up. A worker is **given up** for the folder of states once the service has started the next worker. Until
+then, its commits are taken over and kept.
 
-Frames that a worker commits after the states were linked for the next worker, but before the link moves, are updated
-again by design (docs/cluster.md, Fencing). They were not reported, so they do not count as run twice. They are counted
-separately.
+By design, some frames are updated again: those that a worker commits after the states were linked for the next worker,
+but before the link moves (docs/cluster.md, Fencing). Such frames were not reported, so they are counted separately and
+do not count as run twice.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from studies.simulation.nodes import Capacity
 
 
 class Hurried(Protocol):
-    """Protocol of the work of a running worker."""
+    """Protocol of a running worker's work."""
 
     def hurry(self) -> None:
         """Commits the next frame immediately."""
@@ -47,7 +47,7 @@ class FoundFrame:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Counts of frames at the end. All except `read` and `again` must be 0.
+    """Frame counts at the end of the run. All except `read` and `again` must be 0.
 
     Attributes:
         read: frames read through the links.
@@ -69,7 +69,7 @@ class FrameCounts:
 
 
 class FrameRecord:
-    """Record of the frames of all scenes.
+    """Record of all scenes' frames.
 
     Attributes:
         acknowledged: number of acknowledged frames on the service's disk, keyed by scene.
@@ -126,7 +126,7 @@ class FrameRecord:
     def untold(self, scene: str, count: int) -> list[int]:
         """Returns which of the first `count` frames, all of which are committed, have not been reported.
 
-        Reported frames from `count` on have disappeared, and count as run twice.
+        Reported frames with index `count` or higher have disappeared, and count as run twice.
         """
         reported = self._reported.setdefault(scene, {})
         if gone := {index for index in reported if index >= count}:
@@ -170,11 +170,11 @@ class TimeRecord:
     Attributes:
         capacity: measures the time with room.
         now: function that returns the current time.
-        placed: seconds with room until a worker got a place, and the part of them in which the head responded, keyed by
+        placed: seconds with room until a worker was placed, and the part of them in which the head responded, keyed by
             the reason for the request.
         resumed: seconds from a failure until the scene continued, and the part of them without room, keyed by failure.
         waited: seconds that processes waited for a place, if longer than `WAIT_S`.
-        unexplained: number of these processes whose scene did not receive a reason.
+        unexplained: number of these processes whose scene was not told why it had to wait.
     """
 
     capacity: Capacity

@@ -39,12 +39,12 @@ class ScenePlan:
 
 
 class SimulatedScene:
-    """Replacement for `server.updates.updates.Updates` of one service instance.
+    """Replacement for `server.updates.updates.Updates` in one service instance.
 
     Attributes:
         plan: requests for the scene.
         worker: the service's own supervision of the worker.
-        trouble: error in the scene's status.
+        trouble: error that the scene's status shows.
         ended: whether a user has ended the scene.
     """
 

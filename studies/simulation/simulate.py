@@ -38,7 +38,7 @@ RIGS = (
 FULL = 0.85
 """Share of the CPUs that the scenes use."""
 CPU_BYTES = 1.6e9
-"""Memory of a node per CPU. A scene's worker takes 1.3 GB on average."""
+"""Memory of a node per CPU, in bytes. A scene's worker uses 1.3 GB on average."""
 APART_S = 1440.0
 """Mean seconds between the failures of one node."""
 CREATED_S = 60.0
@@ -46,7 +46,7 @@ CREATED_S = 60.0
 MORE = 0.25
 """Scenes beyond the capacity, as a share of the CPUs. With these scenes, demand exceeds supply."""
 MORE_AT, LEAVE_AT = 0.5, 0.6
-"""When these scenes are requested, and when as many others end, as fractions of the duration."""
+"""Times at which the scenes beyond the capacity are requested and as many others end, as fractions of the duration."""
 PATIENCE_S = 3600.0
 """Seconds after the last failure within which all frames must be committed."""
 CALM_S = 420.0
@@ -95,7 +95,7 @@ class Outcome:
 
     Attributes:
         sizes: size of the simulation.
-        frames: counts of the frames.
+        frames: frame counts at the end of the run.
         placed: see `TimeRecord`.
         resumed: see `TimeRecord`.
         waited: see `TimeRecord`.

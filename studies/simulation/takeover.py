@@ -1,4 +1,4 @@
-"""Worst cases at the start of an epoch: workers commit between its steps, or the service ends there."""
+"""Worst cases at the start of an epoch: workers commit between its steps, or the service ends between them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from server.storage.layout import SceneFolder
 from studies.simulation.record import FrameRecord
 
 HURRIED = 0.5
-"""Probability that a worker of the scene commits between two steps. It would be far lower without intervention."""
+"""Probability that a scene's worker commits between two steps, which is far higher than without intervention."""
 
 
 class _Interrupted(Exception):
@@ -24,8 +24,8 @@ class _Interrupted(Exception):
 class Takeovers:
     """Inserts other actions whenever `begin_epoch` syncs a folder.
 
-    This happens when the states are linked but their folder has no name yet, when it has a name but the link has not
-    moved, and after the link has moved.
+    There are three such moments: the folder of linked states has no name yet, the folder has a name but the link has
+    not moved, and the link has moved.
     """
 
     def __init__(self, record: FrameRecord, random: Random) -> None:

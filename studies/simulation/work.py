@@ -59,7 +59,7 @@ class _Timer:
         self._paused = False
 
     def set(self, delay: Range | float, call: Callable[[], None]) -> None:
-        """Schedules a call after a running time in seconds, replacing the previous call."""
+        """Schedules a call after a delay in seconds, excluding pauses, and cancels the previous call."""
         self.cancel()
         self._call = call
         self._left = self._cluster.random.uniform(*delay) if isinstance(delay, tuple) else delay
@@ -92,7 +92,7 @@ class _Timer:
 class Work:
     """Work of a modelled worker process.
 
-    A worker that was given up but still runs is harder to deal with than a real one. Without any orders, it commits all
+    After being given up, a modelled worker does more damage than a real one. Without any orders, it commits all
     acknowledged frames and repeatedly rewrites its own newest frame.
 
     Args:
@@ -157,7 +157,7 @@ class Work:
         self._end.resume()
 
     def drift(self) -> None:
-        """Continues without instructions for a while, after it was given up."""
+        """Continues without orders for a while after the worker was given up."""
         if not self._adrift and not self._ended:
             self._adrift = True
             self._end.set(ADRIFT_S, self._leave)

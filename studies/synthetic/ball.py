@@ -11,7 +11,7 @@ from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 
 SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
-"""Shift in metres, and rotation in radians about the vertical axis, from the first frame to the second."""
+"""Translation in metres and rotation about the vertical axis in radians between the first two frames."""
 
 
 def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> Rig:
@@ -71,7 +71,7 @@ def moved(before: Gaussians) -> Gaussians:
 
 
 def photograph(gaussians: Gaussians, cameras: Rig) -> Frame:
-    """Renders the images and masks of all cameras on the CPU and returns them as frame 1, at 1 s.
+    """Renders the images and masks of all cameras on the CPU and returns them as frame 1 with timestamp 1 s.
 
     The Gaussians and the cameras must use the same coordinates.
     """

@@ -1,4 +1,4 @@
-"""A synthetic scene: a textured wall with a sliding middle part, for any number of Gaussians and cameras."""
+"""Synthetic scene of a textured wall whose middle part slides, with any number of Gaussians and cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scas4d_core.gaussians import Gaussians
 from studies.synthetic.ball import photograph
 
 WIDTH_M, AWAY_M, BASELINE_M = 2.0, 3.0, 1.0
-"""Width of the wall, distance from the cameras to it, and distance from the first camera to the last."""
+"""Width of the wall, distance of the cameras from the wall, and distance between the first and last camera."""
 SLIDE_M = 0.008
 RATE = 30.0
 
@@ -52,7 +52,7 @@ def wall(size: Size) -> Gaussians:
 
 
 def rig(size: Size) -> Rig:
-    """Creates a row of cameras that look at the centre of the wall. The wall fills the height of their images."""
+    """Creates a row of cameras that look at the centre of the wall, which fills the height of their images."""
     focal = size.height * AWAY_M / WIDTH_M
     lens = np.array([[focal, 0, size.width / 2], [0, focal, size.height / 2], [0, 0, 1]])
     cameras = []
@@ -73,6 +73,6 @@ def shown(state: Gaussians, index: int, cameras: Rig) -> Frame:
 
 
 def known(state: Gaussians, cameras: Rig) -> StaticResult:
-    """Returns the true frame 0 as the result of a perfect fit, in the internal coordinates of the rig."""
+    """Returns the ground truth of frame 0 as if it were a fitted result, in the rig's internal coordinates."""
     world = cameras.world_frame(1.0)
     return StaticResult(state.replace(means=world.to_inside(state.means).astype(np.float32)), {}, [])

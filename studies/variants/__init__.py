@@ -1,5 +1,5 @@
 """Studies that compare settings on variants of captures: reversed, fewer cameras, fewer pixels.
 
-A setting that was chosen on some captures performs best on these. Only captures that were not used for the choice show
-whether it is better.
+A setting that was tuned on certain captures performs best on those captures. Only captures that were not used for
+tuning show whether the setting is better in general.
 """

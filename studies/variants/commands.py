@@ -36,10 +36,10 @@ def variants(
     again: Again = False,
     page: Page = None,
 ) -> None:
-    """Compares settings on variants of captures: backwards, every second frame, half the cameras or pixels, later.
+    """Compares settings on variants of captures, such as reversed frames, or half the frames, cameras or pixels.
 
-    Reports the gain of each contender over the first on every variant, and how often it is behind. For each capture, it
-    also reports the gain of the contender that wins on all other captures.
+    Reports the gain of each contender over the first on every variant, and how often the contender is behind. For each
+    capture, it also reports the gain of the contender that wins on all other captures.
 
     Example: scripts/bench variants captures/robot captures/wheel --contender scas4d --contender adaptive --quick
     """

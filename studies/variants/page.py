@@ -1,4 +1,4 @@
-"""Page of the variants: gains of contenders, and cross-validation over captures."""
+"""Page of the variants study: gains of the contenders, and cross-validation over captures."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from client.cli.scores import Row
 
 BEHIND_DB = -0.05
-"""Gain up to which a contender counts as behind. Smaller losses are within the spread over seeds."""
+"""Gain in dB below which a contender counts as behind. Smaller losses are within the spread over seeds."""
 
 Place = tuple[str, str]
 """A capture and one of its variants."""
 Figures = dict[tuple[Place, str], list[Row]]
-"""Maps a place and a contender to the rows of all seeds."""
+"""Maps each place and contender to its rows for all seeds."""
 
 
 def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:

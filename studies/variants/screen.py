@@ -1,8 +1,8 @@
 """``scripts/bench variants``: compares contenders for the default settings on variants of captures.
 
 Every row (capture, variant, contender, seed) runs in a separate process and stays on disk, like the rows of
-``scripts/bench quality``. The contenders alternate row by row, so that they are timed within the same minutes. They
-share frame 0 if their settings for it are the same.
+``scripts/bench quality``. The contenders alternate row by row, so that they are timed within the same minutes.
+Contenders with the same settings for frame 0 share one frame 0.
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ def run(
     Args:
         captures: capture folders.
         contenders: settings to compare; the first is the baseline.
-        out: folder for rows and frames 0; a second call with the same folder continues.
+        out: folder for rows and frames 0; a second call with the same folder resumes the study.
         variants: names from ``VARIANTS``; if empty, all of them or those of the quick screening.
-        seeds: seeds of the updates; frame 0 always uses the first one.
+        seeds: seeds for the updates; frame 0 always uses the first one.
         frames: maximum number of frames per variant.
         quick: whether to run only the quick screening; see ``QUICK``.
         again: whether to repeat rows that are already on disk.

@@ -1,7 +1,7 @@
 """Variants of a capture, for example reversed or with fewer cameras.
 
 Test images, masks and ground truth are restricted to the selected frames. A point cloud belongs to the capture's first
-frame, so a variant that starts at another frame has none.
+frame, so variants that start at another frame have no point cloud.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Variant:
     """A transformation of one capture into another.
 
     Attributes:
-        made: function that creates the other capture.
+        made: function that transforms a capture.
         changes: settings of the variant, such as ``"scene.image_scale=0.5"``.
     """
 
@@ -130,4 +130,4 @@ VARIANTS: Mapping[str, Variant] = {
     "half the pixels": Variant(lambda capture: capture, ("scene.image_scale=0.5",)),
     "later": Variant(later),
 }
-"""Variants by their name in tables."""
+"""Variants, keyed by their names in tables."""

@@ -42,7 +42,7 @@ def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def centre_axis(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Returns the result of ``fit_to_size`` with square pixels and the principal point at the image centre."""
+    """Same as ``fit_to_size``, but returns a camera with square pixels and the principal point at the image centre."""
     fitted_camera = fit_to_size(camera, size)
     scale = min(fitted_camera.fx, fitted_camera.fy)
     lens = np.array([[scale, 0, size[0] / 2], [0, scale, size[1] / 2], [0, 0, 1]])
@@ -102,8 +102,8 @@ def key_pose_path(
 ) -> CameraPath:
     """Returns the path through the key poses in a file.
 
-    The camera is static before the first and after the last key. Positions follow a natural cubic spline. If every key
-    has a `look_at` point, these points also follow a spline. Otherwise, rotations are interpolated with
+    The camera is static before the first key and after the last key. Positions follow a natural cubic spline. If every
+    key has a `look_at` point, these points also follow a spline. Otherwise, rotations are interpolated with
     ``scipy.spatial.transform.RotationSpline``.
 
     Args:

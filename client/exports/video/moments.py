@@ -16,7 +16,7 @@ class Moment(NamedTuple):
 
     Attributes:
         frame: index of the nearest frame.
-        state: state of this frame, or interpolated between two frames.
+        state: state of this frame, or a state interpolated between two frames.
     """
 
     frame: int
@@ -26,7 +26,7 @@ class Moment(NamedTuple):
 def moments(
     states: Iterable[tuple[int, float, Gaussians]], wanted: Iterable[float], *, between: bool = False
 ) -> Iterator[Moment]:
-    """Yields the states at the given times, with only two input states in memory at a time.
+    """Yields the states at the given times, keeping only two input states in memory at a time.
 
     Args:
         states: (index, time in seconds, state) of each frame, in order.
@@ -54,10 +54,10 @@ def moments(
 
 
 def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
-    """Returns the state at the fraction ``share`` (0…1) of the way from ``a`` to ``b``, two states of one scene.
+    """Returns the state at the fraction ``share`` (0…1) of the way between the states ``a`` and ``b`` of one scene.
 
-    Centres and colours are interpolated linearly. Covariance factors are interpolated in the rotating frame of each
-    Gaussian, so rotating Gaussians keep their size. Gaussians that are present in only one of the states keep their
+    Centres and colours are interpolated linearly. Covariance factors are interpolated in each Gaussian's rotating
+    frame, so rotating Gaussians keep their size. Gaussians that are present in only one of the states keep their
     position and fade in or out.
 
     Args:
@@ -98,7 +98,7 @@ def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
 
 
 def _mix(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
-    """Returns the rows of two arrays interpolated linearly with the weights ``part`` [N]."""
+    """Interpolates linearly between the rows of two arrays, with the weight ``part`` [N] of each row."""
     ways = part.reshape(-1, *[1] * (a.ndim - 1))
     return np.asarray(a + ways * (b - a), np.float32)
 

@@ -22,11 +22,11 @@ WIDTH = 1 / 200
 OPAQUE = 0.5
 """Minimum opacity of a Gaussian that counts as part of a surface rather than haze."""
 CANDIDATES_PER_ROW = 0.5
-"""Fraction of the moving Gaussians, those with the largest motion, from which tracks are selected."""
+"""Tracks are selected from this fraction of the moving Gaussians, those with the largest motion."""
 
 
 def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
-    """Returns the rows of up to `count` Gaussians with large motion and trajectories that are far apart.
+    """Returns the rows of up to `count` Gaussians that move far, on trajectories that are far apart.
 
     The result is empty if no Gaussian moves.
 
@@ -80,13 +80,13 @@ class Trails:
         self._colours = [part_colour(number) for number in range(len(rows))]
 
     def add(self, state: Gaussians) -> None:
-        """Appends the positions of the Gaussians in the next state."""
+        """Appends the Gaussians' positions in the next state."""
         places = self._world.to_user(state.means[self._rows])
         places[~state.present[self._rows]] = np.nan
         self._places.append(places)
 
     def draw(self, picture: Picture, camera: Camera) -> Picture:
-        """Returns the image [H, W, 3] with the trails drawn on top of it.
+        """Returns the image [H, W, 3] with the trails drawn over it.
 
         Args:
             picture: rendered image.

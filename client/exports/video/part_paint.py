@@ -17,11 +17,11 @@ DARKEST = 0.35
 
 
 def part_colours(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
-    """Returns RGB [N, 3]: the part's colour scaled by the Gaussian's brightness, or grey if it belongs to no part.
+    """Returns RGB [N, 3]: the part's colour scaled by the Gaussian's brightness, or grey for a Gaussian without a part.
 
     Args:
         state: state of N Gaussians.
-        labels: [M] part label of each Gaussian, −1 for none. Gaussians beyond the M-th belong to no part.
+        labels: [M] part label of each Gaussian, −1 for none. Gaussians beyond the M-th have no part.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=1.0)
     >>> part_colours(state, np.array([0])).round(2)

@@ -17,7 +17,7 @@ PARALLEL = 1e-6
 Below it, the optical axes are considered parallel and have no common point.
 """
 FAR = 20.0
-"""Distance of the intersection, in radii of the rig, beyond which the optical axes are considered parallel."""
+"""Distance of the intersection, in rig radii, beyond which the optical axes are considered parallel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class RigView:
 
     Attributes:
         target: point [3] closest to all optical axes or, if they are parallel, a point in front of the cameras.
-        up: unit vector [3] opposite to the mean image-down direction of the cameras, or −y if the mean is near zero.
+        up: unit vector [3] opposite to the cameras' mean downward image direction, or −y if the mean is near zero.
         radius: median distance of the cameras from the target.
 
     >>> poses = np.stack([np.eye(4)] * 2)

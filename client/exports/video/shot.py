@@ -35,7 +35,7 @@ class VideoOptions:
         fps: video frame rate; None for the source's frame rate.
         speed: seconds of scene time per second of video.
         seconds: video duration in seconds; None for the duration of the frames.
-        size: (width, height) of the rendered image; None for the size of the camera.
+        size: (width, height) of the rendered image; None for the camera's image size.
         interpolate: whether to interpolate states between frames.
         tracks: number of tracks to draw.
         trail: track length in seconds of video.
@@ -69,7 +69,7 @@ class Shot:
         count: number of images in the video.
         size: (width, height) of the rendered image.
         path: camera path.
-        truth: function that returns the ground-truth image of a frame at this size; None if there is no comparison.
+        truth: function that returns the ground-truth image of a frame at this size; None if no capture is compared.
     """
 
     given: Source
@@ -87,10 +87,10 @@ class Shot:
         return self.size[0] * (1 if self.truth is None else 2), self.size[1]
 
     def pictures(self) -> Iterator[Picture]:
-        """Yields the images [H, W, 3] of the video, with only two states in memory at a time.
+        """Yields the images [H, W, 3] of the video, keeping only two states in memory at a time.
 
         Raises:
-            InputError: if parts or tracks are requested, but there are no parts or nothing moves.
+            InputError: if parts are requested but the source has none, or if tracks are requested but nothing moves.
         """
         from scas4d_core.engines.limits import DEFAULT, rig_limits
         from scas4d_core.query.view import ViewRenderer
@@ -185,7 +185,7 @@ def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera
     The scene's refined cameras take precedence over the capture's cameras.
 
     Raises:
-        InputError: if there are no cameras, or none with this name.
+        InputError: if there are no cameras, or no camera has this name.
     """
     cameras = {}
     if compared is not None:
@@ -235,7 +235,7 @@ def _truth(compared: Capture, camera: Camera, size: tuple[int, int], last: int) 
     """Returns a function that maps a frame index to the ground-truth image, scaled and centred to fit the size.
 
     Raises:
-        InputError: if the capture lacks the camera, or the frame `last`.
+        InputError: if the camera or the frame `last` is missing from the capture.
     """
     training = camera.name in compared.full_rig.names
     if not training and (compared.full_test_rig is None or camera.name not in compared.full_test_rig.names):

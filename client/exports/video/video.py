@@ -14,7 +14,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.errors import InputError
 
 SMALLEST, LARGEST = 16, 7680
-"""Minimum and maximum width and height of the rendered image in pixels. Encoders and memory limit the size."""
+"""Minimum and maximum width and height of the rendered image in pixels. Memory and encoders limit the size."""
 
 
 def make_video(
@@ -27,7 +27,7 @@ def make_video(
     url: str,
     token: str | None,
 ) -> Path:
-    """Renders a video and returns its path, with only two states and one image in memory at a time.
+    """Renders a video, keeping only two states and one image in memory at a time, and returns its path.
 
     Args:
         source: source of the states; see `opened`.

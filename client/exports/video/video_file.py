@@ -19,7 +19,7 @@ SUFFIXES = (".mp4", ".webp")
 QUALITY = {".mp4": {"crf": "18", "preset": "medium"}, ".webp": {"quality": "90", "lossless": "0"}}
 """Encoder options for visually lossless quality."""
 FINEST_RATE = 65535
-"""Largest denominator of a frame rate that the containers can store."""
+"""Largest frame-rate denominator that the containers can store."""
 
 
 def check_suffix(path: Path) -> str:
@@ -47,8 +47,8 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
     """Opens a video file to which images of equal size can be added.
 
     Missing folders are created, and the file appears only once it is complete. Images are encoded as they are added and
-    are not kept. An MP4 uses 8-bit 4:2:0 for compatibility, with BT.709 colours in limited range, tagged as such. A
-    WebP loops endlessly.
+    are not kept. An MP4 uses 8-bit 4:2:0 subsampling for compatibility, with limited-range BT.709 colours, and is
+    tagged accordingly. A WebP loops forever.
 
     Args:
         path: path that ends in `.mp4` or `.webp`.

@@ -1,9 +1,9 @@
 """Reads anipose's `calibration.toml` (aniposelib), and the files of Pose2Sim and FreeMoCap, which have the same fields.
 
-Each camera has a table with `name`, `size` (width, height), `matrix` [3][3], `distortions` [5] or [4], and the
-world-to-camera `rotation` [3] (Rodrigues vector) and `translation` [3]. `fisheye = true` marks coefficients of
-`cv2.fisheye`. `[metadata]` does not describe the rig. Anipose initializes the principal point to (width − 1)/2, which
-implies OpenCV's pixel coordinates.
+Each camera has a table with `name`, `size` (width, height), `matrix` [3][3] and `distortions` [5] or [4]. The table
+also contains the world-to-camera `rotation` [3] (Rodrigues vector) and `translation` [3]. `fisheye = true` marks
+coefficients of `cv2.fisheye`. `[metadata]` does not describe the rig and is ignored. Anipose initializes the principal
+point to (width − 1)/2, which implies OpenCV's pixel coordinates.
 (github.com/lambdaloop/aniposelib, `aniposelib/cameras.py`; github.com/perfanalytics/pose2sim,
 `Pose2Sim/calibration.py`.)
 """
@@ -20,7 +20,7 @@ from client.importers.formats.opencv_camera import opencv_camera, picture_size
 from scas4d_core.captures import CaptureError
 
 INTRINSICS_FOLDER = re.compile(r"int_(.+)_img")
-"""Folder name that Pose2Sim uses as a camera name. The group is the name of the camera's videos."""
+"""Pattern of the folder names that Pose2Sim uses as camera names. The group is the name of the camera's videos."""
 
 
 def is_anipose(document: Mapping[str, Any]) -> bool:

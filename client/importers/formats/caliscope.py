@@ -1,10 +1,10 @@
 """Reads caliscope's `camera_array.toml`.
 
 Each camera has a table `[cameras.<id>]` with `size` (width, height), `matrix` and `distortions` (5, or 4 if `fisheye`).
-`rotation`, a matrix [3][3] or Rodrigues vector [3], and `translation` transform the world to the camera. Cameras are
-named after their videos, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of
+`rotation`, a matrix [3][3] or Rodrigues vector [3], and `translation` transform world to camera coordinates. Cameras
+are named after their videos, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of
 `cam_id`. `rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is ignored.
-Cameras that are marked as ignored or have no pose are left out, with a remark.
+Cameras that are marked as ignored or have no pose are left out, and a remark lists them.
 (github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
 """
 

@@ -148,7 +148,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
     """Parses the fields of a line.
 
-    `kinds` has one letter per field: `i` integer, `f` float, `s` text. The last letter applies to all remaining fields.
+    `kinds` contains one letter per field: `i` for integer, `f` for float, `s` for text. The last letter applies to all
+    remaining fields.
     """
     words = line.split(maxsplit=len(kinds) - 1 if kinds.endswith("s") else -1)
     if len(words) < len(kinds):

@@ -3,7 +3,7 @@
 `names` lists the cameras. For each camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in
 some versions, `H_<name>` and `W_<name>`. If the size is missing, it is read from the images. `extri.yml` has the
 world-to-camera rotation `Rot_<name>` [3, 3], or only `R_<name>` [3] (Rodrigues vector), and translation `T_<name>` [3].
-A camera without a pose is left out, with a remark.
+Cameras without a pose are left out, and a remark lists them.
 (github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)
 """
 
@@ -22,7 +22,7 @@ from scas4d_core.captures import CaptureError
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 APART = 1e-3
-"""Maximum entrywise difference between a rotation matrix and that of its Rodrigues vector. Files have six digits."""
+"""Maximum difference per entry between the rotation matrix and the Rodrigues vector's. Files store six digits."""
 
 
 def is_easymocap(folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Reads OpenCV's FileStorage format (YAML or XML), and image sizes, which such files often omit.
+"""Reads OpenCV FileStorage files (YAML or XML), and the image sizes that such files often omit.
 
 Reading this format requires OpenCV, because no other library parses its `%YAML:1.0` header and `!!opencv-matrix` tags.
 """
@@ -46,7 +46,7 @@ def read_storage(path: Path) -> dict[str, Any]:
         if not storage.isOpened():
             raise CaptureError(f"{path} cannot be read as an OpenCV FileStorage file (YAML or XML)")
         root = storage.root()
-        return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - a FileNode is no mapping
+        return {key: _value(root.getNode(key)) for key in root.keys()}  # noqa: SIM118 - a FileNode is not a mapping
     except (OSError, SystemError, cv2.error) as fault:
         first = str(fault).strip().splitlines()[0] if str(fault).strip() else type(fault).__name__
         raise CaptureError(f"{path} cannot be read as an OpenCV FileStorage file: {first}") from fault
@@ -86,7 +86,7 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
     Args:
         folder: capture folder.
         camera: camera name.
-        where: file and camera without a size, for error messages.
+        where: name of the file and of the camera that has no size, for error messages.
 
     Raises:
         CaptureError: if there is neither an image nor a video, or the file cannot be read.

@@ -60,7 +60,7 @@ def read_calibration_file(path: Path, capture: Path) -> Calibration:
 
     Args:
         path: calibration file, or folder that contains exactly one calibration.
-        capture: capture folder, whose images provide any image sizes that the file omits.
+        capture: capture folder, whose images supply any image sizes that the file omits.
 
     Raises:
         CaptureError: if the format is unknown, the folder has several calibrations, or the file cannot be read.

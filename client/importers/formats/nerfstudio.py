@@ -3,8 +3,8 @@
 Each image has `file_path`, `transform_matrix` (camera to world, OpenGL axes: x right, y up, z back), and optionally
 `time`. The intrinsics `camera_model`, `w`, `h`, `fl_x`, `fl_y` (or `camera_angle_x`, radians), `cx`, `cy`, `k1` … are
 at the top level or in an image's entry, which takes precedence. `applied_transform` (3×4, on the world) and
-`applied_scale` are undone, so the rig is in the originally calibrated coordinates. `mask_path` and `ply_file_path` are
-not read: the former marks pixels to ignore instead of the foreground, and the latter is a point cloud.
+`applied_scale` are undone, so the rig keeps the coordinates of the original calibration. Two fields are not read:
+`mask_path`, which marks pixels to ignore rather than the foreground, and `ply_file_path`, a point cloud.
 (docs.nerf.studio, "Data conventions"; `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`.)
 """
 
@@ -88,7 +88,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
 
 
 def _default_model(given: Mapping[str, Any]) -> str:
-    """Infers the camera model from `is_fisheye` and the coefficients, because instant-ngp's files do not name it."""
+    """Infers the camera model from `is_fisheye` and the coefficients, because instant-ngp's files omit it."""
     if given.get("is_fisheye"):
         return "OPENCV_FISHEYE"
     return "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE"

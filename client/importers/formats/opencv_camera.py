@@ -2,7 +2,7 @@
 
 `matrix` is [3, 3] with the centre of the first pixel at (0, 0), so half a pixel is added to principal points here.
 `distortions` are in OpenCV's order. The world-to-camera transform consists of a rotation (matrix or Rodrigues vector)
-and a translation: `X_cam = R X_world + t` with x right, y down, z forward.
+and a translation: `X_cam = R X_world + t`. The camera's axes are x right, y down and z forward.
 (docs.opencv.org, "Camera Calibration and 3D Reconstruction".)
 """
 
@@ -20,9 +20,9 @@ from scas4d_core.captures import CaptureError
 Float = NDArray[np.float64]
 
 HALF = 0.5
-"""Offset of the first pixel's centre, which is at (0, 0) in OpenCV and at (0.5, 0.5) in this project."""
+"""Position of the first pixel's centre in this project's coordinates. In OpenCV, the centre is at (0, 0)."""
 COUNTS = (0, 4, 5, 8, 12, 14)
-"""Valid numbers of OpenCV coefficients. Coefficients beyond the eighth (thin prism, tilted sensor) must be 0."""
+"""Supported numbers of OpenCV coefficients. Coefficients beyond the eighth (thin prism, tilted sensor) must be 0."""
 SKEW = 1e-6
 """Maximum skew, relative to the focal length, that is treated as a rounding error."""
 LARGEST_SIDE = 1 << 16

@@ -2,8 +2,8 @@
 
 OpenCV defines no rig layout, so this layout uses the field names of its samples. As in the calibration sample, each
 file has `camera_matrix` [3, 3], `distortion_coefficients`, `image_width`, `image_height` and, if true, `fisheye_model`.
-As in the stereo sample, `R` ([3, 3] or a Rodrigues vector) and `T` [3] transform the world to the camera. Other common
-names are accepted too. The sample's `extrinsic_parameters` are board poses, so they are not used.
+As in the stereo sample, `R` ([3, 3] or a Rodrigues vector) and `T` [3] transform world to camera coordinates. Other
+common names are also accepted. The sample's `extrinsic_parameters` are board poses, so they are not used.
 (docs.opencv.org, "Camera calibration With OpenCV"; `samples/cpp/.../camera_calibration.cpp`.)
 """
 

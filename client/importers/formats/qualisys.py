@@ -4,14 +4,15 @@ Each camera has the attributes `active`, `serial` and `model`, and the following
 
 - `transform`: the camera's position x, y, z in millimetres, and its world-to-camera rotation r11 … r33 with OpenGL axes
   (x right, y up, z back). The position is converted to metres.
-- `intrinsic`: focalLengthU, centerPointU, … in subpixels of the sensor, 64 per pixel. The number of subpixels per
-  pixel is `sensorMaxU` divided by the width of `fov_video_max`. `radialDistortion1` … and `tangentalDistortion1`, `2`
-  are OpenCV's k1, k2, k3, p1, p2. Pose2Sim divides them by 64 as well, but on its demo rig they match a checkerboard
-  calibration only if undivided (k1 −0.046 to −0.048 here; −0.031, −0.047, −0.052, −0.053 there).
+- `intrinsic`: focalLengthU, centerPointU, … in subpixels of the sensor, normally 64 per pixel. The actual number
+  is `sensorMaxU` divided by the width of `fov_video_max`. `radialDistortion1` … and `tangentalDistortion1`, `2` are
+  OpenCV's k1, k2, k3, p1, p2. Pose2Sim also divides these coefficients by 64. On its demo rig, however, they match a
+  checkerboard calibration only without this division. There, k1 ranges from −0.046 to −0.048 in the file, and is
+  −0.031, −0.047, −0.052 and −0.053 in the checkerboard calibration.
 - `fov_video`: the recorded region of the sensor. Principal points are made relative to its corner.
 
-The centre of the first pixel is assumed to be (0, 0), as in Pose2Sim, because Qualisys does not specify it. Cameras
-that record markers but no video are left out, with a remark.
+The centre of the first pixel is assumed to be at (0, 0), as in Pose2Sim, because Qualisys does not specify it. Cameras
+that record markers instead of video are left out, and a remark lists them.
 (github.com/perfanalytics/pose2sim, `read_qca` and `calib_qca_fun` in `Pose2Sim/calibration.py`.)
 """
 
@@ -40,7 +41,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """Converts OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
 WHOLE = 0.1
-"""Tolerance when rounding the subpixels per pixel. Real files have ratios such as 69568/1087 or 122879/1919."""
+"""Tolerance for rounding the subpixels per pixel. Real files have ratios such as 69568/1087 or 122879/1919."""
 
 
 @dataclass
@@ -71,7 +72,7 @@ def _films(camera: _QualisysCamera) -> bool:
 
 
 def _cameras(path: Path) -> list[_QualisysCamera]:
-    """Returns the cameras of the file. Files with a document type declaration are rejected, because QTM writes none."""
+    """Returns the cameras of the file. Files with a DOCTYPE declaration are rejected, because QTM never writes one."""
     cameras: list[_QualisysCamera] = []
 
     def started(name: str, attributes: dict[str, str]) -> None:

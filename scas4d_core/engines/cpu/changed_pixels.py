@@ -5,9 +5,9 @@ Gaussians, both moving and static, are rendered in the same order as in the full
 therefore bit-identical to those of a full rendering. All other pixels show only static Gaussians, and are re-rendered
 only when the static Gaussians change.
 
-Candidate blocks and their static Gaussians are determined once per frame and view, around the current moving Gaussians.
-The blocks to render are determined in every iteration. The image loss is evaluated near all candidate blocks. The loss
-of the rest of the image is constant during a frame.
+Candidate blocks and their static Gaussians are determined once per frame and view, around the moving Gaussians. The
+blocks to render are determined in every iteration. The image loss is evaluated near all candidate blocks. The loss of
+the rest of the image is constant during a frame.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Region:
     """The part of one camera's image that may be rendered in a frame.
 
     Attributes:
-        blocks: [tiles] uint64 bitmask of the candidate blocks. Each rendering only includes those that moving
-            Gaussians cover.
+        blocks: [tiles] uint64 bitmask of the candidate blocks. Each rendering includes only the blocks that
+            moving Gaussians cover.
         rows: [R] int64 rows of the rendered Gaussians, in ascending order.
         learnt: [R] uint8 mask of the moving Gaussians in ``rows``.
         moving: [M] int64 indices of the moving Gaussians in ``rows``.
-        box: image rows and columns that contain the blocks and a margin of ``REACH``.
+        box: image rows and columns that contain the blocks plus a margin of ``REACH``.
         near: [h, columns] uint8 flags of the losses in the box that can change, as in ``image_loss.near``. All
             other losses are included in ``outside_losses``.
         view: view to which the following fields belong, or None if no view is loaded yet.
@@ -106,7 +106,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = np.zeros(3)
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame. If static Gaussians have changed, they will be re-rendered."""
+        """Loads the initial state of a frame. Static Gaussians are rendered again if they have changed."""
         features = previous.features(previous.colours)
         state = take_rows((previous.means, previous.factors, previous.opacities, features), self._static_rows)
         if self._static_state is None or not all(map(np.array_equal, state, self._static_state)):
@@ -145,7 +145,7 @@ class ChangedPixels(CpuRenderer):
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``. Renders only changed pixels if ``learnt`` is exactly the moving Gaussians."""
+        """See ``ResidualRenderer.residuals``. Renders only changed pixels if ``learnt`` is the moving Gaussians."""
         if not np.array_equal(learnt, self._is_moving):
             return super().residuals(state, view, learnt, most)
         count, shown = len(state), features_seen(state, view.camera)
@@ -248,7 +248,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = self._static_means[_key(view)] + shifts[:3] / pixels
 
     def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
-        """Returns two [C, h, w] buffers for a box, one for its rendering and one for the gradient."""
+        """Returns two [C, h, w] buffers for a box: one for the rendering, and one for the gradient."""
         shape = (2, channels, box[1] - box[0], box[3] - box[2])
         if self._planes.size < (size := int(np.prod(shape))):
             self._planes = np.empty(size + size // 4, np.float32)
@@ -264,7 +264,7 @@ class ChangedPixels(CpuRenderer):
         near: NDArray[np.uint8],
         gradient: Array,
     ) -> NDArray[np.float64]:
-        """Returns image loss, mask loss and squared error of part of an image, and computes the requested gradients.
+        """Returns the image loss, mask loss and squared error of part of an image, and computes requested gradients.
 
         If ``near`` does not request gradients (``image_loss.GRADIENT``), ``gradient`` may be ``planes`` itself, which
         then remains unchanged.

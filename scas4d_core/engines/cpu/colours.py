@@ -52,7 +52,7 @@ class Colours:
         self._change: Array
 
     def loss(self, curve: bool) -> float:
-        """Returns the weighted soft-colour loss, or 0 if ``curve`` is false. Must precede ``gradient`` and ``step``."""
+        """Returns the weighted soft-colour loss, or 0 if ``curve`` is false. Call before ``gradient`` and ``step``."""
         self._change = self._table - self._before
         return float(self._weight * np.abs(self._change).sum(dtype=np.float64)) if curve else 0.0
 

@@ -142,7 +142,7 @@ class CpuDeformation:
         ``freeze_layers(0)`` before changing the parameters.
 
         Raises:
-            ValueError: if this would freeze the last layer.
+            ValueError: if the last layer would be frozen.
         """
         if layers and layers >= len(self.clusters):
             raise ValueError(

@@ -138,7 +138,7 @@ class CpuEngine:
         lap(REPORT)
 
     def _pictures(self, views: Sequence[int], step: StepScalars) -> tuple[float, Gradients]:
-        """Returns the sum of image and mask loss, averaged over views, and its gradients.
+        """Returns the sum of the image and mask losses, averaged over views, and its gradients.
 
         If there is a single view, the gradients are renderer buffers.
         """
@@ -160,7 +160,7 @@ class CpuEngine:
         return loss / len(views), total
 
     def _picture(self, index: int, step: StepScalars) -> tuple[float, Gradients]:
-        """Renders a view, logs the result, and returns the sum of image and mask loss with its gradients."""
+        """Renders a view, logs the result, and returns the sum of the image and mask losses with its gradients."""
         view, deformation, renderer, lap = self._views[index], self._deformation, self.renderer, self._start.lap
         if self._gloss is not None:
             self._gloss.shade(deformation.means, deformation.turns, self._colours, view.camera, self._features)

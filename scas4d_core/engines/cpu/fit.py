@@ -109,9 +109,9 @@ class CpuFitEngine:
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 
     def _backward(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
-        """Returns the gradients of all rendered arrays, followed by the gradients of the features alone.
+        """Returns the gradients of all rendered arrays, followed by the gradients of the features.
 
-        The former are None if only colours are learned.
+        If only colours are learned, the first item is None.
         """
         if rates[: COLOUR.start].any() or rates[COLOUR.stop :].any():
             gradients = self.renderer.forward_backward(*drawn, view)

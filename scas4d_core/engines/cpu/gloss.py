@@ -26,7 +26,7 @@ and 3e-3 for normals reduced the PSNR of test views by 0.6 dB."""
 UPDATE_RATE_GLOSS, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS = 2e-3, 1e-2, 1e-3
 """Initial Adam learning rates of an update. They decay to a tenth of these values during the update."""
 NEARNESS = 0.3
-"""Initial nearness (inverse distance) of the environment in 1/m, typical of lamps in a room."""
+"""Initial nearness (inverse distance) of the environment in 1/m, typical of lights in a room."""
 NEIGHBOURS = 16
 """Number of neighbours over which changes of normals and strengths are averaged, because surfaces curve gradually."""
 SAME_SIDE = 0.5
@@ -46,7 +46,7 @@ def features_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | Non
 
 
 def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """Returns the colours [N, 3] of a state as seen by a camera. Without gloss, these are ``gaussians.colours`` itself.
+    """Returns the colours [N, 3] of a state as seen by a camera. Without gloss, returns ``gaussians.colours`` itself.
 
     Args:
         gaussians: state to shade.
@@ -70,8 +70,8 @@ def gloss_rate(rate: float, gloss: Array) -> float:
     """Returns the gloss learning rate at which normals rotate as fast as at strength ``GLOSS`` with the given rate.
 
     Adam's step length does not depend on the strength. At a fifth of the strength, normals would therefore rotate five
-    times as fast. This reduced the PSNR in frame 0 of the `gloss` scene by 0.6 dB. The rate is scaled by the mean
-    strength, weighted by the strengths themselves, because Gaussians without gloss have no normal.
+    times as fast. In a test on the `gloss` scene, this reduced the PSNR of frame 0 by 0.6 dB. The rate is scaled by the
+    mean strength, weighted by the strengths themselves, because Gaussians without gloss have no normal.
 
     Args:
         rate: learning rate at strength ``GLOSS``.
@@ -95,10 +95,10 @@ class GlossShading:
 
     Attributes:
         gloss, environment, rates: same as the arguments.
-        moments: Adam moments of gloss and environment, [2, …] each.
+        moments: Adam moments of the gloss and environment, [2, …] each.
         steps: number of Adam steps so far.
         changed_from: [M, 3] reference gloss. ``smooth`` averages the changes since this reference.
-        gradients: gradients of gloss and environment, accumulated since the last step.
+        gradients: gradients of the gloss and environment, accumulated since the last step.
     """
 
     def __init__(self, gloss: Array, environment: Array, rates: tuple[float, float, float]) -> None:
@@ -154,7 +154,7 @@ class GlossShading:
     def step(self, factor: float = 1.0) -> None:
         """Takes an Adam step with the mean gradient since the last step.
 
-        Afterwards, shifts the environment to a mean of zero over the sphere, and clamps its nearness to at least 0.
+        Afterwards, the environment is shifted to zero mean over the sphere, and its nearness is clamped to at least 0.
         """
         from scas4d_core.kernels.adam import EVERY_ROW, adam
 
@@ -265,7 +265,7 @@ class LearntGloss:
 
     @property
     def gradients(self) -> tuple[Array, Array]:
-        """Gradients of gloss and environment in the last step."""
+        """Gradients of the gloss and environment in the last step."""
         return self._shading.gradients
 
     def step(self, factor: float, smooth: bool) -> None:

@@ -29,7 +29,7 @@ Array = NDArray[np.float32]
 
 
 class Drawing(NamedTuple):
-    """Selection of the blocks of an image to render. All other blocks are neither read nor written.
+    """Selection of the image blocks to render. All other blocks are neither read nor written.
 
     Attributes:
         blocks: [tiles] uint64 bitmask of the selected blocks in each tile. See ``tiles.cover`` for the bit order.
@@ -72,7 +72,7 @@ class CpuRasterizer:
     Attributes:
         guards: number of times each guard was triggered since the last ``reset``.
         limits: [6] float32 rasterizer constants, in the order of the ``Limits`` fields.
-        outside_region: whether a learned Gaussian covered a block that the last forward pass did not render.
+        outside_region: whether a ``learnt`` Gaussian covered a block that the last forward pass did not render.
         drawn: [tiles] uint64 bitmask of the blocks that the last forward pass rendered.
 
     >>> from scas4d_core.cameras import Camera
@@ -104,7 +104,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """Returns a contiguous scratch array. Allocates 25 % more than required to avoid reallocation as sizes vary."""
+        """Returns a contiguous scratch array. Its memory has a reserve of 25 % to avoid reallocations as sizes vary."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view
@@ -195,7 +195,7 @@ class CpuRasterizer:
         )  # fmt: skip
         tasks = threads()
         begins, ends = self._buffer("begins", (2, tasks), np.int64)
-        # One extra element, because pairs that do not intersect are written too, before being overwritten.
+        # One extra element, because pairs that do not intersect are also written, and then overwritten.
         most = tiles.share_pairs(order, visible, counts, begins) + 1
         firsts = self._buffer("firsts", (count,), np.int64)
         pairs = self._buffer("pairs", (most, 2), np.int32)
@@ -237,8 +237,8 @@ class CpuRasterizer:
     def gradient_buffers(self) -> tuple[Array, Array]:
         """Returns the buffers for dL/dimage [C, rows, stride] and dL/dalpha [rows, stride] that ``backward`` reads.
 
-        Like the forward buffers, they are padded to whole tiles. They are set to zero whenever the image size changes.
-        The padding must remain zero.
+        Like the forward buffers, these buffers are padded to whole tiles, and the padding must remain zero. They are
+        set to zero whenever the image size changes.
         """
         camera, image, transmittance = self._last.camera, self._last.image, self._last.transmittance
         g_image = self._buffer("g_image", image.shape)
@@ -290,7 +290,7 @@ class CpuRasterizer:
         return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
-        """Returns the feature gradients [N, 4] without computing any others. The image must have four channels."""
+        """Returns the feature gradients [N, 4] without computing other gradients. The image must have four channels."""
         last, count = self._last, len(self._last.features)
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
         feature_gradients.blend_features(

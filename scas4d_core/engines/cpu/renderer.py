@@ -21,7 +21,7 @@ Array = NDArray[np.float32]
 Moments = tuple[Array, Array]
 
 _moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
-"""SSIM moments of each view (windowed means of the target and of its square). All renderers share them."""
+"""SSIM moments of each view (windowed means of the target and of its square), shared by all renderers."""
 
 
 def no_lap(stage: str) -> None:
@@ -136,7 +136,7 @@ class CpuRenderer:
     # Losses of iterations, for arrays that are updated in place.
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads the initial state of a frame. This class ignores it, but subclasses may use it."""
+        """Loads the initial state of a frame. This class ignores the state, but subclasses may use it."""
 
     def forward_backward(
         self,
@@ -206,7 +206,7 @@ class CpuRenderer:
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
 
     def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
-        """Returns the sums of ``Renderer.residuals`` for the last rendering."""
+        """Returns the sums of ``ResidualRenderer.residuals`` for the last rendering."""
         height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
@@ -235,7 +235,7 @@ class CpuRenderer:
 
 
 def forget_moments(view: TrainingView) -> None:
-    """Drops a view's cached moments. Call it once the renderer has copied the part that it needs."""
+    """Drops a view's cached moments. Call this function after the renderer has copied the part that it needs."""
     _moments.pop(view, None)
 
 

@@ -217,7 +217,7 @@ def cluster_map(
 
     Let d = x − p, z = c·d + s, f = 2σ(2z) and f' = f(2−f). The centred map is x' = p + t + f·R d, and the published map
     is x' = (R d + p + t)·f. The Jacobian is J = R (f·I + f'·y·cᵀ), with y = d for the centred map and
-    y = Rᵀ(R d + p + t) for the published one. The published map scales about the world origin and is therefore not
+    y = Rᵀ(R d + p + t) for the published map. The published map scales about the world origin and is therefore not
     translation-equivariant. The maps agree for c = s = 0. If all parameters are 0, points are preserved bit for bit.
 
     Args:

@@ -112,7 +112,7 @@ class TorchEngine:
         self._log.losses.append(float(loss.detach()))
 
     def _picture(self, index: int, moved: Moved, colours: Tensor, step: StepScalars) -> Tensor:
-        """Renders a view, logs the result, and returns the sum of image and mask loss."""
+        """Renders a view, logs the result, and returns the sum of the image and mask losses."""
         view, plan, learnt = self._views[index], self._plan, self._parameters.gloss
         gloss, environment = (None, None) if learnt is None else (learnt.gloss, learnt.environment)
         features = self._scene.seen(moved, colours, gloss, environment, view.camera)
@@ -143,7 +143,7 @@ class TorchEngine:
         return picture.features, picture.alpha
 
     def _terms(self, moved: Moved, colours: Tensor, step: StepScalars) -> Tensor:
-        """Returns the weighted sum of all loss terms other than image and mask loss."""
+        """Returns the weighted sum of all loss terms except the image and mask losses."""
         plan, scene = self._plan, self._scene
         sound = scene.rows[scene.sound]
         share = len(sound) / max(len(scene.rows), 1)  # losses are averaged over all moving Gaussians
@@ -190,7 +190,7 @@ class TorchEngine:
             learnt.gloss.copy_(before + (weights[..., None] * (learnt.gloss - before)[index]).sum(dim=1))
 
     def _neighbours_on_surface(self, gloss: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the frame-0 neighbours [M, k] and their weights, equal on the same surface and 0 elsewhere."""
+        """Returns the frame-0 neighbours [M, k] and weights, which are equal on the same surface and 0 elsewhere."""
         if self._smoothing is None:
             count = len(gloss)
             roots = self._structure.roots[:count]

@@ -86,7 +86,7 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
 
 def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns the rows [m] with their neighbours [m, k] and weights [m, k]. If ``rows`` is None, uses all rows."""
+    """Returns the rows [m] with their neighbours [m, k] and weights [m, k]. If ``rows`` is None, all rows are used."""
     if rows is None:
         return torch.arange(len(neighbours), device=neighbours.device), neighbours, weights
     return rows, neighbours[rows], weights[rows]

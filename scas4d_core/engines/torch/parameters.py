@@ -15,7 +15,7 @@ from scas4d_core.engines.torch.deformation import ClusterParams, Deltas
 from scas4d_core.guards import ADAM_EPSILON
 
 GLOSS_BETAS = (0.9, 0.999)
-"""Adam decay rates of gloss and environment, which are the same in every update."""
+"""Adam decay rates of the gloss and environment, which are the same in every update."""
 
 
 def leaf(values: object) -> Tensor:

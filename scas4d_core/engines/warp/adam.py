@@ -24,7 +24,7 @@ COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
 SCALARS = 3
 """Number of scalars per step: learning rate factor, 1 − β₁^steps and 1 − β₂^steps."""
 IDLE = 0.0, 1.0, 1.0
-"""Scalars with which an optimizer takes no step."""
+"""Scalars that make an optimizer skip a step."""
 
 
 @wp.struct
@@ -130,7 +130,7 @@ class Optimizer:
         return factor, 1 - self.adam.beta1**self.steps, 1 - self.adam.beta2**self.steps
 
     def load(self, first: NDArray[np.float32], second: NDArray[np.float32], steps: int) -> None:
-        """Loads the moments and step count from which to continue."""
+        """Loads moments and a step count, from which the optimizer continues."""
         self.adam.first.assign(first)
         self.adam.second.assign(second)
         self.steps = steps

@@ -5,8 +5,8 @@ blends the entries whose support intersects its block. On the CPU device, a warp
 
 A few tiles account for most of the work, so lists are split into segments that are blended in parallel.
 ``blend_segments`` blends each segment as if it were the first, and ``join_segments`` combines the segments. If a pixel
-is finished within a segment, that segment is blended again for this pixel, up to the entry that finishes it. The state
-at the start of each segment is kept for the backward pass.
+is finished within a segment, the segment is blended again for this pixel, up to the finishing entry. The state at the
+start of each segment is kept for the backward pass.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ def draw_entries(
         spot: pixel of the lane.
         open: 1 if the lane's pixel must be rendered, otherwise 0.
         passed: transmittance before the first entry.
-        exact: selects the transmittance returned for a pixel that is finished here: a value below the stop (0), or the
-            value before the entry that finishes the pixel (1).
+        exact: determines the transmittance returned for a pixel that these entries finish. If 0, the value is below the
+            stop. If 1, it is the value before the entry that finishes the pixel.
     """
     light = Light()
     light.passed = passed
@@ -379,7 +379,7 @@ def blend_backward(
         passed = wp.float32(1.0)
         behind = wp.float32(0.0)  # contribution of later entries and background
         g = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        label = wp.float32(0.0)  # part of g[3] that affects the blending weights; a second vector would spill
+        label = wp.float32(0.0)  # part of g[3] that affects the blending weights; a second vector would spill registers
         if spot.inside == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
             if number < begun[spot.y, spot.x]:
                 g = wp.vec4(

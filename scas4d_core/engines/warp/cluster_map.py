@@ -62,7 +62,7 @@ def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterPa
 def pivot_of(
     start: wp.int32, end: wp.int32, sound: wp.array[wp.int32], points: wp.array[wp.vec3]
 ) -> wp.vec3:  # fmt: skip
-    """Returns the mean of a cluster's points with finite values, in all lanes."""
+    """Returns the mean of a cluster's points with finite values. All lanes receive the result."""
     total = wp.vec3(0.0, 0.0, 0.0)
     count = wp.float32(0.0)
     for entry in range(start + lane(), end, lane_count()):

@@ -18,10 +18,10 @@ MOST = 32
 
 
 class DeviceCopies:
-    """The most recently used device copies of host arrays, so that an array is uploaded only once.
+    """Cache of the most recently used device copies of host arrays, which avoids repeated uploads.
 
-    A host array becomes read-only when a copy of it is stored, because the copy would not follow changes. Writable
-    views of parts of other arrays are uploaded on each call. Callers must not modify the copies.
+    A host array becomes read-only when a copy of it is stored, because the copy would not reflect later changes.
+    Writable views of parts of other arrays are uploaded on each call. Callers must not modify the copies.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -65,7 +65,7 @@ class DeviceCopies:
             source.flags.writeable = False
             if isinstance(source.base, np.ndarray):
                 source.base.flags.writeable = False
-        self._copies[self._key(copy.dtype, sources)] = sources, copy  # the reference keeps the identity unique
+        self._copies[self._key(copy.dtype, sources)] = sources, copy  # the reference keeps the ids unique
         while len(self._copies) > MOST:
             self._copies.popitem(last=False)
 
@@ -75,7 +75,7 @@ class DeviceCopies:
 
 
 def _can_freeze(array: NDArray[Any]) -> bool:
-    """Returns whether an array is read-only or can become so, because no larger array shares its memory."""
+    """Returns whether an array is read-only, or can be made read-only because no larger array shares its memory."""
     base = array.base
     if base is None or not array.flags.writeable:
         return True
@@ -84,12 +84,12 @@ def _can_freeze(array: NDArray[Any]) -> bool:
 
 @cache
 def copies_on(device: str) -> DeviceCopies:
-    """Returns the copies on a device, which all engines and renderers of this process share."""
+    """Returns the cache of copies on a device, which all engines and renderers of this process share."""
     return DeviceCopies(device)
 
 
 def features_on(copies: DeviceCopies, state: Gaussians) -> wp.array:
-    """Returns the features of a state's colours and labels, [N] vec4 without gloss."""
+    """Returns a state's features, [N] vec4: the colours without gloss, and the labels."""
     return copies.derived(lambda: state.features(state.colours), wp.vec4, state.colours, state.foreground)
 
 

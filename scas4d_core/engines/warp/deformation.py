@@ -26,12 +26,12 @@ class WarpDeformation:
         device: Warp device, such as "cpu" or "cuda:0".
         plan: plan of the scene's updates.
         structure: clusters and neighbour graph of the moving Gaussians.
-        records: values that change between iterations. The optimizers of the layers and of the deltas come first.
+        records: values that change between iterations. Its first optimizers are those of the layers and the deltas.
 
     Attributes:
         clusters: [K, 10] parameters of each layer, with columns r, t, c, s of equation (6).
         deltas: [M, 9] per-Gaussian deltas, with columns Δp, Δr, Δs.
-        gradients: gradients of the last iteration, first those of ``clusters``, then those of ``deltas``.
+        gradients: gradients of ``clusters``, followed by those of ``deltas``, from the last iteration.
         optimizers: optimizers for the layers, followed by the optimizer for the deltas.
         means: [N] vec3 means of all Gaussians.
         factors: [N] mat33 covariance factors of all Gaussians.

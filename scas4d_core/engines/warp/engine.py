@@ -1,8 +1,8 @@
 """GPU engine for updates in Warp, which runs each iteration in the order given by algorithm 1.
 
 The kernel launches of an iteration are captured in a CUDA graph. Kernels read all values that change between iterations
-from device memory (``StepRecords``), so the host only enqueues graphs. It downloads losses and results when the update
-loop requests them. If a tile list turns out to be too small, the lists are enlarged and the attempt is repeated.
+from device memory (``StepRecords``), so the host only enqueues graphs. Losses and results are downloaded when the
+update loop requests them. If a tile list turns out to be too small, the lists are enlarged and the attempt is repeated.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class WarpEngine:
 
     @property
     def _learnt_gloss(self) -> WarpGloss | None:
-        """Gloss if the plan learns it. Otherwise None, and iterations render without gloss."""
+        """Gloss to learn, or None if the plan does not learn gloss and iterations render without it."""
         return self._gloss if self._plan.gloss else None
 
     def set_tables(self, tables: Tables) -> None:

@@ -131,7 +131,7 @@ class WarpFitEngine:
         self._load_gloss(table.gloss, most)
 
     def _load_gloss(self, shading: GlossShading | None, most: int) -> None:
-        """Loads gloss and environment with their moments. ``most`` is the largest number of rendered Gaussians."""
+        """Loads the gloss and environment with their moments. ``most`` is the largest number of rendered Gaussians."""
         self._gloss: GlossTables | None = None
         if shading is not None:
             self._seen = wp.zeros(most, dtype=wp.vec4, device=self._device)

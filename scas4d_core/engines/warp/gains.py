@@ -187,7 +187,9 @@ def record_gain(
     gains: wp.array2d[wp.float32],
     exposures: wp.array2d[wp.vec2],
 ) -> None:
-    """Records a measured gain. The second measurement of a camera starts a new round. Launched with one thread.
+    """Records a measured gain. The second measurement of a camera starts a new round.
+
+    The kernel is launched with one thread.
 
     Args:
         view: [1] index of the view, or −1 to end the round.

@@ -71,7 +71,7 @@ def take_moving(
         sound: [M] output, 1 for entries with finite values, otherwise 0.
         points: [M] output, means of the moving Gaussians.
         turns: [M] output, identity quaternions.
-        unsound: [1] count to which the number of entries with non-finite values is added.
+        unsound: [1] number of entries with non-finite values, accumulated.
     """
     entry = wp.tid()
     mean = previous_means[rows[entry]]
@@ -104,7 +104,7 @@ def apply_deltas(
     Args:
         terms: constants, of which only ``separate`` is used.
         rows: [M] rows of the moving Gaussians in Θ_t.
-        sound: [M] 1 for Gaussians with finite values, otherwise 0. The latter remain unchanged.
+        sound: [M] 1 for Gaussians with finite values, otherwise 0. All other Gaussians remain unchanged.
         points, jacobians, turned: [M] points, Jacobians and rotations after the cascade.
         previous_factors: [N] covariance factors of Θ_{t−1}.
         deltas: [M, 9] per-Gaussian deltas.
@@ -153,7 +153,7 @@ def apply_deltas_backward(
 ) -> None:
     """Backpropagates through ``apply_deltas``, and takes an Adam step for the deltas.
 
-    Also adds the scale and floor losses and their gradients.
+    The kernel also adds the scale and floor losses and their gradients.
 
     Args:
         terms, rows, sound, jacobians, turned, previous_factors, deltas: see ``apply_deltas``.

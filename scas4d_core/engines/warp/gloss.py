@@ -39,7 +39,7 @@ FALL, DARK, OVER, DULL = (
 )
 SAME_SIDE_COSINE = wp.constant(wp.float32(SAME_SIDE))
 BETAS = 0.9, 0.999
-"""Adam decay rates of gloss and environment."""
+"""Adam decay rates of the gloss and environment."""
 STEP = wp.constant(wp.float32((direction.SIDE - 1) / 2))
 
 
@@ -289,7 +289,7 @@ def weigh_neighbours(
     Args:
         gloss: [G, 3] normal of each Gaussian, scaled by its gloss strength.
         neighbours: [G, k] neighbours of each Gaussian, starting with the Gaussian itself.
-        weights: [G, k] output, weights that sum to 1 in each row. They are 0 for all other neighbours.
+        weights: [G, k] output, equal weights that sum to 1 in each row, or 0 for neighbours on another side or surface.
     """
     i = wp.tid()
     normal = wp.normalize(wp.vec3(gloss[i, 0], gloss[i, 1], gloss[i, 2]))
@@ -355,7 +355,7 @@ class GlossTables:
         count: number of Gaussians, N.
         glossy: number of glossy Gaussians, which precede all others.
         rows: [M] rows of the Gaussians that rotate.
-        scalars: two [3] device arrays with the scalars of the optimizers for gloss and environment.
+        scalars: two [3] device arrays with the scalars of the optimizers for the gloss and environment.
 
     Attributes:
         glossy: same as the argument.
@@ -363,7 +363,7 @@ class GlossTables:
         g_seen: [N] vec4 gradients of ``seen``.
         tables: gloss [glossy, 3] and environment [ROWS, 3].
         gradients: gradients of ``tables`` in the last iteration.
-        optimizers: optimizers for gloss and environment.
+        optimizers: optimizers for the gloss and environment.
     """
 
     def __init__(self, count: int, glossy: int, rows: NDArray[np.int64], scalars: tuple[wp.array, wp.array]) -> None:
@@ -403,7 +403,7 @@ class GlossTables:
         wp.launch(shade, self._count, inputs, device=self._device)
 
     def _rotations(self, turns: wp.array | None) -> list[object]:
-        """Returns the kernel arguments for rotations. If ``turns`` is None, its placeholder is not read."""
+        """Returns the kernel arguments for rotations. If ``turns`` is None, kernels do not read the array."""
         return [self._entries, self.seen if turns is None else turns, int(turns is not None)]
 
     def shade_backward(

@@ -27,7 +27,7 @@ class Graphs:
         self._graphs: dict[Hashable, wp.Graph | None] = {}
 
     def forget(self) -> None:
-        """Discards all graphs. Must be called after a buffer is reallocated."""
+        """Discards all graphs. Call this method after a buffer is reallocated."""
         self._graphs = {}
 
     def run(self, variant: Hashable, launch: Callable[[], None]) -> None:

@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 TILE = 16
 """Side length of a tile in pixels."""
 PIXELS = TILE * TILE
-"""Number of pixels per tile, and of threads in a block that renders a tile."""
+"""Number of pixels per tile, which is also the number of threads in a block that renders a tile."""
 SEGMENT = 128
 """Number of list entries per segment. Segments are blended in parallel. Values of 64 and 256 are 5 to 15 % slower."""
 
@@ -27,8 +27,8 @@ COLUMNS = 8
 IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
 """Columns of the log: weighted image and mask loss, sum of squared RGB differences, colour shift, and tile-list size.
 The colour shift (three columns, RGB in 0…1) is the mean of the training image minus the mean of the rendering, with
-exposure applied. The size is the number of tile-list entries or, if this exceeds the capacity, the capacity required
-with room to spare."""
+exposure applied. The size is the number of tile-list entries or, if this exceeds the capacity, the required capacity
+plus a margin."""
 
 
 @wp.struct

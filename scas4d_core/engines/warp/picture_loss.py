@@ -2,7 +2,7 @@
 
 SSIM follows 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding. Each thread computes four pixels of
 a column. It filters the 14 rows of their windows horizontally, and accumulates each row for all four pixels. Filtered
-rows are recomputed instead of stored. Arithmetic is cheap, because a single image occupies only a tenth of a GPU.
+rows are recomputed rather than stored. Arithmetic is cheap, because a single image occupies only a tenth of a GPU.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ return 1;
 #endif
 """)
 def leads() -> wp.int32:
-    """Returns 1 in a thread with the result of ``sum_over_block`` (on the CPU device, every thread), otherwise 0."""
+    """Returns 1 in a thread that receives the result of ``sum_over_block`` (every thread on the CPU), otherwise 0."""
     ...
 
 
@@ -260,10 +260,10 @@ def picture_loss(
 ) -> None:
     """Accumulates a view's loss, and stores its derivatives with respect to the windowed quantities of SSIM.
 
-    Windows in which both rendering and target are zero have no loss. Unless ``everywhere`` is 1, their derivatives are
-    neither written nor read.
+    Windows in which both the rendering and the target are zero have zero loss. Unless ``everywhere`` is 1, their
+    derivatives are neither written nor read.
 
-    The launch dimensions are [4, bands of ``ROWS`` rows, columns]. Each block covers one channel.
+    The launch dimensions are [4, bands of ``ROWS`` rows, columns], and each block covers one channel.
 
     Args:
         cameras: [views] cameras of all views.
@@ -360,13 +360,15 @@ def picture_gradient(
     by_window: wp.array3d[wp.vec3],
     g_planes: wp.array3d[wp.float32],
 ) -> None:
-    """Computes the gradient of a view's loss with respect to the planes. Launched like ``picture_loss``.
+    """Computes the gradient of a view's loss with respect to the planes.
+
+    The launch dimensions are those of ``picture_loss``.
 
     Unless ``everywhere`` is 1, tiles with empty lists are not written, because no Gaussian has a gradient there.
 
     Args:
         cameras, channels, view, window, taps, exposures, planes, targets, tiles_x, starts: see ``picture_loss``.
-        weights: weight of each channel's mean loss, scaled by the factor on the gradient.
+        weights: weight of each channel's mean loss, multiplied by the scale factor of the gradient.
         everywhere: 1 to write all pixels, otherwise 0.
         by_window: output of ``picture_loss``.
         g_planes: [4, rows, columns] output, gradient of the planes. It is 0 in channels that the target does not have.
@@ -439,7 +441,7 @@ def exposure_gradient(
 
 
 _instances: WeakSet[PictureLoss] = WeakSet()
-"""All instances, which share the images of a frame."""
+"""All instances of ``PictureLoss``, which share the images of a frame."""
 
 
 class PictureLoss:

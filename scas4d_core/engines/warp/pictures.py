@@ -51,8 +51,8 @@ def keep_picture(
 class PicturePass:
     """Renders the views of an iteration one after another, and computes and backpropagates their losses.
 
-    ``launch``, ``measure`` and ``keep`` can be captured in a CUDA graph once each has run, because the first run
-    compiles the kernels. A graph remains valid until ``generation`` changes.
+    ``launch``, ``measure`` and ``keep`` can be captured in a CUDA graph after their first run, which compiles the
+    kernels. A graph remains valid until ``generation`` changes.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".

@@ -23,7 +23,7 @@ COUNTED_GUARDS = ("not_finite", "footprint_ceiling", "gradient_not_finite")
 """Names of the counted guards: ``project`` counts the first two, ``project_backward`` the last."""
 RECORD = 4
 """Number of rows per splat in ``records`` [4 N]. The first ten values are sums over pixels: dL/dpower times 1, x, y,
-xx, xy and yy, where (x, y) is the offset from the mean, and dL/dfeatures. The rest is padding to 64 bytes."""
+xx, xy and yy, followed by dL/dfeatures. Here, (x, y) is the offset from the mean. The rest is padding to 64 bytes."""
 
 
 @wp.func
@@ -37,7 +37,7 @@ def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.floa
 
 @wp.func
 def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
-    """Returns the sum of the absolute values of a Gaussian's parameters. It is not finite if any parameter is not."""
+    """Returns the sum of the absolute values of a Gaussian's parameters. The sum is non-finite if any parameter is."""
     size = wp.abs(mean[0]) + wp.abs(mean[1]) + wp.abs(mean[2]) + wp.abs(opacity)
     for row in range(3):
         size += wp.abs(factor[row, 0]) + wp.abs(factor[row, 1]) + wp.abs(factor[row, 2])
@@ -130,7 +130,9 @@ def project(
     starts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Projects N Gaussians with one thread each, and counts the entries of each tile list. Launched in whole warps.
+    """Projects N Gaussians with one thread each, and counts the entries of each tile list.
+
+    The kernel is launched in whole warps.
 
     Args:
         raster: rasterizer constants.
@@ -226,7 +228,7 @@ def project_backward(
         g_axis0 = camera.fx * inverse * gm0
         g_axis1 = camera.fy * inverse * gm1
         g_axis2 = -(u * g_axis0 + v * g_axis1)
-        # Clamped tangents are treated as constants, but the projected mean always gets a gradient.
+        # Clamped tangents are treated as constants, but the projected mean always receives a gradient.
         g_place0 = camera.fx * inverse * gx - at_u[1] * inverse * wp.dot(g_axis0, axes[2])
         g_place1 = camera.fy * inverse * gy - at_v[1] * inverse * wp.dot(g_axis1, axes[2])
         g_place2 = -inverse * (wp.dot(gm0, m0) + wp.dot(gm1, m1) + place[0] * g_place0 + place[1] * g_place1)

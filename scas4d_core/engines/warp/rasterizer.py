@@ -19,7 +19,7 @@ LEAST_CAPACITY = 1 << 16
 TILES_EACH = 8
 """Initial tile-list capacity per Gaussian. On average, a Gaussian intersects two to four tiles."""
 WARPS_EACH = 24
-"""Number of warps per multiprocessor that blend segments. There are not enough registers for more."""
+"""Number of warps per multiprocessor that blend segments. More warps would need too many registers."""
 
 
 class Rasterizer:

@@ -108,10 +108,10 @@ def take_colour_step(
     features: wp.array[wp.vec4],
     stepped: wp.array[wp.vec4],
 ) -> None:
-    """Adds the weighted mean residual to the colours of the chosen Gaussians, with one thread per Gaussian.
+    """Adds the weighted mean residual to the colours of selected Gaussians, with one thread per Gaussian.
 
     Args:
-        learnt: [N] mask of the chosen Gaussians.
+        learnt: [N] mask of the selected Gaussians.
         sums: [N] weighted sums of the RGB residuals, and sum of the weights.
         prior: number added to the sum of the weights.
         features: [N] colours and labels.
@@ -133,7 +133,7 @@ def extrapolate_numbers(
     after: wp.array2d[wp.float32],
     moved: wp.array2d[wp.float32],
 ) -> None:
-    """Adds a share of the change between two [N, C] arrays, with one thread per number."""
+    """Adds a fraction of the change between two [N, C] arrays, with one thread per number."""
     i, k = wp.tid()
     moved[i, k] = after[i, k] + share * (after[i, k] - before[i, k])
 
@@ -270,7 +270,7 @@ class WarpRenderer:
     ) -> tuple[list[wp.array], NDArray[np.bool_] | None]:
         """Returns the features in groups of four channels, [N] vec4 each, and a [N] mask of valid features.
 
-        The mask is None if there is only one group, whose invalid features are culled by projection.
+        The mask is None if there is only one group, because the projection then culls Gaussians with invalid features.
         """
         if features is None:
             return [features_seen(self._copies, state, cameras)], None
@@ -295,7 +295,7 @@ class WarpRenderer:
             self._rasterizer = Rasterizer(device, count, self.limits)
             self._rasterizer.resize(camera.width, camera.height)
         opacities, features = copies.of(state.opacities, wp.float32), groups[0]
-        if sound is not None and not sound.all():  # projection can check one group only
+        if sound is not None and not sound.all():  # projection can only check one group
             opacities = wp.array(np.where(sound, state.opacities, np.float32(0)), dtype=wp.float32, device=device)
         shapes = copies.of(state.means, wp.vec3), copies.of(state.factors, wp.mat33), opacities
         given = (cameras, self._first, *shapes, features, self._first, self._log)
@@ -309,7 +309,7 @@ class WarpRenderer:
         self._rasterizer.draw(cameras, self._first, features, self._behind)
 
     def _render_view(self, state: Gaussians, view: TrainingView) -> wp.array:
-        """Renders a state from the camera of a view, loads the view, and returns the features that it sees."""
+        """Renders a state from a view's camera, loads the view, and returns the features that the camera sees."""
         cameras = self._camera(view.camera)
         features = features_seen(self._copies, state, cameras)
         self._project(state, view.camera, cameras, [features])

@@ -93,7 +93,9 @@ def place_lists(
     record: wp.array[wp.int32],
     log: wp.array2d[wp.float32],
 ) -> None:
-    """Computes the first entry and the first segment of each list. Launched as one block.
+    """Computes the first entry and the first segment of each list.
+
+    The kernel is launched as a single block.
 
     Args:
         threads: number of threads in the block, 1 on the CPU device.
@@ -122,7 +124,9 @@ def fill_lists(
     tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Writes the list entries in arbitrary order, with one thread per Gaussian. Launched in whole warps.
+    """Writes the list entries in arbitrary order, with one thread per Gaussian.
+
+    The kernel is launched in whole warps.
 
     Args:
         raster: rasterizer constants.
@@ -204,7 +208,7 @@ def sort_lists(
         threads: number of threads per block, 1 on the CPU device.
         starts, segment_starts: [tiles + 1] outputs of ``place_lists``.
         tile_counts: [tiles] number of entries in each list, reset to 0.
-        keys: [capacity] output of ``fill_lists``. Its order is undefined afterwards.
+        keys: [capacity] output of ``fill_lists``. The kernel leaves the keys in an undefined order.
         items: [capacity] output, Gaussian of each entry.
         segment_tiles: [segments] output, tile of each segment.
     """
