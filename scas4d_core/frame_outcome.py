@@ -159,7 +159,7 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
     >>> cloud_warnings({"method": "agreement + pairs", "points": 900, "coverage": 0.12})[0][:75]
-    'frame 0 is partly a guess: the points that cameras agree on cover only 12 %'
+    'frame 0 is partly a guess: the points that cameras agree on cover only 12%'
     """
     if cloud is None or cloud.get("coverage") is None:
         return []
@@ -170,7 +170,7 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     if cloud["coverage"] == 0:
         return [f"frame 0 is a guess: no two cameras agree on any initial point; {remedy}"]
     if cloud["coverage"] < COVERS_LITTLE:
-        share = f"cover only {100 * cloud['coverage']:.0f} % of the images"
+        share = f"cover only {100 * cloud['coverage']:.0f}% of the images"
         return [f"frame 0 is partly a guess: the points that cameras agree on {share}; {remedy}"]
     return []
 

@@ -269,7 +269,7 @@ def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
 def moving_extent(gaussians: Gaussians) -> float:
     """Returns the extent of the moving Gaussians in metres.
 
-    The extent is the longest side of a box that contains the central 98 % of the centres along each
+    The extent is the longest side of a box that contains the central 98% of the centres along each
     axis. A few stray Gaussians therefore hardly affect the result. If no Gaussian moves, all Gaussians
     that are not retired are used. If all Gaussians are retired, all of them are used.
 

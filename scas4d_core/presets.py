@@ -42,7 +42,7 @@ PRESETS: dict[str, Settings] = {
     # Half the iterations of the default, except in a cold start, and no iterations if nothing has
     # moved (docs/accuracy-and-time.md).
     "adaptive": Settings(update=UpdateSettings(iterations=50, cold_start_iterations=6.0, skip_tolerance=0.02)),
-    # Fewer iterations than "adaptive", and 30 % of the Gaussians. An update takes about 30 % of the
+    # Fewer iterations than "adaptive", and 30% of the Gaussians. An update takes about 30% of the
     # time of the default.
     "fast": Settings(
         static=StaticSettings(detail=0.3),

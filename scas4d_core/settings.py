@@ -100,7 +100,7 @@ class StaticSettings(SettingsModel):
     exposure: bool | Literal["auto"] = Field(
         default="auto",
         description="Learn a colour gain and offset per training camera; held-out cameras are evaluated without them. "
-        "'auto' stops learning them after 30 % of the iterations if the cameras agree, because they then only "
+        "'auto' stops learning them after 30% of the iterations if the cameras agree, because they then only "
         "fit noise.",
     )
     refine_calibration: bool = Field(

@@ -332,7 +332,7 @@ class FrameReportModel(Model):
     shortened: list[str] = Field(
         default_factory=list,
         description=(
-            "Frame 0 only: stages that the time limit `static.seconds` shortened by at least 5 % of their "
+            "Frame 0 only: stages that the time limit `static.seconds` shortened by at least 5% of their "
             "iterations. If the list is empty and `planned` has one entry, the result of frame 0 does not "
             "depend on the speed of the machine."
         ),

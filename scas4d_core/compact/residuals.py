@@ -31,7 +31,7 @@ from scas4d_core.gaussians import rotation_rows
 Array = NDArray[np.float32]
 
 SCALE_STEP = 0.08
-"""Quantization step of log sizes. Other steps scale with the decoded sizes, which are within 4 % of the true sizes."""
+"""Quantization step of log sizes. Other steps scale with the decoded sizes, which are within 4% of the true sizes."""
 MARGIN = 0.95
 """Safety factor for steps that are relative to a size; it accounts for the quantization error of the size itself."""
 LARGEST = 1 << 30

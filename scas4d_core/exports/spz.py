@@ -7,7 +7,7 @@ format are designed for metres. The format quantizes as follows, according to gs
 Niantic's ``load-spz.cc``:
 
 - positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m, with the largest number of fractional bits f for which the frame fits;
-- scales: the logarithm in one byte, 16 steps per factor of e: ±3.2 %, clipped below 45 µm or above 379 m;
+- scales: the logarithm in one byte, 16 steps per factor of e: ±3.2%, clipped below 45 µm or above 379 m;
 - rotations: the smallest three components in 10 bits each, ±0.0007 per component;
 - opacity: one byte, linear, ±0.002; colour: one byte over −0.44…1.44, ±0.0037;
 - harmonics of degree 1 to 3: one byte over −1…1, ±0.004, clipped outside this range.

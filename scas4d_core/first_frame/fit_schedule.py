@@ -30,9 +30,9 @@ MIN_PLAN_CHANGE = 0.02
 """Relative change in the number of iterations above which a new plan is recorded."""
 REPORTED_SHORTFALL = 0.05
 """Fraction of missing iterations above which the report mentions them; smaller fractions have less effect than the
-random seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10 and 20 % fewer iterations, it reaches
+random seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10 and 20% fewer iterations, it reaches
 35.20, 35.29 and 35.24 dB, and with half the iterations, 35.03 dB. *cloth* at half size (one seed) reaches 28.91 dB;
-with 5 and 20 % fewer iterations, it reaches 28.91 and 28.88 dB."""
+with 5 and 20% fewer iterations, it reaches 28.91 and 28.88 dB."""
 MIN_COUNT_RATIO = 1.3
 """Minimum ratio of the largest to the smallest Gaussian count for separating per-Gaussian cost from pixel cost."""
 

@@ -37,7 +37,7 @@ MIN_VIEWS = 12
 """Minimum number of views for the trial; with fewer, only one camera sees each highlight and any model explains it."""
 MAX_STRIDE = 1.5
 """Schedule stride above which there is no time for a trial, which takes as long as 350 iterations. Moreover, the
-surface of a shortened fit explains less of the images, so view dependence seems to explain more: on basketball, 7 %
+surface of a shortened fit explains less of the images, so view dependence seems to explain more: on basketball, 7%
 after 600 iterations, but nothing after 3000."""
 ROUNDS = 8
 """Number of passes over all views in the trial."""
@@ -119,9 +119,7 @@ class GlossTrial:
         gloss, means = estimate_gloss(self._trainer, None)
         without, seen = self._remaining_error(None), self._remaining_error(GlossShading.fresh(gloss, means))
         share = max(0.0, 1 - seen / max(without, 1e-12))
-        self.evidence = Evidence(
-            share, f"view-dependent colour explains {100 * share:.0f} % of the residual of frame 0"
-        )
+        self.evidence = Evidence(share, f"view-dependent colour explains {100 * share:.0f}% of the residual of frame 0")
         self.on = self._mode == "on" or share >= effect("direction").on_above
         return self.on
 

@@ -26,7 +26,7 @@ llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 # No fast math: every operation is rounded according to IEEE 754, in source order, so that results are bit-identical on
 # all processors. Approximate reciprocals (`arcp`, `afn`) depend on the manufacturer, fused multiply-adds (`contract`)
 # on the instruction set, and reordered sums (`reassoc`) on the register width.
-# Long sums use explicit lanes instead. The cost is about 1 % (docs/tried.md).
+# Long sums use explicit lanes instead. The cost is about 1% (docs/tried.md).
 STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
 

@@ -2,7 +2,7 @@
 
 These definitions complement those in ``scas4d_core.metrics``:
 
-- A ground-truth point is *moving* if its distance from its position in frame 0 ever exceeds 1 % of the extent.
+- A ground-truth point is *moving* if its distance from its position in frame 0 ever exceeds 1% of the extent.
 - *Foreground* pixels are inside the mask of the test camera. *Changed* pixels differ by more than 0.1 in at least one
   channel from the ground-truth image of frame 0.
 - 3D tracks start at the ground-truth points in frame 0. 2D tracks start at the pixels of the moving points that are
@@ -196,7 +196,7 @@ def render_parts(reconstruction: Committed, camera: Camera, index: int, labels: 
 
 
 def moving_points(points: NDArray[np.float64], extent: float) -> NDArray[np.bool_]:
-    """Returns a mask [P] of the points [T, P, 3] that move more than 1 % of the extent from their first position."""
+    """Returns a mask [P] of the points [T, P, 3] that move more than 1% of the extent from their first position."""
     moving: NDArray[np.bool_] = np.linalg.norm(points - points[:1], axis=-1).max(axis=0) > MOVING_SHARE * extent
     return moving
 

@@ -27,7 +27,7 @@ class TrackError:
 
     Attributes:
         median: median error in %; infinite if at least half of the positions are lost.
-        percentile_90: 90th percentile in %: the smallest observed error that 90 % of the errors do not exceed.
+        percentile_90: 90th percentile in %: the smallest observed error that 90% of the errors do not exceed.
         count: number of evaluated positions.
     """
 

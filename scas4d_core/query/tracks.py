@@ -32,11 +32,11 @@ ALPHA_OF_A_SURFACE = 0.5
 """Minimum alpha of a pixel that counts as showing a surface."""
 CARRIERS = 32
 """Number of Gaussians that carry a point. Compared with using only the nearest Gaussian, the median 3D error decreases
-by 6 % (cloth) to 25 % (stage)."""
+by 6% (cloth) to 25% (stage)."""
 SOFTENING = 0.01
 """Length added in quadrature to a Gaussian's axes when computing its distance to a point, as a fraction of the extent.
 Gaussians are thinner than the uncertainty of the surface, and more carriers average out more noise. Compared with
-0.001, the median 3D error decreases by 2 % (cloth) to 18 % (stage)."""
+0.001, the median 3D error decreases by 2% (cloth) to 18% (stage)."""
 RAY_SOFTENING = 0.003
 """Equivalent of ``SOFTENING`` for the position of a Gaussian along the ray of a pixel query."""
 AGREEMENT = 0.01

@@ -175,13 +175,13 @@ def _check_camera(
         now = replace(now, tint=before.tint + 1 if tint > tints[0] else 0)
         now = replace(now, gain=before.gain + 1 if abs(gain) > gains[0] else 0)
         if tint > tints[1] or now.tint >= ROW:
-            parts = ", ".join(f"{colour} {100 * part:+.0f} %" for colour, part in zip(COLOURS, change, strict=True))
+            parts = ", ".join(f"{colour} {100 * part:+.0f}%" for colour, part in zip(COLOURS, change, strict=True))
             text = (
                 f"its colours differ from its earlier images and the other cameras ({parts}); check the white balance"
             )
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
         elif abs(gain) > gains[1] or now.gain >= ROW:
-            size = f"{100 * abs(gain):.0f} % {'brighter' if gain > 0 else 'darker'}"
+            size = f"{100 * abs(gain):.0f}% {'brighter' if gain > 0 else 'darker'}"
             text = (
                 f"its image is {size} than expected from its earlier images and the other cameras; check the exposure"
             )
@@ -194,7 +194,7 @@ def _check_camera(
         if abs(sharper) > SHARPNESS[1] or now.blur >= ROW:
             how, why = ("sharper", "check for noise") if sharper > 0 else ("less sharp", "check the focus")
             text = (
-                f"its image is {100 * abs(np.expm1(sharper)):.0f} % {how} than usual relative to the other cameras; "
+                f"its image is {100 * abs(np.expm1(sharper)):.0f}% {how} than usual relative to the other cameras; "
                 f"{why}"
             )
             alarms.append(Alarm(AlarmKind.CAMERA_SHARPNESS, name, text))

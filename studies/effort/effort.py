@@ -111,7 +111,7 @@ def measure_budgets(
         kept.append(one)
         row = one.row()
         report(
-            f"    {capture.name}, {budget:g} ms: {100 * row['within']:.0f} % within, {100 * row['not_over']:.0f} % not "
+            f"    {capture.name}, {budget:g} ms: {100 * row['within']:.0f}% within, {100 * row['not_over']:.0f}% not "
             f"over; {row['iterations'][1]:.0f} iterations; worst {row['worst_off_ms']:+.0f} ms"
         )
     return leave(out, f"{capture.name}-budgets", capture, {"budgets": [one.row() for one in kept]})
@@ -148,8 +148,8 @@ def measure_adaptive(
         answer = {"sequence": what, **turns.row()}
         answers.append(answer)
         difference = answer["psnr"][name] - answer["psnr"]["scas4d"]
-        ratio = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f} %"
-        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f} % of the time{ratio}, {difference:+.2f} dB")
+        ratio = "" if answer["time_repeats"] is None else f", repeats {100 * answer['time_repeats']:.0f}%"
+        report(f"    {capture.name}, {what}: {100 * answer['time']:.0f}% of the time{ratio}, {difference:+.2f} dB")
     return leave(out, f"{capture.name}-{name}", capture, {"name": name, "sequences": answers})
 
 

@@ -47,7 +47,7 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
         "",
         "Each capture is played back and forth under each budget (`scripts/bench effort`). Times are measured from",
         "before decoding to the end of the commit on disk, excluding the first two frames. The tolerance is the larger",
-        f"of {100 * TOLERANCE:.0f} % of the budget and one iteration; {100 * KEPT:.0f} % of frames must meet it.",
+        f"of {100 * TOLERANCE:.0f}% of the budget and one iteration; {100 * KEPT:.0f}% of frames must meet it.",
         "",
         "| capture | budget, ms | within | not over | median error, ms | worst error, ms | median iterations | |",
         "|---|---|---|---|---|---|---|---|",
@@ -56,8 +56,8 @@ def _budgets(rows: Sequence[Row]) -> list[str]:
         for one in row["budgets"]:
             verdict = "reached" if one["within"] >= KEPT else "**missed**"
             lines.append(
-                f"| {row['capture']} | {one['milliseconds']:g} | {100 * one['within']:.0f} % "
-                f"| {100 * one['not_over']:.0f} % | {one['median_off_ms']:+.1f} | {one['worst_off_ms']:+.1f} "
+                f"| {row['capture']} | {one['milliseconds']:g} | {100 * one['within']:.0f}% "
+                f"| {100 * one['not_over']:.0f}% | {one['median_off_ms']:+.1f} | {one['worst_off_ms']:+.1f} "
                 f"| {one['iterations'][1]:.0f} | {verdict} |"
             )
     return [*lines, ""]
@@ -83,16 +83,16 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
         times.append(plain["time"])
         repeats.append(again["time_repeats"])
         lines.append(
-            f"| {row['capture']} | {plain['frames']} | {100 * plain['time']:.0f} % | {_gain(plain):+.2f} "
-            f"({_told(plain, 'adaptive')} : {_told(plain, 'scas4d')}) | {100 * again['time_repeats']:.0f} % "
-            f"| {100 * slow['time']:.0f} % | {_gain(slow):+.2f} |"
+            f"| {row['capture']} | {plain['frames']} | {100 * plain['time']:.0f}% | {_gain(plain):+.2f} "
+            f"({_told(plain, 'adaptive')} : {_told(plain, 'scas4d')}) | {100 * again['time_repeats']:.0f}% "
+            f"| {100 * slow['time']:.0f}% | {_gain(slow):+.2f} |"
         )
     ok = max(times) <= TIME and min(losses) >= -LOSS_DB and max(repeats) <= REPEATS
     lines += [
         "",
-        f"Mean: {100 * np.mean(times):.0f} % of the time, {np.mean(losses):+.2f} dB; "
-        f"repeats {100 * np.mean(repeats):.0f} %. The target, at most {100 * TIME:.0f} % of the time at "
-        f"{LOSS_DB:g} dB, and {100 * REPEATS:.0f} % for repeats, is "
+        f"Mean: {100 * np.mean(times):.0f}% of the time, {np.mean(losses):+.2f} dB; "
+        f"repeats {100 * np.mean(repeats):.0f}%. The target, at most {100 * TIME:.0f}% of the time at "
+        f"{LOSS_DB:g} dB, and {100 * REPEATS:.0f}% for repeats, is "
         f"{'reached on every capture' if ok else '**missed** on some captures'}.",
         "",
     ]
@@ -114,10 +114,10 @@ def _report(rows: Sequence[Row]) -> list[str]:
         verdict = "reached" if row["share"] <= TARGET else "**missed**"
         low, high = row["ratio_quartiles"]
         lines.append(
-            f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f} % "
-            f"| {100 * row['share_worst']:.2f} % | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
+            f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f}% "
+            f"| {100 * row['share_worst']:.2f}% | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
         )
-    return [*lines, "", f"Target: at most {100 * TARGET:.0f} % of an update.", ""]
+    return [*lines, "", f"Target: at most {100 * TARGET:.0f}% of an update.", ""]
 
 
 def _gain(one: Row) -> float:

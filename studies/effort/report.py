@@ -78,7 +78,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     verdict = "reached" if answer["share"] <= TARGET else "missed"
     low, high = answer["ratio_quartiles"]
     report(
-        f"    {capture.name}: report: {100 * answer['share']:.2f} % of an update ({verdict}: {100 * TARGET:.0f} %), "
+        f"    {capture.name}: report: {100 * answer['share']:.2f}% of an update ({verdict}: {100 * TARGET:.0f}%), "
         f"{answer['milliseconds']:.1f} ms; with the optional work {answer['ratio']:.3f} × the CPU time without it "
         f"(quartiles {low:.3f}, {high:.3f})"
     )

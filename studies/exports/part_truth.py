@@ -251,7 +251,7 @@ def told_asset(figures: list[AssetFigures]) -> str:
         for part in one.parts:
             if part.covered:
                 turn = f"{np.nanmedian(part.degrees):.2f}° ({np.nanmax(part.degrees):.2f}°)"
-                shift = f"{np.nanmedian(part.percent):.3f} % ({np.nanmax(part.percent):.3f} %)"
+                shift = f"{np.nanmedian(part.percent):.3f}% ({np.nanmax(part.percent):.3f}%)"
             else:
                 turn = shift = "not found"
             rows.append(f"| | {part.part} | {part.points} | {part.share:.0%} | {turn} | {shift} |")
@@ -260,7 +260,7 @@ def told_asset(figures: list[AssetFigures]) -> str:
         met = "reached" if degrees <= BAR_DEGREES and percent <= BAR_PERCENT else "missed"
         rows.append(
             f"| {one.nodes}, {one.count} | **{covered} of {len(one.parts)} parts** | | | **{degrees:.2f}°**, moving "
-            f"ones {moving[0]:.2f}° | **{percent:.3f} %**, moving ones {moving[1]:.3f} % (bar: {BAR_DEGREES:g}°, "
-            f"{BAR_PERCENT:g} %: {met}) |"
+            f"ones {moving[0]:.2f}° | **{percent:.3f}%**, moving ones {moving[1]:.3f}% (bar: {BAR_DEGREES:g}°, "
+            f"{BAR_PERCENT:g}%: {met}) |"
         )
     return "\n".join(rows)

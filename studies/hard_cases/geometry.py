@@ -84,7 +84,7 @@ def _culled_as_behind(count: int) -> Rendering:
 
 
 def _near_plane(near: float) -> Rendering:
-    """Places Gaussians just before, on and just behind the near plane, with a width of 2 % of its depth."""
+    """Places Gaussians just before, on and just behind the near plane, with a width of 2% of its depth."""
     z = np.float32(near)
     depths = np.array([np.nextafter(z, np.float32(0)), z, np.nextafter(z, np.float32(9))])
     limits = Rendering.limits._replace(near=float(z))
@@ -300,7 +300,7 @@ def _as_unscaled(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> l
     assert plain is not None
     off = np.abs(plain.values["features"] - outcomes[CPU].values["features"])
     share = float(np.mean(off.max(axis=0) > 1e-4))
-    return [] if share <= 0.005 else [f"{100 * share:.2g} % of the pixels change with the scale"]
+    return [] if share <= 0.005 else [f"{100 * share:.2g}% of the pixels change with the scale"]
 
 
 CASES = (

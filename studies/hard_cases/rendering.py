@@ -185,7 +185,7 @@ class Rendering:
             off = np.abs(outcome.values["features"] - truth.values["features"]).max(axis=0) / max(high - low, 1e-3)
             share = float(np.mean(~(off <= self.value)))
             if share > KINK_SHARE and np.count_nonzero(off > self.value) > 1:
-                faults.append(f"{backend}: {100 * share:.2g} % of the pixels differ by up to {off.max():.2g}")
+                faults.append(f"{backend}: {100 * share:.2g}% of the pixels differ by up to {off.max():.2g}")
         if self.gradient is not None:
             for name, expected in truth.gradients.items():
                 distance = apart(outcome.gradients[name], expected, least=1e-9 * self.weight)

@@ -43,8 +43,8 @@ def cost(footage: AnyFootage, updates: int = 8) -> Share:
 def in_words(footage: AnyFootage, found: Share) -> str:
     """Formats the cost as one line."""
     seconds, checks, probes = found
-    verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"
+    verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f}%"
     return (
-        f"{footage.name}: the checks take {100 * checks:.1f} % of an update of {seconds:.2f} s ({verdict}), "
-        f"comparing its start and end takes {100 * probes:.1f} %"
+        f"{footage.name}: the checks take {100 * checks:.1f}% of an update of {seconds:.2f} s ({verdict}), "
+        f"comparing its start and end takes {100 * probes:.1f}%"
     )

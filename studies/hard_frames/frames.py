@@ -376,7 +376,7 @@ CASES = (
     FrameCase("all white", "number of overexposed frames", FIELD, (1, 3), filled(255), held),
     FrameCase("saturated noise", "number of frames whose pixels are randomly 0 or 255", FIELD, (1, 3), noise, held),
     FrameCase(
-        "lights off and on", "number of frames with 2 % of the light, followed by full light", FIELD, (1, 5),
+        "lights off and on", "number of frames with 2% of the light, followed by full light", FIELD, (1, 5),
         brighter(lambda size, number: 0.02, lambda size: int(size)), held,
     ),
     FrameCase(

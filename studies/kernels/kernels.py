@@ -288,7 +288,7 @@ def _scene_words(on: Row) -> str:
     width, height = on["picture"]
     return (
         f"{on['gaussians']:,} Gaussians, {on['views']} images of {width}×{height} with an average of "
-        f"{on['pairs_per_view']:,.0f} pairs; {100 * on['lanes_filled']:.0f} % of the lanes are pairs"
+        f"{on['pairs_per_view']:,.0f} pairs; {100 * on['lanes_filled']:.0f}% of the lanes are pairs"
     )
 
 

@@ -73,7 +73,7 @@ def table(results: Sequence[MovingTime]) -> str:
     last = results[-1].seconds
     lines = ["| moving pixels | moving Gaussians | s per update | of the last | PSNR |", "|---|---|---|---|---|"]
     lines += [
-        f"| {100 * one.share:.0f} % | {one.moving:,} | {one.seconds:.2f} | {one.seconds / last:.2f} | {one.psnr:.1f} |"
+        f"| {100 * one.share:.0f}% | {one.moving:,} | {one.seconds:.2f} | {one.seconds / last:.2f} | {one.psnr:.1f} |"
         for one in results
     ]
     return "\n".join(lines)

@@ -213,10 +213,10 @@ def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], f
 
 def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
     """Formats the rates as a Markdown table, with a description of the frames and the verdict."""
-    shares = [f"{100 * measured.share(took):.0f} %" for took in (measured.ingest, measured.socket)]
+    shares = [f"{100 * measured.share(took):.0f}%" for took in (measured.ingest, measured.socket)]
     rows = "\n".join(
-        f"| {number + 1} | {plain:.0f} | {ingest:.0f} | {100 * ingest / plain:.0f} % "
-        f"| {socket:.0f} | {100 * socket / plain:.0f} % |"
+        f"| {number + 1} | {plain:.0f} | {ingest:.0f} | {100 * ingest / plain:.0f}% "
+        f"| {socket:.0f} | {100 * socket / plain:.0f}% |"
         for number, (plain, ingest, socket) in enumerate(
             zip(measured.plain, measured.ingest, measured.socket, strict=True)
         )
@@ -227,5 +227,5 @@ def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, s
         f"HTTP over {senders} connections, one WebSocket with {UNANSWERED} messages unanswered\n\n"
         "| round | plain fsynced writes, MB/s | HTTP, MB/s | share | WebSocket, MB/s | share |\n"
         f"|---|---|---|---|---|---|\n{rows}\n\n"
-        f"Median shares {shares[0]} and {shares[1]}, target {100 * TARGET:.0f} % (HTTP): {verdict}."
+        f"Median shares {shares[0]} and {shares[1]}, target {100 * TARGET:.0f}% (HTTP): {verdict}."
     )

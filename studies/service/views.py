@@ -193,7 +193,7 @@ def line(row: ViewTimes) -> str:
         f"{row.latency:.2f}",
         f"{statistics.median(row.alone):.2f}",
         f"{statistics.median(row.together):.2f}",
-        f"{100 * row.slower:+.0f} %",
+        f"{100 * row.slower:+.0f}%",
         str(row.refused),
     ]
     return "| " + " | ".join(cells) + " |"
@@ -202,7 +202,7 @@ def line(row: ViewTimes) -> str:
 def table(rows: Sequence[ViewTimes]) -> str:
     """Formats the results as a Markdown table, followed by a sentence on the target."""
     head = [
-        "| views per second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
+        "| views per second | idle, ms (95%) | during updates, ms (95%) | ratio | update alone, s | under views, s | "
         "slower | no response |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -212,8 +212,8 @@ def table(rows: Sequence[ViewTimes]) -> str:
             reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0
             text += (
                 f"\n\nTarget at {TARGET_RATE:g} per second: median latency at most {TARGET_LATENCY:g} times idle, "
-                f"updates at most {100 * TARGET_SLOWER:.0f} % slower: {'reached' if reached else '**missed**'} "
-                f"({row.latency:.2f} times, {100 * row.slower:+.0f} %)."
+                f"updates at most {100 * TARGET_SLOWER:.0f}% slower: {'reached' if reached else '**missed**'} "
+                f"({row.latency:.2f} times, {100 * row.slower:+.0f}%)."
             )
     return text
 

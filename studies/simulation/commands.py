@@ -11,7 +11,7 @@ from studies.simulation.delays import HEAD_S
 
 
 def simulate(
-    scenes: Annotated[int, typer.Option(min=8, help="Number of scenes, which fill 85 % of the CPUs.")] = 5000,
+    scenes: Annotated[int, typer.Option(min=8, help="Number of scenes, which fill 85% of the CPUs.")] = 5000,
     nodes: Annotated[int, typer.Option(min=3, help="Number of nodes.")] = 200,
     failures: Annotated[
         int, typer.Option(min=20, help="Number of failures of nodes, workers, service and head.")

@@ -105,6 +105,6 @@ def _seconds(times: Sequence[tuple[float, float]]) -> str:
     late = with_room[int(0.99 * (len(with_room) - 1))]
     longest = max(total for total, _ in times)
     return (
-        f"median {median(with_room):.1f} s, 99 % {late:.1f} s, maximum {with_room[-1]:.1f} s; "
+        f"median {median(with_room):.1f} s, 99% {late:.1f} s, maximum {with_room[-1]:.1f} s; "
         f"including waits for a node, maximum {longest:.0f} s"
     )

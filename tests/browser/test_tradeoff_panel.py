@@ -151,8 +151,8 @@ def test_held_frames_are_marked_with_their_reason_and_cameras_have_their_health(
     assert page.locator("#reason").is_hidden()
     rows = page.locator("#cameras tr").all_inner_texts()
     assert "left out" in rows[1]
-    assert "20 %" in rows[2]
-    assert "95 %" in rows[0]
+    assert "20%" in rows[2]
+    assert "95%" in rows[0]
     assert "camera c1" in text(page, "camera-summary").lower()
     page.locator("#marks span").click()
     shown(page, frame="6")

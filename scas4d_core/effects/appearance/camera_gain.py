@@ -120,7 +120,7 @@ EFFECT = CameraGain(
     description="Each camera has a gain per channel, which may drift.",
     disambiguation="For each channel, the gains of all cameras multiply to 1; a change that all cameras share is "
     "attributed to lighting and changes the colours.",
-    cost="a median over about 4,000 pixels per iteration, 1 % of the update time",
+    cost="a median over about 4,000 pixels per iteration, 1% of the update time",
     auto=True,
     on_above=0.04,
     off_below=0.02,

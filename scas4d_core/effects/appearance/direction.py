@@ -95,7 +95,7 @@ class Direction(Effect):
             for which, shown in enumerate((matte, state)):
                 left[which] += 10 ** (-seen.renderer.compare(shown, view).psnr / 10)
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))
-        return Evidence(share, f"view-dependent colour explains {100 * share:.0f} % of the residual")
+        return Evidence(share, f"view-dependent colour explains {100 * share:.0f}% of the residual")
 
     def register(self, builder: PlanBuilder) -> None:
         """Adds a ``DirectionPart`` and requests full images.
@@ -113,7 +113,7 @@ EFFECT = Direction(
     "fixed while the objects move.",
     disambiguation="The environment sums to zero over the sphere; appearance that is the same from all directions is "
     "attributed to colour.",
-    cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes 50 % longer if the effect "
+    cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes 50% longer if the effect "
     "is switched on",
     auto=True,
     on_above=0.1,  # the trial measures 0.25 on `gloss` and at most 0.03 on the five objects

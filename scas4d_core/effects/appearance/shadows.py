@@ -106,7 +106,7 @@ class Shadows(Effect):
         if compared == 0:
             return None
         share = changed / compared
-        return Evidence(share, f"{100 * share:.0f} % of the static scene looks different from frame 0")
+        return Evidence(share, f"{100 * share:.0f}% of the static scene looks different from frame 0")
 
     def register(self, builder: PlanBuilder) -> None:
         """Adds a ``ShadowsPart`` to the updates."""

@@ -23,7 +23,7 @@ MOST = 1000
 STEEP = 0.02
 """Minimum gradient magnitude of an informative pixel, for values in 0…1; flatter pixels mostly show noise."""
 CAUCHY = 2.4
-"""Residual, as a multiple of the usual residual, at which the Cauchy weight is one half. It has 95 % efficiency for
+"""Residual, as a multiple of the usual residual, at which the Cauchy weight is one half. It has 95% efficiency for
 Gaussian noise."""
 QUIETEST = 1 / 255
 """Lower bound on the usual residual, for values in 0…1: the quantization step of 8-bit images."""

@@ -37,7 +37,7 @@ PATCHES = 400
 AROUND = 19
 """Number of nearest patches that each patch is compared with; together they cover a twentieth of the object."""
 REST = 1e-3
-"""Motion relative to the extent of the moving Gaussians. If 90 % of them move less, a frame provides no evidence."""
+"""Motion relative to the extent of the moving Gaussians. If 90% of them move less, a frame provides no evidence."""
 
 # Measurements on which the thresholds are based, in radians: on swinging `cloth`, at least 0.030 while the effect is
 # off (also when played backwards or with half of the cameras), and at least 0.037 while it is on. All other captures
@@ -121,7 +121,7 @@ EFFECT = Bending(
     description="Neighbours rotate independently, as in cloth: the rotation term is off, and rigidity fades to 0.",
     disambiguation="Only patch rotations that exceed the rest of the patch's motion count; joints between rigid parts "
     "affect too few patches.",
-    cost="1 % of an update: the rotations of 400 patches per frame",
+    cost="1% of an update: the rotations of 400 patches per frame",
     auto=True,
     on_above=0.018,
     off_below=0.012,

@@ -13,5 +13,5 @@ EFFECT = FreeColumns(
     group=EffectGroup.MOTION,
     description="Each Gaussian may move away from the position given by its clusters.",
     disambiguation="It is learnt last and slowly, so it captures only motion that the clusters do not explain.",
-    cost="1 % of an update, together with own_rotation and own_scale",
+    cost="1% of an update, together with own_rotation and own_scale",
 )

@@ -13,5 +13,5 @@ EFFECT = FreeColumns(
     group=EffectGroup.MOTION,
     description="Each Gaussian may rotate relative to its clusters.",
     disambiguation="It is learnt last and slowly, so it captures only motion that the clusters do not explain.",
-    cost="1 % of an update, together with own_position and own_scale",
+    cost="1% of an update, together with own_position and own_scale",
 )

@@ -29,5 +29,5 @@ EFFECT = OwnScale(
     group=EffectGroup.MOTION,
     description="Each Gaussian's axes may grow and shrink.",
     disambiguation="Axis lengths are limited, and changes are learnt last and slowly.",
-    cost="1 % of an update, together with own_position and own_rotation",
+    cost="1% of an update, together with own_position and own_rotation",
 )

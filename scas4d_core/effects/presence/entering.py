@@ -216,7 +216,7 @@ class Entering(Effect):
 
 def _evidence(share: float, cameras: int) -> Evidence:
     return Evidence(
-        share, f"an object entered: {cameras} cameras agree, and it explains {100 * share:.0f} % of the error"
+        share, f"an object entered: {cameras} cameras agree, and it explains {100 * share:.0f}% of the error"
     )
 
 

@@ -95,7 +95,7 @@ class Leaving(Effect):
 
 
 def _evidence(share: float) -> Evidence:
-    return Evidence(share, f"{100 * share:.0f} % of the moving Gaussians are outside all images" if share else "")
+    return Evidence(share, f"{100 * share:.0f}% of the moving Gaussians are outside all images" if share else "")
 
 
 EFFECT = Leaving(

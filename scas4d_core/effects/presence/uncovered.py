@@ -116,7 +116,7 @@ class UncoveredEffect(Effect):
 
 
 def _evidence(share: float) -> Evidence:
-    return Evidence(share, f"regions uncovered by moving objects contain {100 * share:.0f} % of the error")
+    return Evidence(share, f"regions uncovered by moving objects contain {100 * share:.0f}% of the error")
 
 
 EFFECT = UncoveredEffect(

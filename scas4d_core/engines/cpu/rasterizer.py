@@ -104,7 +104,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """Returns a contiguous scratch array. Its memory has a reserve of 25 % to avoid reallocations as sizes vary."""
+        """Returns a contiguous scratch array. Its memory has a reserve of 25% to avoid reallocations as sizes vary."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view

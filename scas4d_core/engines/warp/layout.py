@@ -20,7 +20,7 @@ TILE = 16
 PIXELS = TILE * TILE
 """Number of pixels per tile, which is also the number of threads in a block that renders a tile."""
 SEGMENT = 128
-"""Number of list entries per segment. Segments are blended in parallel. Values of 64 and 256 are 5 to 15 % slower."""
+"""Number of list entries per segment. Segments are blended in parallel. Values of 64 and 256 are 5 to 15% slower."""
 
 COLUMNS = 8
 """Number of columns in the log, which has one row per rendering."""

@@ -115,7 +115,7 @@ export function showCameras(body, summary, names, report, lookFrom) {
     const share = fit && fit.psnr !== null ? Math.max(0.03, (fit.psnr - low) / (high - low)) : 0;
     meter.firstChild.style.width = `${100 * share}%`;
     const shift = fit?.colour_shift;
-    const swatch = node("span", { class: "swatch", title: shift ? `red, green, blue: ${shift.map((v) => `${(100 * v).toFixed(1)} %`).join(", ")}` : "not measured" });
+    const swatch = node("span", { class: "swatch", title: shift ? `red, green, blue: ${shift.map((v) => `${(100 * v).toFixed(1)}%`).join(", ")}` : "not measured" });
     // Shown around middle grey and ten times amplified, so that a shift of one hundredth is visible.
     if (shift) swatch.style.background = `rgb(${shift.map((v) => Math.round(128 + 1280 * v)).join(" ")})`;
     const words = found.length ? found.join("; ") : "";
@@ -124,9 +124,9 @@ export function showCameras(body, summary, names, report, lookFrom) {
       node("td", {}, meter),
       node("td", { class: "figure" }, fit && fit.psnr !== null ? fit.psnr.toFixed(1) : "–"),
       node("td", {}, swatch),
-      node("td", { class: "figure" }, shift ? `${(100 * Math.max(...shift.map(Math.abs))).toFixed(1)} %` : "–"),
+      node("td", { class: "figure" }, shift ? `${(100 * Math.max(...shift.map(Math.abs))).toFixed(1)}%` : "–"),
       node("td", { class: "words", title: words },
-        (found.length ? "⚠ " : "") + (name in (report?.dropped_cameras ?? {}) ? "left out" : fit?.health != null ? `${Math.round(100 * fit.health)} %`
+        (found.length ? "⚠ " : "") + (name in (report?.dropped_cameras ?? {}) ? "left out" : fit?.health != null ? `${Math.round(100 * fit.health)}%`
           : found.length ? "check" : fit ? "good" : "no data")));
   });
   body.replaceChildren(...rows);

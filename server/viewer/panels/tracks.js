@@ -31,7 +31,7 @@ export class Tracks {
     const id = `track-${++this.picks}`;
     const used = new Set(page.tracks.map((track) => track.colour));
     const colour = TRACKS.find((one) => !used.has(one)) ?? TRACKS[this.picks % TRACKS.length];
-    const where = `frame ${frame}, ${Math.round(100 * u / camera.width)} % from the left, ${Math.round(100 * v / camera.height)} % from the top`;
+    const where = `frame ${frame}, ${Math.round(100 * u / camera.width)}% from the left, ${Math.round(100 * v / camera.height)}% from the top`;
     page.tracks.push({ id, colour, where, name: this.picks, positions: new Map(), confidence: new Map() });
     const small = smaller(camera);
     page.stream.subscribe(id, "tracks", { pixels: [[u * small.sx, v * small.sy]], camera: small.camera, at: frame }, this.picks);

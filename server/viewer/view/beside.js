@@ -10,7 +10,7 @@ const WORDS = {
   picture: "as sent",
   render: "rendered",
   difference: `rendered minus sent, amplified ${STRONGER} times around grey`,
-  heat: `difference, 0 (dark) to ${100 * HOTTEST} % (bright) of the range`,
+  heat: `difference, 0 (dark) to ${100 * HOTTEST}% (bright) of the range`,
 };
 
 export class Beside {

@@ -68,7 +68,7 @@ def test_no_pixel_was_made_up_and_the_largest_such_picture_was_taken(model):
         corners = np.concatenate([corners, corners * [1, 0] + [0, HEIGHT]])
         rays = (corners - wider[:2, 2]) / wider.diagonal()[:2]
         at = distorted(model, LENSES[model], rays)
-        assert ((at < 0) | (at > [WIDTH, HEIGHT])).any(), "a picture 3 % wider would have been seen whole too"
+        assert ((at < 0) | (at > [WIDTH, HEIGHT])).any(), "a picture 3% wider would have been seen whole too"
 
 
 @pytest.mark.parametrize("model", [model for model in LENSES if "PINHOLE" not in model])

@@ -120,7 +120,7 @@ def test_faults_are_named():
 def test_a_part_is_lost_by_its_own_moving_points_in_the_last_frame() -> None:
     truth = np.zeros((3, 6, 3))
     parts, moving = np.array([1, 1, 1, 2, 2, 3]), np.array([True, True, True, True, False, False])
-    off = np.array([0.0, 0.1, 0.9, 0.3, 0.0, 9.0])  # of an extent of 10: 2 % are 0.2
+    off = np.array([0.0, 0.1, 0.9, 0.3, 0.0, 9.0])  # of an extent of 10: 2% are 0.2
     tracks = truth.copy()
     tracks[2, :, 0] = off
     assert lost_parts(tracks, truth, parts, moving, 10.0) == [2]  # of part 1 most are near; part 3 stands

@@ -104,7 +104,7 @@ def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service,
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may make a process less nice")
 def test_a_worker_is_as_nice_as_locally_and_does_not_load_ray(service: Service, scene: str) -> None:
-    """Ray's 15 more made it give way to idle daemons: updates took 3 % longer. Ray in a process takes 40 MB."""
+    """Ray's 15 more made it give way to idle daemons: updates took 3% longer. Ray in a process takes 40 MB."""
     sent(service, scene, range(1))
     wait_for(lambda: committed(service, scene) == 1)
     pid = service.worker_pid(scene)

@@ -23,7 +23,7 @@ SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 def test_what_is_within_is_measured_both_ways() -> None:
     kept = Kept(500.0, [0.5, 0.520, 0.530, 0.470, 0.400], [9] * 5, [0.01] * 5)
     row = kept.row()
-    assert row["within"] == pytest.approx(2 / 5)  # 25 ms: 5 % is more than one iteration
+    assert row["within"] == pytest.approx(2 / 5)  # 25 ms: 5% is more than one iteration
     assert row["not_over"] == pytest.approx(4 / 5)
     assert row["worst_off_ms"] == pytest.approx(30)
     assert Kept(100.0, [0.118], [1], [0.02]).row()["within"] == 1.0
@@ -84,7 +84,7 @@ def test_the_page_judges(tmp_path: Path) -> None:
 
     adaptive(0.5)
     text = effort_text(tmp_path, ["robot"])
-    assert "| robot | 500 | 100 % | 100 % | +0.0 | +0.0 | 9 | reached |" in text
+    assert "| robot | 500 | 100% | 100% | +0.0 | +0.0 | 9 | reached |" in text
     assert "**missed** |" in text
     assert "(29.95 ± 0.00 : 30.00 ± 0.50)" in text
     assert "reached on every capture" in text
@@ -98,7 +98,7 @@ def test_the_page_tells_what_reports_cost(tmp_path: Path) -> None:
     for share, verdict in ((0.0123, "reached"), (0.0223, "**missed**")):
         told = {**row, "share": share, "ratio_quartiles": [0.99, 1.02]}
         (tmp_path / "effort" / "robot-report.json").write_text(json.dumps(told))
-        assert f"| {100 * share:.2f} % | 3.00 % | 1.010 (0.990 to 1.020) | {verdict} |" in effort_text(
+        assert f"| {100 * share:.2f}% | 3.00% | 1.010 (0.990 to 1.020) | {verdict} |" in effort_text(
             tmp_path, ["robot"]
         )
 

@@ -64,7 +64,7 @@ def test_the_table_judges_the_bar():
     assert good.slower == pytest.approx(0.2)
     other = ViewTimes(20.0, idle=[10], loaded=[90], alone=[1.0], together=[2.0])
     text = table([good, other])
-    assert ": reached (1.83 times, +20 %)" in text
+    assert ": reached (1.83 times, +20%)" in text
     assert len(text.split("\n\n")[0].splitlines()) == 4
     for change in ({"loaded": [30]}, {"together": [1.3]}, {"refused": 1}):
         bad = ViewTimes(**{"rate": 5.0, "idle": [12], "loaded": [22], "alone": [1.0], "together": [1.2]} | change)

@@ -200,7 +200,7 @@ def test_an_update_learns_it_and_says_so() -> None:
     state, evidence = after(before, truth, effects)
     assert evidence is not None
     assert evidence.share > 0.05
-    assert evidence.text == f"view-dependent colour explains {100 * evidence.share:.0f} % of the residual"
+    assert evidence.text == f"view-dependent colour explains {100 * evidence.share:.0f}% of the residual"
     assert state.gloss is not None
     assert before.gloss is not None
     assert not np.array_equal(state.gloss, before.gloss)

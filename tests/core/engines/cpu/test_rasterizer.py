@@ -141,7 +141,7 @@ def assert_agrees(scene: Scene, camera: Camera, limits: Limits = DEFAULT, depth_
     scale = max(1.0, float(np.abs(expected).max()))
     np.testing.assert_allclose(features[smooth], expected[smooth], atol=3e-5 * scale)
     np.testing.assert_allclose(alpha[smooth], truth.alpha.detach().numpy()[smooth], atol=3e-5)
-    # Elsewhere one Gaussian may be drawn by one and not by the other: at the floor, or behind 1 % of the light.
+    # Elsewhere one Gaussian may be drawn by one and not by the other: at the floor, or behind 1% of the light.
     np.testing.assert_allclose(features, expected, atol=0.012 * scale)
 
     rng = np.random.default_rng(99)
