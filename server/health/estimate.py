@@ -13,8 +13,8 @@ from server.settings import ServerSettings
 
 PROCESS = 280e6
 """Bytes of the interpreter, libraries and compiled kernels in a worker or reader process."""
-PIXEL = 8
-"""Bytes per input pixel: the decoded image and mask of the current and the previous frame."""
+PIXEL = 12
+"""Bytes per input pixel: the decoded image and mask of the previous, the current and the next frame."""
 SCALED_PIXEL = 112
 """Bytes per scaled pixel for the images of an update.
 
