@@ -35,7 +35,7 @@ STAGE_ROWS = ("scas4d 10", "scas4d 25", "scas4d 50", "scas4d 100", "dynamic3dgs 
 """Labels of the settings whose stages are plotted."""
 AXIS_WORDS: Mapping[str, str] = {
     "adaptive": "Other presets",
-    "layers": "Layers (K is their number)",
+    "layers": "Number of layers (K)",
     "clusters": "First-layer clusters",
     "views": "Views per iteration",
     "gaussians": "Gaussian budget",
@@ -147,7 +147,7 @@ def equal_words(compared: Sequence[EqualSeconds]) -> str:
         return "Not measured at a common time."
     ahead = sum(lead > 0 for lead in leads)
     words = f"`scas4d` is ahead at {ahead} of {len(leads)} budgets; the smallest lead is {min(leads):+.2f} dB."
-    return words + (f" Budgets outside the measured range: {missing}." if missing else "")
+    return words + (f" The measured range does not include the other {missing}." if missing else "")
 
 
 def _draw(
@@ -206,11 +206,11 @@ def _text(
 
 {_provenance(out, captures)}
 
-An iteration is a forward and backward pass over one training view, or over several where noted. Each row covers a
-capture's first {updates} updates from the same frame 0; accuracy is the mean over these updates and the test cameras.
-Definitions are in [quality.md](quality.md) and `scas4d_core/metrics/evaluation.py`. Times are medians per update,
-including decoding and commit; other pages have times of other days on this shared machine. A setting is dominated if
-another is at least as fast and more accurate.
+An iteration is a forward and backward pass over one training view, or over several where noted. Each row covers the
+first {updates} updates of a capture, starting from the same frame 0. Accuracy is averaged over these updates and the test
+cameras. Metrics are defined in `scas4d_core/metrics/`, as in [quality.md](quality.md). Times are medians per update,
+including decoding and commit. Because the machine is shared, times on other pages differ. A setting is dominated if
+another setting is at least as fast and more accurate.
 
 ## Recommended settings
 
@@ -219,14 +219,14 @@ another is at least as fast and more accurate.
 Selection rules:
 
 - preview: the fastest setting within {PREVIEW_LOSS_DB:g} dB of the default;
-- live show: slower settings while each doubling of the time gains at least {LIVE_GAIN_DB:g} dB;
+- live show: the slowest setting for which each doubling of the time gains at least {LIVE_GAIN_DB:g} dB;
 - archive: the fastest setting within {ARCHIVE_GAIN_DB:g} dB of the best.
 
 ## Comparison at equal time
 
-Each budget is the time that the baseline, `dynamic3dgs`, needs for a number of iterations. The PSNR of `scas4d` at that
-time is interpolated between measured iteration counts, linearly in log time. Counts that are slower than a more
-accurate one are omitted. Cells show the lead of `scas4d` in dB and both PSNR values (`scas4d` : baseline).
+Each budget is the time in which the baseline, `dynamic3dgs`, completes a number of iterations. The PSNR of `scas4d` at
+that time is interpolated linearly in log time between measured settings. Settings that are slower and less accurate
+than another are omitted. Cells show the lead of `scas4d` in dB and both PSNR values (`scas4d` : baseline).
 {equal_words(compared)}
 
 {equal_table(compared)}
@@ -238,14 +238,14 @@ accurate one are omitted. Cells show the lead of `scas4d` in dB and both PSNR va
 
 {score_table(iterations, default)}
 
-With 10 iterations, updates miss motion. Examining and fitting it as new objects takes longer than the iterations saved
-(*rest* in the plot of stages; repeated on *robot*, 2026-11-27).
+With 10 iterations, updates miss motion. Fitting the missed motion as new objects takes longer than the saved iterations
+(*rest* in the stage plot; confirmed on *robot* on 2026-11-27).
 
 {_spreads(points, captures)}
 
 ## One setting at a time
 
-These rows vary the default (`scas4d`, 100 iterations).
+Each row changes one setting of the default (`scas4d`, 100 iterations).
 
 {others}
 
@@ -255,12 +255,12 @@ These rows vary the default (`scas4d`, 100 iterations).
         _picture(
             images,
             "convergence",
-            "PSNR on the test cameras within an update. Learning rates and layers are scheduled as shares of the "
-            "iterations, so a curve does not pass through the end points of shorter updates.",
+            "PSNR on the test cameras during an update. Learning rates and layers are scheduled as fractions of the "
+            "iteration count, so a curve does not pass through the end points of shorter updates.",
         )
     }
 
-{_picture(images, "drift", "PSNR over a whole capture. Errors carry over from one update to the next.")}
+{_picture(images, "drift", "PSNR over a whole capture. Each update inherits the errors of previous updates.")}
 
 {_picture(images, "stages", "Time per frame, by stage.")}
 
@@ -270,8 +270,8 @@ These rows vary the default (`scas4d`, 100 iterations).
 scripts/bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page docs/{stem}.md
 ```
 
-Times come from a separate pass that alternates between all settings (`--only times`); without it, they are CPU seconds
-of single-threaded rows.
+Times come from a separate pass (`--only times`) that alternates between all settings. Without this pass, the page shows
+CPU seconds of single-threaded runs.
 """
 
 
