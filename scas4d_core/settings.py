@@ -39,22 +39,22 @@ class SceneSettings(SettingsModel):
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
         description="Metres per unit of the calibration. 'auto' scales the rig radius to 3 m. A single camera does not "
-        "determine the scale: set a number that puts the subject about 3 m away.",
+        "determine the scale; set a value that places the subject about 3 m away.",
     )
-    image_scale: float = Field(1.0, gt=0, le=1, description="Factor by which images are resized before any other step.")
+    image_scale: float = Field(1.0, gt=0, le=1, description="Scale factor applied to all images before any other step.")
     background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
         "auto",
-        description="Background colour, RGB in 0…1. 'auto' uses the colour of a plain backdrop, or the mean of the "
-        "images of frame 0 if there is none.",
+        description="Background colour as RGB values in 0…1. 'auto' uses the colour of a plain backdrop or, without "
+        "one, the mean colour of frame 0.",
     )
     near: Positive | Literal["auto"] = Field(
         default="auto",
-        description="Near plane in metres: nothing closer to a camera is rendered. 'auto': a tenth of the rig radius.",
+        description="Distance of the near plane from the camera in metres. 'auto' uses a tenth of the rig radius.",
     )
     floor: tuple[float, float, float, float] | None = Field(
         None,
-        description="Floor plane (a, b, c, d) in the user's world: points with a·x + b·y + c·z + d > 0 are below the "
-        "floor. If None, there is no floor term.",
+        description="Floor plane (a, b, c, d) in world coordinates: points with a·x + b·y + c·z + d > 0 are below "
+        "the floor. None disables the floor term.",
     )
 
     @property
@@ -77,36 +77,36 @@ class StaticSettings(SettingsModel):
     1.0
     """
 
-    iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations for frame 0, one view each.")
+    iterations: int = Field(3000, ge=1, le=1_000_000, description="Number of iterations for frame 0, one view each.")
     seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
         110.0,
-        description="Time limit for frame 0 in seconds, covering the initial points and the fit. If it is too short, "
-        "the search for points is coarser and the fit has fewer iterations (at least 500), so the result depends on "
-        "the machine. No limit if None.",
+        description="Time limit for frame 0 in seconds, for the point search and the fit. A tight limit makes the "
+        "search coarser and the fit shorter (at least 500 iterations), so the result depends on the machine. None "
+        "means no limit.",
     )
     stop_gain: Share = Field(
         0.0,
-        description="Frame 0 stops early when no more Gaussians are added and five passes over all views reduce the "
-        "mean training loss by less than this fraction. 0 disables early stopping; 0.01 saves time on simple scenes.",
+        description="After densification, the fit of frame 0 stops once five passes over all views reduce the "
+        "training loss by less than this fraction. 0 disables early stopping; 0.01 saves time on simple scenes.",
     )
     max_gaussians: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
         None,
-        description="Maximum number of Gaussians, at which densification stops. If None, 0.34 per pixel of a training "
-        "image plus 0.27 per foreground pixel, at most 100,000 (25,000 for an object at 256x256).",
+        description="Maximum number of Gaussians, at which densification stops. None means 0.34 per pixel of a "
+        "training image plus 0.27 per foreground pixel, up to 100,000 (25,000 for an object at 256x256).",
     )
     detail: float = Field(
-        1.0, gt=0, le=1, description="Factor on the default number of Gaussians, used if max_gaussians is None."
+        1.0, gt=0, le=1, description="Factor applied to the default max_gaussians; ignored if max_gaussians is set."
     )
     exposure: bool | Literal["auto"] = Field(
         default="auto",
-        description="Learn a colour gain and offset per training camera; held-out cameras are evaluated without them. "
-        "'auto' stops learning them after 30% of the iterations if the cameras agree, because they then only "
-        "fit noise.",
+        description="Whether to learn a colour gain and offset for each training camera. Held-out cameras are "
+        "evaluated without them. 'auto' stops learning after 30% of the iterations if the cameras agree, to avoid "
+        "fitting noise.",
     )
     refine_calibration: bool = Field(
         default=False,
-        description="Refine the camera poses using image features of frame 0. The result is used only if it reduces "
-        "the error of held-out features.",
+        description="Whether to refine the camera poses using image features of frame 0. Refined poses are used only "
+        "if they reduce the error of held-out features.",
     )
     seed: int = Field(0, ge=0, description="Random seed for the order of views and the splitting of Gaussians.")
 
@@ -123,27 +123,27 @@ class Weights(SettingsModel):
 
     mask: NotNegative = Field(
         1.0,
-        description="Weight of the image loss between the rendered label and the mask, which separates moving from "
-        "static Gaussians; used if masks are given and at least a tenth of the Gaussians are static.",
+        description="Weight of the image loss between rendered labels and masks, which separates moving from static "
+        "Gaussians. Used if masks are given and at least a tenth of the Gaussians are static.",
     )
     mask_alone: NotNegative = Field(
         0.3,
-        description="Weight of the mask loss if nearly all Gaussians move: the images already show the silhouette, and "
-        "hard mask edges would distort it.",
+        description="Weight of the mask loss if nearly all Gaussians move. It is lower, because hard mask edges would "
+        "distort the silhouette.",
     )
     rigidity: NotNegative = Field(
         4.0,
-        description="Weight of the rigidity loss, as in Dynamic3DGaussians; the paper's ratio to the image loss is "
-        "0.19 to 0.05.",
+        description="Weight of the rigidity loss, as in Dynamic3DGaussians. In the paper, its ratio to the image loss "
+        "is 0.19 to 0.05.",
     )
     isometry: NotNegative = Field(
         6.0,
-        description="Weight of the isometry loss, three times the authors' weight. It preserves distances and allows "
-        "bending.",
+        description="Weight of the isometry loss, which preserves distances but allows bending; three times the weight "
+        "in Dynamic3DGaussians.",
     )
     rotation: NotNegative = Field(4.0, description="Weight of the rotation loss, as in Dynamic3DGaussians.")
     scale: NotNegative = Field(
-        10.0, description="Weight of the axis-length loss; the paper's ratio to the image loss is 0.48 to 0.05."
+        10.0, description="Weight of the axis-length loss. In the paper, its ratio to the image loss is 0.48 to 0.05."
     )
 
 
@@ -159,52 +159,52 @@ class UpdateSettings(SettingsModel):
         1,
         ge=1,
         le=8,
-        description="Training views per iteration, over which losses and gradients are averaged. The paper does not "
-        "give a number; its code base, Dynamic3DGaussians, uses one.",
+        description="Number of training views per iteration; losses and gradients are averaged over them. The paper "
+        "does not state the number; its code base, Dynamic3DGaussians, uses one view.",
     )
     budget_ms: Annotated[float, Field(gt=0, le=3_600_000)] | None = Field(
         None,
         description="Time budget per frame in milliseconds, including decoding and commit. It determines the number of "
-        "iterations and overrides `iterations`. No limit if None.",
+        "iterations and overrides `iterations`. None means no limit.",
     )
     stop_gain: Share = Field(
         0.0,
-        description="An update decays its learning rates and ends once ten iterations reduce its error on the probe "
-        "views by less than this fraction, after all layers have started. 0 disables early stopping.",
+        description="Once all layers have started, an update stops early if ten iterations reduce its error on the "
+        "probe views by less than this fraction. 0 disables early stopping.",
     )
     skip_tolerance: float = Field(
         0.0,
         ge=-1,
-        description="Skip the update if the previous state's error on the probe views is at most (1 + skip_tolerance) "
-        "times the error after the last update. -1 never skips.",
+        description="An update is skipped if the error of the previous state on the probe views is at most "
+        "(1 + skip_tolerance) times the error after the last update. -1 disables skipping.",
     )
     reject_outliers: bool = Field(
         True,
-        description="Exclude outlying cameras, reject frames that do not fit, and never commit a state that fits worse "
-        "than the unchanged previous state. The frame report gives the reasons.",
+        description="Whether to exclude outlier cameras, reject frames that do not fit, and discard states that fit "
+        "worse than the previous state. The frame report states the reasons.",
     )
     max_rejected_frames: int = Field(
         10,
         ge=1,
         le=1_000_000,
-        description="Number of consecutive frames that do not fit; the last one is accepted as a new scene. Dark "
-        "frames do not count. A lighting change that lasts this long is accepted as the scene's normal lighting.",
+        description="If this many consecutive frames do not fit, the last is accepted, because the scene has changed. "
+        "Dark frames do not count. A lighting change of this length is accepted as the scene's normal lighting.",
     )
     clusters: tuple[Count, ...] = Field(
         (64, 320, 1280),
         max_length=16,
-        description="Number of clusters per layer, coarse to fine, as in the paper. If empty, each Gaussian moves "
-        "independently.",
+        description="Number of clusters per layer, from coarse to fine; the default is the paper's. If empty, each "
+        "Gaussian moves independently.",
     )
     cluster_map: Literal["centred", "published"] = Field(
         "centred",
-        description="Scale about the pivot ('centred', translation-equivariant) or the world origin ('published', as "
-        "in the paper).",
+        description="Whether clusters scale about their pivot ('centred', translation-equivariant) or the world origin "
+        "('published', as in the paper).",
     )
     covariance: Literal["entangled", "separate"] = Field(
         "entangled",
-        description="The covariance of a Gaussian follows the Jacobian of its map ('entangled', as in the paper), or "
-        "is learnt separately by its own ΔR and Δs ('separate', the paper's ablation).",
+        description="Whether a Gaussian's covariance follows the Jacobian of its map ('entangled', as in the paper) or "
+        "only its own ΔR and Δs ('separate', the paper's ablation).",
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (
@@ -213,44 +213,45 @@ class UpdateSettings(SettingsModel):
             LayerRates(rotation=0.002, translation=0.0004),
         ),
         min_length=1,
-        description="Learning rates of each layer, coarse to fine; the last entry is repeated for further layers.",
+        description="Learning rates of each layer, from coarse to fine; further layers use the last entry.",
     )
     deltas_start: Share = Field(
         0.4,
-        description="Fraction of the iterations after which each Gaussian's own Δp, ΔR and Δs are learnt. The cluster "
-        "layers start earlier, one after another.",
+        description="Fraction of the iterations after which the optimization of each Gaussian's own Δp, ΔR and Δs "
+        "starts. The cluster layers start earlier, one after another.",
     )
     cold_start_iterations: Positive = Field(
-        3.0, description="Factor on the number of iterations of an update without previous motion."
+        3.0, description="Factor applied to the number of iterations if there is no previous motion."
     )
     cold_start_rates: float = Field(
-        2.0, ge=1, description="Factor on the learning rates of the layers in an update without previous motion."
+        2.0, ge=1, description="Factor applied to the layers' learning rates if there is no previous motion."
     )
     rate_position: Positive = Field(1.6e-4, description="Learning rate of Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="Learning rate of ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Learning rate of Δs, on a logarithmic scale.")
-    rate_colour: NotNegative = Field(0.0025, description="Learning rate of the RGB of moving Gaussians.")
+    rate_colour: NotNegative = Field(0.0025, description="Learning rate of the colours of moving Gaussians.")
     rate_static_colour: NotNegative = Field(
         0.01,
-        description="Learning rate of the RGB of static Gaussians, if static_colour is on. If 0, they keep their "
-        "colours.",
+        description="Learning rate of the colours of static Gaussians while the effect static_colour is on. 0 fixes "
+        "these colours.",
     )
     final_rate: float = Field(
         0.05,
         gt=0,
         le=1,
-        description="Each learning rate decays along a half-cosine to this fraction, until its layer is frozen. 1 "
-        "keeps the rates constant.",
+        description="Fraction of its initial value to which each learning rate decays along a half-cosine, until its "
+        "layer is frozen. 1 keeps the rates constant.",
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Decay rate of Adam's first moment.")
     beta2: Share = Field(
         0.95, description="Decay rate of Adam's second moment; 100 iterations are too few for the usual 0.999."
     )
     momentum: Unit = Field(
-        0.0, description="Fraction of the previous residual motion, beyond that of the layers, with which Δp starts."
+        0.0,
+        description="Fraction of a Gaussian's own previous motion, relative to the layers, from which Δp and ΔR start.",
     )
     weights: Weights = Field(default_factory=Weights)
-    use_masks: bool = Field(True, description="Use masks in frames that have them.")
+    use_masks: bool = Field(True, description="Whether to use masks, if available.")
     seed: int = Field(0, ge=0, description="Random seed for the order of views and the sampling of neighbours.")
 
     @field_validator("clusters")

@@ -47,7 +47,7 @@ class ServerSettings(BaseSettings):
 
     model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
-    data: Path = Field(default=Path("data"), description="Data folder with the scenes; created if missing.")
+    data: Path = Field(default=Path("data"), description="Data folder for the scenes; created if missing.")
 
     host: str = Field(
         default="127.0.0.1", description="Address to listen on. Any address other than loopback requires a token."
@@ -56,18 +56,18 @@ class ServerSettings(BaseSettings):
     token: SecretStr | None = Field(
         default=None,
         description=(
-            "Token that every request must send (Authorization: Bearer), except for /health, the viewer's "
-            "files and the API description. Without a token, every user of this machine has full access."
+            "Token that every request must send (Authorization: Bearer), except requests for /health, the "
+            "viewer's files and the API description. Without a token, every user of this machine has full access."
         ),
     )
     token_file: Path | None = Field(
-        default=None, description="File that contains the token, such as a mounted secret; excludes `token`."
+        default=None, description="File that contains the token, such as a mounted secret; conflicts with `token`."
     )
     allowed_hosts: Names = Field(
         default=(),
         description=(
-            "Additional host names of the service: `studio.example`, or `studio.example:8443` for one "
-            "port. Requests for other names are refused, to prevent DNS rebinding."
+            "Additional host names of the service: `studio.example`, or `studio.example:8443` for one port. "
+            "Requests for other names are refused, to prevent DNS rebinding."
         ),
     )
     allowed_origins: Names = Field(
@@ -80,7 +80,7 @@ class ServerSettings(BaseSettings):
         gt=0,
         le=600,
         description=(
-            "Time limit in seconds for sending a header, counted from the opening of the connection or the first byte "
+            "Time limit in seconds for sending a header, from the opening of the connection or the first byte "
             "of a later request."
         ),
     )
@@ -101,7 +101,7 @@ class ServerSettings(BaseSettings):
         gt=0,
         le=3600,
         description=(
-            "Time in seconds until an idle connection is closed. Clients and proxies should close theirs "
+            "Time in seconds after which an idle connection is closed. Clients and proxies should close theirs "
             "earlier (httpx: 5 s)."
         ),
     )
@@ -123,7 +123,7 @@ class ServerSettings(BaseSettings):
         ge=4,
         description=(
             "Maximum number of open connections per address, or per client of a trusted proxy. The default is enough "
-            "for 64 cameras with a sender each, and their viewers."
+            "for 64 cameras with one sender each, plus viewers."
         ),
     )
     trusted_proxies: Names = Field(
@@ -155,7 +155,7 @@ class ServerSettings(BaseSettings):
     max_scenes: int = Field(
         default=8,
         ge=1,
-        description="Maximum number of awake scenes, each with up to three processes; all others are asleep.",
+        description="Maximum number of awake scenes, each with up to three processes; others are asleep.",
     )
     sleep_seconds: float = Field(
         default=600.0,
@@ -171,7 +171,7 @@ class ServerSettings(BaseSettings):
     queue_frames: int = Field(
         default=4,
         ge=1,
-        description="Maximum number of acknowledged but unfinished frames per scene; further frames get 429.",
+        description="Maximum number of acknowledged but unfinished frames per scene; further frames are refused (429).",
     )
     max_body_mb: float = Field(
         default=256,
@@ -184,18 +184,17 @@ class ServerSettings(BaseSettings):
     max_image_pixels: int = Field(
         default=40_000_000,
         ge=1,
-        description="Maximum number of pixels per camera. A decoded image takes 3 bytes per pixel, and 6 while it is "
-        "being decoded.",
+        description="Maximum number of pixels per camera. An image takes 3 bytes per pixel, and 6 during decoding.",
     )
     max_subscribers: int = Field(
-        default=128, ge=1, description="Maximum number of subscribers per scene; further ones get 429."
+        default=128, ge=1, description="Maximum number of subscribers per scene; further ones are refused (429)."
     )
     scrub_mb_per_second: float = Field(
         default=4.0,
         ge=0,
         description=(
-            "Rate at which each scene's files are reread to verify their checksums, reduced to a quarter "
-            "during updates; 0 disables this check. Reading 4 MB/s takes half a percent of a core."
+            "Rate at which each scene's files are reread to verify checksums, reduced to a quarter "
+            "during updates. 0 disables the check. Reading 4 MB/s takes half a percent of a core."
         ),
     )
     scrub_pause_seconds: float = Field(
@@ -204,8 +203,8 @@ class ServerSettings(BaseSettings):
     warm_up: bool = Field(
         default=True,
         description=(
-            "Compile missing kernels at startup, in separate processes. /health/ready waits for the kernels needed "
-            "for a first frame."
+            "Whether to compile missing kernels at startup, in separate processes. /health/ready waits for the kernels "
+            "needed for a first frame."
         ),
     )
 

@@ -1,8 +1,9 @@
-"""A pool of processes that compile kernels in parallel, and a function that waits for them.
+"""Pool of processes that compile kernels in parallel, and a function that waits for the kernels.
 
-Each process of the pool claims and compiles one kernel after another until none is left. At most one process per core
-compiles for the same cache at a time; the service, tests and commands share this limit. Results are bit-identical
-regardless of which process compiled a kernel.
+Each process of the pool claims and compiles one kernel after another until no kernel is left. At
+most one process per core, and at most ``MAX_PROCESSES``, compile for the same cache at the same
+time. The service, tests and commands share this limit. Results are bit-identical regardless of
+which process compiled a kernel.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ log = logging.getLogger("scas4d.kernels")
 MAX_PROCESSES = 4
 """Maximum number of processes. Each needs about 350 MB, and the slowest kernel takes a sixth of the total time."""
 NICE = 10
-"""Increase in niceness of processes that compile in advance, so that frames, views and requests take priority."""
+"""Increase of the niceness of processes that compile in advance. Frames, views and requests thus
+take priority."""
 GC_THRESHOLDS = (200_000, 20, 1000)
 """Thresholds of Python's garbage collector, tuned for a compiler with millions of long-lived objects.
 
@@ -46,13 +48,18 @@ _pool: list[subprocess.Popen[bytes]] = []
 
 
 def processes() -> int:
-    """Returns the number of processes that may compile concurrently: one per core, at most `MAX_PROCESSES`."""
+    """Returns the number of processes that may compile concurrently.
+
+    The number is one per core, but at most ``MAX_PROCESSES``.
+    """
     cores = usable_cores()
     return min(cores, MAX_PROCESSES)
 
 
 def compile_kernels(wanted: Iterable[str], then: Iterable[str]) -> int:
-    """Compiles kernels that no other process has claimed; this is the main function of a pool process.
+    """Compiles kernels that no other process has claimed.
+
+    This function is the main function of a pool process.
 
     Args:
         wanted: names of the groups to compile first.
@@ -96,16 +103,20 @@ def _compile_all(marks: CompiledMarkers, groups: Iterable[KernelGroup]) -> int:
 def wait_for_kernels(
     wanted: Iterable[KernelGroup], then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> bool:
-    """Waits until all kernels of the ``wanted`` groups are cached, and starts processes to compile them if needed.
+    """Waits until all kernels of the ``wanted`` groups are cached.
+
+    If kernels are missing, processes that compile these kernels are started.
 
     Args:
         wanted: groups to wait for.
-        then: groups that the same processes compile afterwards; this function does not wait for them.
-        on_progress: function called at the start if kernels are missing, and whenever more kernels have been compiled.
+        then: groups that the same processes compile afterwards. This function does not wait for
+            these groups.
+        on_progress: function called at the start if kernels are missing, and whenever more kernels
+            have been compiled.
 
     Returns:
-        True if the kernels are cached. False if they could not be compiled in advance; each is then compiled when it
-        is first called.
+        Whether the kernels are cached. If they could not be compiled in advance, each kernel is
+        compiled on its first call.
     """
     wanted, then = tuple(wanted), tuple(then)
     kernels = kernels_of(wanted)
@@ -138,7 +149,8 @@ def wait_for_kernels(
 
 
 def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
-    # Pass sys.path on, since the package may be importable only with the path of this process.
+    # The new process gets sys.path, because the package may be importable only with the path of
+    # this process.
     program = (
         "import sys; groups = [given.split(';') if given else [] for given in sys.argv[1:3]]; "
         "sys.path[:] = sys.argv[3:]; "
@@ -148,7 +160,7 @@ def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
     for _ in range(processes()):
         try:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-        except OSError:  # no interpreter found, e.g. in an embedded Python
+        except OSError:  # there is no interpreter, e.g. in an embedded Python
             return False
         threading.Thread(target=process.wait, daemon=True).start()  # avoids zombie processes
         _pool.append(process)

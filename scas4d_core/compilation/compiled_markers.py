@@ -1,7 +1,8 @@
-"""Markers for compiled kernels (empty files next to the cache), and lock files of the processes that compile.
+"""Markers for compiled kernels, and lock files of the processes that compile kernels.
 
-A marker means that a kernel is cached for this version, checkout and processor. Numba keys its cache by source path, so
-each checkout has its own markers. A lock is released when its process ends.
+A marker is an empty file in the cache folder. It means that a kernel is cached for this version,
+checkout and processor. Numba keys its cache by source path, so each checkout has its own markers. A
+lock is released when its process ends.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from scas4d_core.compilation.manifest import Kernel
 from scas4d_core.kernels.cache import locked
 
 SLOT_WAIT_S = 1.0
-"""Seconds for which a process keeps trying to get a slot, because `is_compiling` briefly locks slots to check them."""
+"""Seconds for which a process keeps trying to get a slot. `is_compiling` briefly locks slots to
+check them."""
 
 
 def open_markers() -> CompiledMarkers | None:
@@ -57,18 +59,26 @@ class CompiledMarkers:
 
     def add(self, kernel: Kernel) -> None:
         """Marks a kernel as compiled."""
-        with suppress(OSError):  # e.g. disk full; the kernel is compiled anyway
+        with suppress(OSError):  # e.g. the disk is full; the compiled kernel can be used anyway
             (self.folder / kernel.key).touch()
 
     @contextmanager
     def claim(self, kernel: Kernel) -> Iterator[bool]:
-        """Yields True to one process at a time, which may then compile the kernel, and False to all others."""
+        """Context manager that lets one process at a time compile a kernel.
+
+        Yields True if this process may compile the kernel, and False if another process compiles
+        it.
+        """
         with locked(self.folder / f"{kernel.key}.lock", wait=False) as mine:
             yield mine
 
     @contextmanager
     def slot(self, slots: int) -> Iterator[bool]:
-        """Yields True to at most ``slots`` processes at a time, and False to all others."""
+        """Context manager that lets at most ``slots`` processes compile at a time.
+
+        Yields True if this process has a slot, and False if no slot becomes free within
+        ``SLOT_WAIT_S``.
+        """
         until = time.monotonic() + SLOT_WAIT_S
         while True:
             for number in range(slots):

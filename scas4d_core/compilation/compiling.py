@@ -1,4 +1,4 @@
-"""Compiles a kernel of the manifest for its argument types and stores it in the cache."""
+"""Compilation of a kernel of the manifest, for its argument types, into the cache."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _type_of(word: str) -> Any:
 
 
 def compile_kernel(kernel: Kernel) -> None:
-    """Compiles a kernel into the cache, or loads it if it is already cached.
+    """Compiles a kernel into the cache, or loads the kernel if it is already cached.
 
     Raises:
         Exception: if the function does not exist, or Numba cannot compile it for these types.

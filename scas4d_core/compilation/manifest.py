@@ -1,8 +1,9 @@
 """Kernels that scenes call, with their argument types, grouped by the stage that needs them.
 
-Numba compiles a kernel on its first call, for the argument types of that call. This list declares the types in advance
-so that several processes can share the work; a test compares it with the kernels that a scene calls. A kernel missing
-from the list still works, but the first process to call it must compile it.
+Numba compiles a kernel on its first call, for the argument types of that call. This list declares
+the types in advance, so that several processes can share the work. A test compares the list with
+the kernels that a scene calls. A kernel that is missing from the list still works, but the first
+process that calls the kernel must compile it.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ class Kernel:
         group: group to which the kernel belongs.
         module: module of the function, relative to ``scas4d_core``.
         name: name of the function.
-        arguments: one word per argument. The first letter is the type: f, d for float32, float64; i, s for int64,
-            int32; u, w, y for uint32, uint64, uint8; b for bool. A number after the letter is the number of array axes.
-            i*2 is a tuple of two int64, and none is None.
+        arguments: one word per argument. The first letter is the type: f, d for float32, float64;
+            i, s for int64, int32; u, w, y for uint32, uint64, uint8; b for bool. A number after the
+            letter is the number of array axes. The word i*2 is a tuple of two int64, and the word
+            none is None.
     """
 
     group: KernelGroup
@@ -55,7 +57,8 @@ def _of(group: KernelGroup, *rows: str) -> tuple[Kernel, ...]:
     return tuple(Kernel(group, module, name, arguments) for module, name, arguments in split)
 
 
-# In each group, the kernels that take longest to compile come first, which balances the load best.
+# In each group, kernels with the longest compilation time come first, because this order balances
+# the load.
 KERNELS = (
     *_of(
         KernelGroup.FIRST_FRAME,

@@ -1,4 +1,4 @@
-"""Fits frame 0, and collects the data from it that every update needs."""
+"""Fit of frame 0, and the data from frame 0 that every update needs."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ Colour = tuple[float, float, float]
 def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
     """Returns the settings with the background 'auto' replaced by a colour from the images.
 
-    A plain backdrop's colour is used if there is one, otherwise the mean colour of the images. A background colour that
-    does not occur in the images, such as black in a bright room, causes dark seams. It also causes black holes in
-    regions that no camera sees.
+    If the images show a plain backdrop, the background gets its colour. Otherwise, the background
+    gets the mean colour of the images. A background colour that does not occur in the images, such
+    as black in a bright room, would cause dark seams, and black holes in regions that no camera
+    sees.
 
     Args:
         settings: settings of the scene.
@@ -51,7 +52,7 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
         return settings
     pictures = [image for image in images.values() if image.ndim == 3 and image.shape[2] == 3]
     pictures = [image for image in pictures if min(image.shape[:2]) > PIXEL_STRIDE]
-    if not pictures:  # rejected later with an error message
+    if not pictures:  # such images are rejected later with an error message
         return settings
     backdrop_colour = backdrop(pictures)
     return _set_background(settings, _colour(mean_colour(pictures) if backdrop_colour is None else backdrop_colour))
@@ -68,7 +69,10 @@ def _set_background(settings: Settings, background: Sequence[float]) -> Settings
 
 
 def with_recorded_background(settings: Settings, history: History) -> Settings:
-    """Returns the settings with a scene's recorded background, or unchanged if its first frame cannot be read."""
+    """Returns the settings with the background 'auto' replaced by a scene's recorded background.
+
+    If the first frame of the scene cannot be read, the settings are returned unchanged.
+    """
     if settings.scene.background != "auto":
         return settings
     with suppress(HistoryError):
@@ -93,7 +97,10 @@ class FirstFrame:
     background: Colour
 
     def record(self) -> dict[str, Any]:
-        """Returns the data not stored in the state of frame 0, as JSON values to be included in frame 0's report."""
+        """Returns the data that the state of frame 0 does not contain, as JSON values.
+
+        The values are included in the report of frame 0.
+        """
         return {
             "masked": self.masked,
             "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
@@ -125,11 +132,11 @@ def fit_static_scene(
     settings: StaticSettings,
     progress: Callable[[FitProgress], None] | None = None,
 ) -> StaticResult:
-    """Fits Θ_0 to the views of frame 0, starting from a point cloud.
+    """Fits the Gaussians Θ_0 to the views of frame 0, starting from a point cloud.
 
     Args:
         factory: factory that creates the scene's views.
-        views: views of frame 0; their exposures are learnt in place.
+        views: views of frame 0. Their exposures are learnt in place.
         positions: [P, 3] point positions in metres, in the internal world.
         colours: [P, 3] point colours in 0…1.
         foreground: [P] foreground label of each point in 0…1, or None.
@@ -163,9 +170,10 @@ def fit_first_frame(
     world: WorldFrame,
     on_progress: Callable[[Progress], None],
 ) -> StaticResult:
-    """Fits frame 0 to its images, starting from a given point cloud or from one computed from the images.
+    """Fits Gaussians to the images of frame 0, starting from a given or a computed point cloud.
 
-    The cloud is computed in the internal world, so that it does not depend on the user's origin and unit.
+    Points are computed in the internal world, so that the result does not depend on the user's
+    origin and unit.
 
     Args:
         frame: images and masks of frame 0, at the image size of the factory's rig.
@@ -205,12 +213,12 @@ def fit_first_frame(
 
 
 def _remaining_time(limit: TimeLimit) -> dict[str, float]:
-    """Returns the maximum remaining time of frame 0 in seconds for a progress report, or {} if there is no limit."""
+    """Returns the maximum remaining time of frame 0 in seconds, or {} without a limit."""
     return {"seconds_at_most": max(0.0, limit.seconds_left())} if limit.bounded else {}
 
 
 def _figures(now: FitProgress, limit: TimeLimit) -> dict[str, float]:
-    """Returns the loss and the remaining time, to be included in a progress report."""
+    """Returns the loss and the remaining time, for a progress report."""
     left = {} if now.seconds is None else {"seconds_left": now.seconds}
     return {"loss": now.loss, **left, **_remaining_time(limit)}
 

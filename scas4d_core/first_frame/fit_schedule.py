@@ -1,9 +1,10 @@
-"""Iteration schedule of frame 0: all configured iterations or, if a time limit requires it, fewer in every phase.
+"""Iteration schedule of frame 0, which can shorten every phase of the fit to meet a time limit.
 
-Learning rates, density control and other events are defined in iterations of the full schedule. If time is short, each
-iteration advances the schedule by more than one. The fit thus completes all of its phases, like a shorter fit, instead
-of being cut off. The stride is computed from the measured pace and updated during the fit. With enough time, the stride
-is one, and the result is the same as without a limit.
+Learning rates, density control and other events are defined in iterations of the full schedule. If
+time is short, each iteration advances the schedule by more than one iteration. The fit thus
+completes all of its phases, like a shorter fit, instead of being cut off. The stride is the advance
+per iteration. It is computed from the measured pace and updated during the fit. With enough time,
+the stride is one, and the result is the same as without a limit.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class FitProgress:
 
 
 class FitSchedule:
-    """Plans the iterations of a fit within a time limit.
+    """Schedule of a fit, whose stride is adapted to a time limit.
 
     Args:
         iterations: number of iterations of the full schedule.
@@ -68,8 +69,9 @@ class FitSchedule:
         stride: number of iterations by which the next iteration advances the full schedule.
         fits_again: whether another complete fit must follow within the time limit.
         end: position in the full schedule at which this fit ends.
-        shortened: whether any iteration has advanced the schedule by more than one.
+        shortened: whether any iteration has advanced the schedule by more than one iteration.
         planned: (iteration, total iterations) at each change of plan.
+        seconds: predicted remaining time in seconds, or None before the first prediction.
 
     >>> schedule = FitSchedule(4, TimeLimit(None), lambda at: 100.0)
     >>> [(step := schedule.begin_iteration()).begun for _ in range(2)], step.ended, schedule.planned

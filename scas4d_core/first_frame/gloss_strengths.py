@@ -1,7 +1,9 @@
-"""Estimates gloss strengths from the images of frame 0: how strongly colours follow their predicted reflections.
+"""Gloss strengths, estimated from the images of frame 0.
 
-Gradient descent leaves matte objects with half of their initial gloss, because their gradients are small. Such objects
-then show highlights in novel views. Given the normals and environment, the strength is the slope of a regression line.
+The gloss strength of a Gaussian describes how strongly its colour follows the predicted reflection.
+Gradient descent leaves matte objects with half of their initial gloss, because their gradients are
+small. Such objects then show highlights in novel views. Here, the normals and the environment are
+given, and the strength is the slope of a regression line.
 """
 
 from __future__ import annotations
@@ -46,15 +48,16 @@ TINY = 1e-12
 def estimate_strengths(
     normals: Array, environment: Array, state: Gaussians, views: Sequence[TrainingView], renderer: Renderer
 ) -> Array:
-    """Returns the [N, 1] gloss strengths of the Gaussians, given their unit normals [N, 3] and the environment.
+    """Returns the gloss strengths [N, 1] of the Gaussians.
 
-    Over the views, each Gaussian's light (its squared image colour) is a linear function of its predicted reflection.
-    The slope is estimated over neighbours on the same side of the surface. If the line explains little, the strength
-    is taken from reliable neighbours, or is near 0 if there are none.
+    The light of a Gaussian is its squared colour in an image. Over the views, the light is a linear
+    function of the predicted reflection, and the slope of this line is the strength. The slope is
+    estimated over neighbours on the same side of the surface. If the line explains little, the
+    strength is taken from reliable neighbours, or is near 0 if there are none.
 
     Args:
         normals: [N, 3] unit surface normals.
-        environment: reflected environment.
+        environment: [ROWS, 3] reflected environment.
         state: Gaussians of the surface.
         views: training views, including their images.
         renderer: renderer used to compute blending weights.

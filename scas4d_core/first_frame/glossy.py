@@ -1,8 +1,9 @@
 """Fits frame 0 with glossy objects: a trial detects them, and a second fit models their reflections.
 
-Without a gloss model, the fit reproduces each camera's highlights with off-surface Gaussians that only this camera
-sees. These Gaussians persist in later frames. An early trial checks whether colours depend on the viewing direction. If
-they do, the environment is learnt on the current surface, and the fit restarts with this environment and surface.
+Without a gloss model, the fit reproduces the highlights in each camera's image with Gaussians off
+the surface that only this camera sees. These Gaussians persist in later frames. An early trial
+therefore checks whether colours depend on the viewing direction. If they do, the environment is
+learnt on the current surface, and the fit restarts with this environment and surface.
 """
 
 from __future__ import annotations
@@ -56,11 +57,11 @@ SMOOTH_EVERY = 10
 def fit_with_gloss_trial(
     make: Callable[[], StaticTrainer], mode: Mode, progress: Callable[[FitProgress], None] | None = None
 ) -> StaticResult:
-    """Fits Θ_0, with view-dependent colours if needed.
+    """Fits the Gaussians Θ_0 of frame 0, with view-dependent colours if the scene is glossy.
 
     Args:
         make: function that creates a new trainer.
-        mode: whether to use view-dependent colours; "auto" runs a trial to decide.
+        mode: whether to use view-dependent colours: "on", "off", or "auto" to decide with a trial.
         progress: function called after each iteration.
     """
     trainer = make()
@@ -90,17 +91,19 @@ def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[A
 
 
 class GlossTrial:
-    """Decides whether colours depend on the viewing direction, using the surface of an unfinished fit.
+    """Trial that decides whether colours depend on the viewing direction.
+
+    The trial uses the surface of an unfinished fit.
 
     Args:
         trainer: trainer of the fit.
         mode: "auto" to decide by evidence, or "on" to always use view-dependent colours.
 
     Attributes:
-        on: whether to use view-dependent colours; false before the trial.
+        on: whether to use view-dependent colours. The value is false before the trial.
         out_of_time: whether the trial was skipped for lack of time.
-        evidence: fraction of the residual that view-dependent colours explain beyond constant colours, or None without
-            a trial.
+        evidence: fraction of the residual that view-dependent colours explain beyond constant
+            colours, or None if the trial has not run.
     """
 
     def __init__(self, trainer: StaticTrainer, mode: Mode) -> None:
@@ -109,7 +112,10 @@ class GlossTrial:
         self.evidence: Evidence | None = None
 
     def run_when_due(self, now: FitStep) -> bool:
-        """Runs the trial if it is due, and returns whether gloss is needed; does not change the fit."""
+        """Runs the trial if it is due, and returns whether a gloss model is needed.
+
+        The trial does not change the fit.
+        """
         if not now.reaches(max(1, round(TRIAL * self._trainer.settings.iterations))):
             return False
         few = len(self._trainer.views) < MIN_VIEWS or self._trainer.settings.iterations < MIN_ITERATIONS
@@ -124,7 +130,10 @@ class GlossTrial:
         return self.on
 
     def _remaining_error(self, gloss: GlossShading | None) -> float:
-        """Returns the mean squared image error after a few passes of fitting the colours, and the gloss if given."""
+        """Fits the colours, and the gloss if given, and returns the mean squared image error.
+
+        The fit makes ``ROUNDS`` passes over all views. All other parameters are fixed.
+        """
         trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
         rates[COLOUR] = RATE
         parameters, cameras = trainer.fit.table.parameters.copy(), len(trainer.views)
@@ -163,7 +172,7 @@ class GlossTrial:
 
 
 class GlossyFit:
-    """Fits frame 0 with the surface normals and environment of a previous fit.
+    """Fit of frame 0 that starts with the surface normals and environment of a previous fit.
 
     Args:
         trainer: new trainer.
@@ -179,7 +188,12 @@ class GlossyFit:
         trainer.fit.set_gloss(GlossShading.fresh(self._with_first_normals(None), means, environment))
 
     def _with_first_normals(self, gloss: Array | None) -> Array:
-        """Returns the [N, 3] gloss with the first surface's normals, and also with its strengths if gloss is None."""
+        """Returns the gloss [N, 3] of the current Gaussians, with the normals of the first surface.
+
+        Args:
+            gloss: [N, 3] gloss from which the strengths are taken, or None to use the strengths of
+                the first surface.
+        """
         near = self._tree.query(self._trainer.fit.table.parameters[:, MEAN], 6)[1]
         normals = self._normals[near].mean(axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)

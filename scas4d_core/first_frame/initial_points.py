@@ -1,4 +1,4 @@
-"""Computes the initial point cloud from the images of frame 0 and calibrated cameras, using several methods."""
+"""Initial point cloud, computed from the images of frame 0 and the calibrated cameras."""
 
 from __future__ import annotations
 
@@ -49,14 +49,15 @@ LITTLE_COVERAGE = 0.05
 
 @dataclass(eq=False)
 class InitialCloud(InitialPoints):
-    """Initial points, and the methods that found them.
+    """Initial points, and the methods that found the points.
 
     Attributes:
-        method: methods used, joined by " + ": "agreement" (at least three cameras agree), "backdrop" (silhouettes in
-            front of a plain backdrop), "pairs" (two cameras agree), "plane" (a floor or table on which images agree),
-            "surroundings" (images placed far behind the scene), "volume" (unconfirmed points in the volume that the
-            cameras share).
-        coverage: median over cameras of the fraction of image cells that contain a point that cameras agree on.
+        method: methods used, joined by " + ": "agreement" (at least three cameras agree),
+            "backdrop" (silhouettes in front of a plain backdrop), "pairs" (two cameras agree),
+            "plane" (a floor or table on which images agree), "surroundings" (images placed far
+            behind the scene), "volume" (unconfirmed points in the volume that the cameras share).
+        coverage: median over the cameras of the fraction of image cells that contain a confirmed
+            point, i.e. a point on which cameras agree.
         stage: region enclosed by the surroundings, or None if there are no surroundings.
     """
 
@@ -79,32 +80,39 @@ def initial_points(
 ) -> InitialCloud:
     """Finds points on the surfaces that are visible in the images of one frame.
 
-    Triangulated features bound the scene and provide support for walls and floors. PatchMatch stereo adds textured
-    surfaces; its points are kept if at least ``MIN_VIEWS`` cameras agree and few see through them. The visual hull (of
-    the masks, or of silhouettes in front of a plain background) and fitted surfaces add the rest.
+    Triangulated features bound the scene, and walls, floors and domes are fitted to the features.
+    PatchMatch stereo adds textured surfaces. A stereo point is kept if at least ``MIN_VIEWS``
+    cameras agree on the point and few cameras see through it. The visual hull (of the masks, or of
+    silhouettes in front of a plain background) and the fitted surfaces fill the remaining gaps.
 
-    With few, widely spaced cameras, these points may cover too little of the images. Further methods are then tried in
-    turn: silhouettes in front of a backdrop that does not fill the image borders, points that two cameras agree on,
-    and a plane on which images agree. Finally, the images themselves are placed far behind the scene. If almost nothing
-    is found, points are sampled in the volume that the cameras share.
+    With few, widely spaced cameras, these points may cover too little of the images. Three further
+    methods are then tried in turn. The first uses silhouettes in front of a backdrop that does not
+    fill the image borders. The second accepts points on which two cameras agree. The third searches
+    for a plane on which images agree. If almost nothing is found, points are sampled in the volume
+    that the cameras share. Unless the scene has a plain backdrop, the images themselves are finally
+    placed far behind the scene.
 
     Args:
-        rig: calibrated cameras, in the user's world.
-        images: maps each camera name to its image, [H, W, 3] uint8; cameras without an image are ignored.
-        masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground; may be empty.
+        rig: calibrated cameras, in any world.
+        images: maps each camera name to its image, [H, W, 3] uint8. Cameras without an image are
+            ignored.
+        masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground. The mapping may
+            be empty.
         progress: function called with (stage, done, total).
         max_points: maximum number of points.
         stereo: whether to use dense stereo in textured regions.
         stereo_iterations: number of stereo rounds of propagation and refinement.
-        seed: random seed; the same seed gives the same points.
-        limit: time limit of frame 0; if time is short, the search is coarser, as recorded in ``limit.shortened``.
+        seed: random seed. The same seed gives the same points.
+        limit: time limit of frame 0, or None for no limit. If time is short, the search is coarser,
+            and ``limit.shortened`` lists the shortened steps.
 
     Returns:
-        Points in the user's units; ``foreground`` is None if there are no masks.
+        Points in the rig's world. ``foreground`` is None unless masks or silhouettes label all
+        points.
 
     Raises:
-        InitialPointsError: if there are fewer than two images, an image does not have its camera's size, or no two
-            cameras look at the same place.
+        InitialPointsError: if there are fewer than two images, an image or mask does not have the
+            size of its camera, or no two cameras look at the same place.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot", image_scale=0.5)
@@ -141,7 +149,8 @@ def initial_points(
     confirmed = 0.0 if points is None else points.coverage
     if points is None or confirmed <= LITTLE_COVERAGE:
         points = merge_points(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
-    if before is views and not first.backdrop:  # otherwise the background is the colour of the backdrop
+    # A plain backdrop needs no points, because it is rendered as the background colour.
+    if before is views and not first.backdrop:
         points = merge_points(points, surroundings(before, distances), "surroundings", before, 0.0)
         points = replace(points, stage=Stage.of(before, distances))
     return replace(points, coverage=confirmed)
@@ -154,7 +163,10 @@ def _add_points(
     views: Sequence[PosedPicture],
     spacing: float,
 ) -> InitialCloud | None:
-    """Merges a method's points into the previous points, which are returned unchanged if the method finds none."""
+    """Merges a method's points into the previous points.
+
+    If the method finds no points, the previous points are returned unchanged.
+    """
     try:
         return merge_points(found, search(), method, views, spacing)
     except InitialPointsError:
@@ -162,7 +174,7 @@ def _add_points(
 
 
 def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSearch]]:
-    """Returns the search methods for points that cameras agree on, most reliable first."""
+    """Returns the methods that search for points on which cameras agree, most reliable first."""
     ways = [("agreement", first)]
     if not masked and not first.backdrop:
         colour = backdrop([view.image for view in first.labelled])
@@ -177,7 +189,15 @@ def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSe
 def merge_points(
     found: InitialCloud | None, cloud: InitialPoints, method: str, views: Sequence[PosedPicture], spacing: float
 ) -> InitialCloud:
-    """Adds all points of ``cloud`` that are more than ``spacing`` (in world units) away from the previous points."""
+    """Returns the previous points and all points of ``cloud`` that are not close to one of these.
+
+    Args:
+        found: previous points, or None.
+        cloud: points to add.
+        method: name of the method that found ``cloud``.
+        views: views for measuring the coverage.
+        spacing: distance from the previous points, in world units, that an added point must exceed.
+    """
     if found is None:
         both = InitialCloud(cloud.positions, cloud.colours, cloud.foreground, method)
     else:
@@ -186,7 +206,8 @@ def merge_points(
         both = InitialCloud(
             np.concatenate([found.positions, cloud.positions[new]]),
             np.concatenate([found.colours, cloud.colours[new]]),
-            # Silhouettes of one method label only its own points, so the combined cloud has no labels.
+            # The silhouettes of one method label only the points of this method. If other points
+            # have no labels, the combined cloud has none either.
             None if any(label is None for label in labels) else np.concatenate(labels),  # type: ignore[arg-type]
             f"{found.method} + {method}",
         )

@@ -36,12 +36,13 @@ TINY = 1e-9
 def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: Renderer) -> Array:
     """Returns the [N, 3] unit normals of the Gaussians, pointing outwards, towards the cameras.
 
-    Each pixel's normal is computed from the depth gradient and distributed to the Gaussians by their blending weights.
-    The normals are then averaged over neighbours.
+    The normal of each pixel is computed from the gradient of the rendered depth. A Gaussian gets
+    the mean of these normals, weighted by its blending weights. The normals are then averaged over
+    neighbouring Gaussians.
 
     Args:
         state: Gaussians of the surface.
-        views: training views; depth is rendered from their cameras.
+        views: training views. Depth is rendered from their cameras.
         renderer: renderer used to render depth.
     """
     means, count = state.means, len(state)

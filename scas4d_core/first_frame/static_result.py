@@ -23,8 +23,8 @@ class FirstCloud:
         method: "given" for a cloud supplied by the user, otherwise the methods used; see
             ``initial_points.InitialCloud``.
         points: number of points.
-        coverage: fraction of the image area covered by points that the cameras agree on, or None for a cloud supplied
-            by the user.
+        coverage: fraction of the image area covered by points on which cameras agree, or None for a
+            cloud supplied by the user.
     """
 
     method: str
@@ -43,10 +43,11 @@ class StaticResult:
         losses: training loss of each iteration.
         psnr: PSNR of the view rendered in each iteration, in dB.
         cameras: how well each camera's image was fitted in its last iteration, keyed by camera name.
-        evidence: evidence for each effect, keyed by effect name, or None without a trial.
+        evidence: evidence for each effect that a trial tested, keyed by effect name, or None if
+            trials were disabled.
         cloud: origin of the initial points, or None if unknown.
         planned: (iteration, total iterations) at each change of plan.
-        ran_short_of_time: whether any iteration advanced the schedule by more than one.
+        ran_short_of_time: whether any iteration advanced the schedule by more than one iteration.
         shortened: descriptions of the steps that were shortened or skipped for lack of time.
     """
 

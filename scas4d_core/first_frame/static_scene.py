@@ -68,7 +68,7 @@ passes; fewer are too noisy."""
 
 
 class StaticTrainer:
-    """Fits Gaussians to the views of frame 0, with density control.
+    """Trainer that fits Gaussians to the views of frame 0, with density control.
 
     Attributes:
         fit: training loop and its parameters.
@@ -127,7 +127,11 @@ class StaticTrainer:
         return self.fit.losses
 
     def _after(self, now: FitStep, last: FitLoss) -> None:
-        """Records the camera's fit, and runs density control, removal and the exposure check when they are due."""
+        """Ends an iteration: records the fit of its view, and takes all steps that are due.
+
+        The possible steps are density control, removal of Gaussians that are hardly seen, the
+        stopping rule, and the exposure check.
+        """
         settings, schedule, until = self.settings, self.schedule, self._until
         if last.colour_shift is not None:
             self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)
@@ -143,17 +147,20 @@ class StaticTrainer:
         schedule.end_iteration(len(self.fit))
 
     def _target(self, at: float) -> int:
-        """Returns the target number of Gaussians at a given point in the schedule."""
+        """Returns the target number of Gaussians at a given point of the schedule."""
         share = (at - DENSIFY_FROM) / max(self._until - DENSIFY_FROM, 1)
         return round(self._start + (self.budget - self._start) * min(1.0, share + 0.1))
 
     def _expected(self, at: float) -> float:
-        """Returns the expected number of Gaussians at a point in the schedule; past points refer to a second fit."""
+        """Returns the expected number of Gaussians at a given point of the schedule.
+
+        A point before the current position refers to a second fit, which starts from the beginning.
+        """
         aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
         return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
     def _has_converged(self) -> bool:
-        """Returns whether passes over all views no longer reduce the loss; one final pass follows."""
+        """Returns whether further passes over all views hardly reduce the loss."""
         losses, window = self.fit.losses, STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
             return False
@@ -161,7 +168,10 @@ class StaticTrainer:
         return bool(before - now < self.settings.stop_gain * before)
 
     def scalars(self, now: FitStep) -> FitScalars:
-        """Returns the learning rates for an iteration; the last iterations also measure each camera's colour shift."""
+        """Returns the learning rates for an iteration.
+
+        The last iterations also measure the colour shift of each camera.
+        """
         # A shortened fit may end in the middle of a pass, but two passes include every view.
         rounds = 1 if self.schedule.stride == 1 else 2 * self.schedule.stride
         ending = now.begun >= self._last - len(self.views) * rounds
@@ -180,7 +190,10 @@ class StaticTrainer:
         return rates
 
     def control_density(self, target: int) -> None:
-        """Removes nearly transparent Gaussians, and clones or splits those with the largest screen-space gradients.
+        """Removes nearly transparent Gaussians, and densifies Gaussians with large gradients.
+
+        Gaussians with the largest screen-space gradients come first. Of these, larger Gaussians are
+        split and smaller Gaussians are cloned.
 
         Args:
             target: target number of Gaussians.
@@ -205,8 +218,9 @@ class StaticTrainer:
     def remove_unseen(self) -> None:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
 
-        A Gaussian that no camera sees is unconstrained and may become visible when the scene moves. A Gaussian that
-        only one camera sees is a floater, which fits this camera's image but degrades all other views.
+        A Gaussian that no camera sees is unconstrained and may become visible when the scene moves.
+        A Gaussian that only one camera sees is a floater, which fits the image of this camera but
+        degrades all other views. Outside the stage, one camera suffices.
         """
         counts = np.zeros(len(self.fit), np.int64)
         state = self.gaussians()
@@ -214,7 +228,7 @@ class StaticTrainer:
             everywhere = np.ones((1, view.camera.height, view.camera.width), np.float32)
             counts += self.fit.renderer.gather(state, view.camera, everywhere)[:, 0] > SEEN_PIXELS
         needed = np.full(len(counts), min(MIN_VIEWS, len(self.views)))
-        if self.stage is not None:  # the surroundings do not occlude anything for other cameras
+        if self.stage is not None:  # the surroundings occlude nothing in other views
             needed[~self.stage.holds(state.means)] = 1
         keep = counts >= needed
         if keep.any():
@@ -222,7 +236,12 @@ class StaticTrainer:
             self.fit.replace_rows(np.flatnonzero(keep), np.zeros((0, COLUMNS), np.float32), none)
 
     def _half(self, half: Array, factors: Array) -> Array:
-        """Returns copies of the rows with smaller scales, each mean displaced by a random sample of its Gaussian."""
+        """Returns copies of Gaussians with smaller scales, and with means sampled from the originals.
+
+        Args:
+            half: [K, 15] parameter rows of the Gaussians.
+            factors: [K, 3, 3] covariance factors of the Gaussians.
+        """
         offset = self.random.standard_normal((len(half), 3)).astype(np.float32)
         half = half.copy()
         half[:, MEAN] += np.einsum("nij,nj->ni", factors, offset)
@@ -230,7 +249,7 @@ class StaticTrainer:
         return half
 
     def gaussians(self) -> Gaussians:
-        """Returns the state Θ_0; without masks, all Gaussians are labelled as foreground."""
+        """Returns the state Θ_0. Without masks, all Gaussians are labelled as foreground."""
         state = self.fit.state()
         return state if self._masked else state.replace(foreground=np.ones(len(state), np.float32))
 
@@ -260,11 +279,18 @@ def first_trainer(
     stage: Stage | None = None,
     device: Device = "cpu",
 ) -> StaticTrainer:
-    """Creates the trainer of ``fit_static_scene``, which takes the same arguments and raises the same errors.
+    """Creates a trainer whose initial Gaussians are the points of a cloud.
+
+    For the other arguments, see ``fit_static_scene``.
 
     Args:
-        stage: region in the internal world outside of which a Gaussian only needs to be seen by one camera, or None
-            without surroundings.
+        limit: time limit of frame 0, or None for no limit.
+        stage: region that contains the scene, in the internal world. Outside of this region, only
+            one camera must see a Gaussian. None if there are no surroundings.
+        device: device that runs the fit.
+
+    Raises:
+        ValueError: if the point cloud is empty.
     """
     if len(positions) == 0:
         raise ValueError("the initial point cloud is empty; provide points, masks, or more overlapping cameras")

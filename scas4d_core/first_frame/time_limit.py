@@ -1,4 +1,4 @@
-"""Time limit of frame 0, which tracks the remaining time and records the steps that were shortened."""
+"""Time limit of frame 0, and the steps that were shortened to meet the limit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AFTER_SHARE = 0.1
 
 
 class TimeLimit:
-    """Limits the duration of frame 0 by choosing cheaper alternatives based on the measured pace.
+    """Time limit of frame 0, with a choice between alternatives of different duration.
 
     Args:
         seconds: time limit of frame 0 in seconds, counted from now, or None for no limit.
@@ -50,19 +50,21 @@ class TimeLimit:
         return self.seconds is not None
 
     def seconds_left(self, share: float = 1.0) -> float:
-        """Returns the seconds until the given share of the time limit has passed.
+        """Returns the seconds until the fraction ``share`` of the time limit has passed.
 
-        The value is negative afterwards, and infinite without a limit.
+        After that moment, the value is negative. Without a limit, the value is infinite.
         """
         return inf if self.seconds is None else self._began + share * self.seconds - self.clock()
 
     @property
     def seconds_left_for_fit(self) -> float:
-        """Seconds until the last iteration must end."""
+        """Seconds until the last iteration of the fit must end, or infinity without a limit."""
         return inf if self.seconds is None else self.seconds_left() - min(AFTER_S, AFTER_SHARE * self.seconds)
 
     def choose(self, share: float, costs: Sequence[float]) -> int:
-        """Returns the index of the first alternative that is fast enough, or the number of alternatives if none is.
+        """Returns the index of the first alternative that is fast enough.
+
+        If no alternative is fast enough, the number of alternatives is returned.
 
         Args:
             share: fraction of the time limit by which the alternative must end.

@@ -1,4 +1,7 @@
-"""Gain and offset of each camera, learnt with frame 0 and discarded if the cameras hardly differ."""
+"""Exposure of each camera: gain and offset, learnt with frame 0.
+
+Exposures are discarded if they hardly differ between the cameras.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,16 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 Array = NDArray[np.float32]
 
 TRIAL, SPREAD = 0.3, 0.015
-"""Fraction of the iterations after which exposures are assessed, and standard deviation of the gains across cameras
-below which they are discarded. After 900 iterations, the standard deviation was 0.004 and 0.007 for identical cameras
-and 0.033 for a real rig."""
+"""Fraction of the iterations after which exposures are assessed, and standard deviation of the
+gains across cameras below which exposures are discarded. After 900 iterations, the standard
+deviation was 0.004 and 0.007 for identical cameras, and 0.033 for a real rig."""
 
 
 class Exposures:
-    """Learns the exposure of each view of frame 0, in place.
+    """Exposures of the views of frame 0, which are learnt in place.
 
     Args:
-        views: views of the frame; their exposures are updated.
+        views: views of the frame. Their exposures are updated.
         on: whether to learn exposures.
         rate: Adam learning rate of gain and offset.
         beta1: Adam decay rate of the first moment.
@@ -38,12 +41,16 @@ class Exposures:
         self._moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
 
     def step(self, view: TrainingView, gradient: Array, steps: int) -> None:
-        """Applies an Adam step to a camera's gain and offset, then recentres their means over all cameras to 1 and 0.
+        """Applies an Adam step to the gain and offset of a camera.
+
+        The exposures of all cameras are then shifted, so that the mean gain is 1 and the mean
+        offset is 0.
 
         Args:
             view: view of the camera.
-            gradient: [C, 2] gradient of the loss with respect to gain and offset; the label channel is ignored.
-            steps: number of Adam steps so far, including this one.
+            gradient: [C, 2] gradient of the loss with respect to gain and offset. The label channel
+                is ignored.
+            steps: number of iterations of the fit so far, over all views, including this iteration.
         """
         if not self.on:
             return
@@ -57,7 +64,10 @@ class Exposures:
             other.exposure[:3] -= centre
 
     def assess(self) -> None:
-        """Resets gains and offsets, and stops learning them, if they hardly differ between cameras."""
+        """Resets gains and offsets if the gains hardly differ between cameras.
+
+        Exposures are then no longer learnt.
+        """
         gains = np.array([view.exposure[:3, 0] for view in self._views])
         if gains.std(axis=0).mean() < SPREAD:
             self.on = False
@@ -65,5 +75,8 @@ class Exposures:
                 view.exposure[:] = (1, 0)
 
     def by_camera(self) -> dict[str, Array]:
-        """Returns the [3, 2] exposure of each camera, keyed by name, or an empty dict if exposures are not learnt."""
+        """Returns the exposure [3, 2] of each camera, keyed by name.
+
+        The result is empty if exposures are not learnt.
+        """
         return {view.name: view.exposure[:3].copy() for view in self._views} if self.on else {}

@@ -1,7 +1,8 @@
-"""The training loop that fits Gaussians to images outside of updates: for frame 0, new objects and their refinement.
+"""Training loop that fits Gaussians to images outside of updates.
 
-These cases differ only in the arguments of ``GaussianFit.run``: the order of views, the learning rates, the schedule,
-and the callback after each iteration.
+The loop fits frame 0 and new objects, and refines new objects. These cases differ only in the
+arguments of ``GaussianFit.run``: the order of views, the learning rates, the schedule, and the
+callback after each iteration.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
 
 @dataclass(frozen=True)
 class FitStep:
-    """One iteration, which advances the full schedule from iteration ``begun`` to ``ended``.
+    """Step of one iteration, from the positions ``begun`` to ``ended`` in the full schedule.
 
     >>> step = FitStep(99.0, 101.5)
     >>> step.reaches(100), step.reaches(102), step.passes(100), step.passes(70)
@@ -39,11 +40,11 @@ class FitStep:
     ended: float
 
     def reaches(self, moment: float) -> bool:
-        """Returns whether this iteration reaches a given point of the schedule."""
+        """Returns whether this step reaches a given point of the schedule."""
         return self.begun < moment <= self.ended
 
     def passes(self, every: float) -> bool:
-        """Returns whether this iteration passes a multiple of ``every``."""
+        """Returns whether this step passes or reaches a multiple of ``every``."""
         return self.ended // every > self.begun // every
 
 
@@ -58,13 +59,15 @@ def never(now: FitStep, last: FitLoss) -> bool:
 
 
 class GaussianFit:
-    """Fits the rows of a parameter table to views.
+    """Fit of Gaussians, the rows of a parameter table, to views.
 
     Args:
         engine: fit engine, which must not be shared with another fit.
         views: views to fit.
-        parameters: [N, 15] parameter table with the columns of ``engines.fit``; changed in place.
-        fixed: fixed Gaussians of each view, which are rendered with the fitted ones; empty if there are none.
+        parameters: [N, 15] parameter table with the columns of ``engines.fit``. It is changed in
+            place.
+        fixed: for each view, the Gaussians that are rendered together with the fitted Gaussians but
+            not updated. The sequence is empty if there are none.
         gloss: gloss of view-dependent colours, which is also learnt, or None for constant colours.
         exposures: exposures of the views, which are also learnt, or None for fixed exposures.
         betas: Adam decay rates.
@@ -126,7 +129,7 @@ class GaussianFit:
         return self._engine.table()
 
     def state(self) -> Gaussians:
-        """Returns the fitted Gaussians without the fixed ones; their labels are between 0 and 1."""
+        """Returns the fitted Gaussians, without the fixed Gaussians. Labels are between 0 and 1."""
         return self._engine.state()
 
     def run(
@@ -141,8 +144,10 @@ class GaussianFit:
         Args:
             order: view index of each iteration.
             scalars: function that returns the learning rates and options of an iteration.
-            begin: function called before each iteration with its number in this run; the fit ends if it returns None.
-            end: function called after each iteration with its loss; the fit ends if it returns true.
+            begin: function called before each iteration, with the number of iterations done in this
+                run. It returns the step of the iteration, or None to end the fit.
+            end: function called after each iteration, with its step and its losses. It returns true
+                to end the fit.
         """
         for done, view in enumerate(order):
             now = begin(done)
@@ -161,7 +166,9 @@ class GaussianFit:
         self._engine.load_table(replace(self.table, gloss=gloss))
 
     def replace_rows(self, rows: NDArray[np.int64], added: Array, parents: NDArray[np.int64]) -> None:
-        """Keeps some rows with their moments and appends new rows with zero moments; statistics are reset.
+        """Keeps some rows with their moments, and appends new rows with zero moments.
+
+        Statistics are reset.
 
         Args:
             rows: indices of the rows to keep.

@@ -1,4 +1,7 @@
-"""Initial Gaussians, one per point of the initial cloud, and the maximum number of Gaussians in a scene."""
+"""Initial Gaussians of a fit, and the maximum number of Gaussians in a scene.
+
+There is one initial Gaussian for each point of the initial cloud.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +17,19 @@ Array = NDArray[np.float32]
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
-"""Gaussians per pixel, additional Gaussians per covered pixel, and the largest budget. They apply if
-``StaticSettings.max_gaussians`` is not set; ``detail`` scales the result. Objects contain most of the detail, but an
-image that is mostly background needs nearly as many Gaussians as a full one. Above the largest budget, an update takes
-seconds."""
+"""Gaussians per pixel, additional Gaussians per covered pixel, and the largest budget. The values
+apply if ``StaticSettings.max_gaussians`` is not set, and ``detail`` scales the result. Objects
+contain most of the detail, but an image that is mostly background needs nearly as many Gaussians as
+a full image. Above the largest budget, an update takes seconds."""
 PLAIN = 2 / 255
 """Maximum difference between a background pixel and the background colour."""
 
 
 def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSettings) -> int:
-    """Returns the maximum number of Gaussians: as configured, or based on the size and content of the images."""
+    """Returns the maximum number of Gaussians.
+
+    If ``max_gaussians`` is not set, the number depends on the size and content of the images.
+    """
     if settings.max_gaussians is not None:
         return settings.max_gaussians
     background = np.array(scene.background_rgb, np.float32)[:, None, None]
@@ -34,7 +40,7 @@ def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSett
 
 
 def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Returns the inverse sigmoid, clamped near 0 and 1."""
+    """Returns the inverse sigmoid of a probability, which is clamped to [1e-4, 1 − 1e-4]."""
     clipped = np.clip(probability, 1e-4, 1 - 1e-4)
     result: NDArray[np.floating] = np.log(clipped / (1 - clipped))
     return result
@@ -43,7 +49,7 @@ def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
 def initial_parameters(
     positions: NDArray[np.float64], colours: Array, foreground: Array | None, limit: int, rng: np.random.Generator
 ) -> Array:
-    """Returns one parameter row per point, for isotropic Gaussians.
+    """Returns the parameters [P, 15] of isotropic Gaussians, one for each point.
 
     The width of each Gaussian is the RMS distance to the three nearest points.
 
@@ -51,7 +57,7 @@ def initial_parameters(
         positions: [P, 3] positions in metres, in the internal world.
         colours: [P, 3] colours in 0…1.
         foreground: [P] foreground label of each point in 0…1, or None.
-        limit: maximum number of Gaussians; a larger cloud is subsampled at random.
+        limit: maximum number of Gaussians. A larger cloud is subsampled at random.
         rng: random generator for the subsampling.
     """
     if len(positions) > limit:

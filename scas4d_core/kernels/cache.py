@@ -1,13 +1,13 @@
 """On-disk cache of compiled kernels, with one folder per version of the kernel sources.
 
-Numba recompiles a cached function only when its own source file changes. Kernels also inline functions from other
-files, which Numba does not track, so they could be outdated after such a file is edited. The cache folder is therefore
-named after a digest of all kernel files and of the guards, whose values are compiled in. Folders of older versions are
-deleted.
+Numba recompiles a cached function only if its own source file changes. Kernels also inline
+functions from other files, which Numba does not track. A cached kernel could therefore be outdated
+after such a file is edited. The cache folder is named after a digest of all kernel files and of the
+guards, whose values are compiled into kernels. Folders of older versions are deleted.
 
-Several processes may write to the same folder. Numba replaces files atomically. However, two processes that save
-different signatures of a function at the same time could choose the same file number. One of them would then load the
-wrong code, so a lock protects saving.
+Several processes may write to the same folder. Numba replaces files atomically. However, two
+processes that save different signatures of a function at the same time could choose the same file
+number. One of the processes would then load the wrong code, so a lock protects saving.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ except ImportError:  # not available on this system
 
 PREFIX = "kernels-"
 KEPT = 3
-"""Number of versions to keep; more than one, because several checkouts may share a cache."""
+"""Number of versions to keep. Several checkouts may share a cache, so more than one version is
+kept."""
 
 
 GUARDS = Path(__file__).parent.parent / "guards.py"
@@ -46,16 +47,23 @@ def digest(folder: Path = Path(__file__).parent) -> str:
 
 
 def base() -> Path:
-    """Returns the folder that contains all versions: NUMBA_CACHE_DIR, or scas4d/numba in the user's cache folder."""
+    """Returns the folder that contains all versions of the cache.
+
+    The folder is NUMBA_CACHE_DIR if that is set, and otherwise scas4d/numba in the user's cache
+    folder.
+    """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         path = Path(given)
-        return path.parent if path.name.startswith(PREFIX) else path  # set by `use` in a parent process
+        return path.parent if path.name.startswith(PREFIX) else path  # `use` in a parent process set it
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scas4d" / "numba"
 
 
 def use(folder: Path) -> None:
-    """Makes Numba use this version's cache folder in ``folder``, or its default if that cannot be created."""
+    """Makes Numba use the cache folder of this version, which is created in ``folder``.
+
+    If the folder cannot be created, Numba uses its default.
+    """
     mine = folder / (PREFIX + digest())
     try:
         mine.mkdir(parents=True, exist_ok=True)
@@ -80,7 +88,8 @@ def remove_old(folder: Path, kept: int = KEPT) -> None:
 def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
     """Context manager that acquires a file lock, and yields whether the lock was acquired.
 
-    If file locks are not supported or the file cannot be created, every caller gets the lock.
+    If the system does not support file locks, or the file cannot be created, every caller gets the
+    lock.
 
     Args:
         path: lock file, created if needed.
@@ -100,7 +109,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
 
 
 class _OneAtATime(IndexDataCacheFile):
-    """Cache files of one function, which only one process at a time may write."""
+    """Cache files of one function, which only one process may write at a time."""
 
     def save(self, key: Any, data: Any) -> None:
         with locked(Path(self._cache_path) / "saving.lock"):
@@ -108,7 +117,11 @@ class _OneAtATime(IndexDataCacheFile):
 
 
 def shared(dispatcher: Any) -> Any:
-    """Makes concurrent writes to a compiled function's cache safe, and returns the function."""
+    """Makes concurrent writes to the cache of a compiled function safe.
+
+    Returns:
+        The function.
+    """
     cache = dispatcher._cache
     if isinstance(cache, FunctionCache):  # caching is enabled
         file = cache._cache_file

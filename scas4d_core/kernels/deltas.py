@@ -1,7 +1,9 @@
 """Per-Gaussian deltas (Δp, ΔR, Δs), which are applied after the cascade, and the scale loss.
 
-F_t = R(Δr) J F_{t−1} diag(exp Δs); x_t = x + Δp; turn = q(Δr) ∘ Q, with w ≥ 0. As in ``cascade``, sixteen Gaussians
-are processed at a time. Reference implementation: ``deformation.deform``.
+    F_t = R(Δr) J F_{t−1} diag(exp Δs),    x_t = x + Δp,    turn = ± q(Δr) ∘ Q
+
+The sign of the turn is chosen such that w ≥ 0. As in ``cascade``, sixteen Gaussians are processed
+at a time. The reference implementation is ``engines.torch.deformation.deform``.
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ LARGEST = np.float32(EXPONENT) / LOG2_E
 COLUMNS = 9
 """Number of columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
 
-# Columns of the Gaussian state used by the neighbour terms: current mean 0–2, rotation since frame t−1 3–6, mean in
-# frame t−1 7–9. Each row is one cache line.
+# Columns of the Gaussian state that the neighbour terms use: current mean 0–2, rotation since frame
+# t−1 3–6, mean in frame t−1 7–9. Each row is one cache line.
 STATE = 16
 MEAN, TURN, PREVIOUS = 0, 3, 7
 TIED = 8
@@ -28,7 +30,7 @@ TIED = 8
 
 @inline
 def gaussian_delta_rotation(deltas, entries, place):
-    """Returns the rotation ΔR as a unit quaternion (1, Δr)/|(1, Δr)|."""
+    """Returns the rotations ΔR of sixteen Gaussians as unit quaternions (1, Δr)/|(1, Δr)|."""
     a = lanes.gather_column(deltas, entries, place, COLUMNS, 3)
     b = lanes.gather_column(deltas, entries, place, COLUMNS, 4)
     c = lanes.gather_column(deltas, entries, place, COLUMNS, 5)
@@ -45,13 +47,15 @@ def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, mean
         entries: int64 indices of the Gaussians among the M moving ones, starting at flat index ``place``.
         rows: int64 indices of the Gaussians among all N, starting at flat index ``place``.
         place: flat index of the first Gaussian in ``entries``, ``rows`` and ``present``.
-        present: mask, starting at flat index ``place``: 0 for Gaussians that are not counted, otherwise 1.
+        present: mask, starting at flat index ``place``: 0 for repeated Gaussians, otherwise 1. The
+            guards do not count repeated Gaussians.
         v: [13, 16] factors (rows 0–8) and rotations (rows 9–12) from the cascade.
         points: [3, 16] points from the cascade.
         means: [N, 3] output, written at ``rows``.
         factors: [N, 3, 3] output, written at ``rows``.
-        state: [M, 16] output; only means and rotations are written.
-        guard_counts: [1 or more] int64 counts, to which the number of Gaussians with a clamped Δs is added.
+        state: [M, 16] output. Only means and rotations are written.
+        guard_counts: [1 or more] int64 counts. The number of Gaussians with a clamped Δs is added
+            to the first count.
     """
     n = lanes.COUNT
     for k in range(3):
@@ -94,14 +98,14 @@ def apply_gaussian_deltas_backward(
         present: mask, starting at flat index ``place``: 0 for repeated Gaussians, otherwise 1.
         v: factors and rotations from the cascade, starting at flat index ``leaving``.
         leaving: flat index of the first value in ``v``.
-        scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If 0, the loss has no
-            gradient.
+        scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If the
+            weight is 0, the loss has no gradient.
         bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
         g_means: [N, 3] gradients of the means.
         g_factors: [N, 3, 3] gradients of the factors.
         g_tied: [M, 8] additional gradients of means and rotations, from the neighbour terms.
-        g: [16, 16] output, gradients of the points (rows 0–2), factors (rows 3–11) and rotations (rows 12–15) after the
-            cascade.
+        g: [16, 16] output, gradients of the points (rows 0–2), factors (rows 3–11) and rotations
+            (rows 12–15) after the cascade.
         g_deltas: [M, 9] output, gradients of the deltas.
 
     Returns:

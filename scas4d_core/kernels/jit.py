@@ -16,35 +16,38 @@ from scas4d_core.kernels import cache
 
 cache.use(cache.base())
 
-# LLVM unrolls short loops before vectorization. Unrolled rows of 16 pixels remain scalar, which makes blending 3 times
-# slower (measured). Loops over channels (at most 8) may still be unrolled.
+# LLVM unrolls short loops before vectorization. Unrolled rows of 16 pixels remain scalar, which
+# makes blending three times slower (measured). Loops over channels (at most 8) may still be
+# unrolled.
 llvm.set_option("scas4d", "-unroll-full-max-count=8")
-# Overlap checks that are hoisted out of the row loop compare whole arrays. They detect an overlap and take the scalar
-# path.
+# LLVM would otherwise hoist the checks for overlapping memory out of the row loop. The hoisted
+# checks compare whole arrays, detect an overlap, and select the scalar path.
 llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 
-# No fast math: every operation is rounded according to IEEE 754, in source order, so that results are bit-identical on
-# all processors. Approximate reciprocals (`arcp`, `afn`) depend on the manufacturer, fused multiply-adds (`contract`)
-# on the instruction set, and reordered sums (`reassoc`) on the register width.
-# Long sums use explicit lanes instead. The cost is about 1% (docs/tried.md).
+# No fast math: every operation is rounded according to IEEE 754, in source order, so that results
+# are bit-identical on all processors. Approximate reciprocals (`arcp`, `afn`) depend on the
+# manufacturer, fused multiply-adds (`contract`) on the instruction set, and reordered sums
+# (`reassoc`) on the register width. Long sums use explicit lanes instead. Strict rounding makes
+# kernels about 1% slower (docs/tried.md).
 STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
 
 def _compiler(**more: Any) -> Any:
-    """Returns a decorator like ``numba.njit`` whose cache may be written by several processes concurrently."""
+    """Returns a decorator like ``numba.njit``, with a cache that several processes may share."""
     options = {**STRICT, **more, "cache": True, "no_cfunc_wrapper": True}  # C callbacks are not needed
     decorate: Any = njit(**options)
     return lambda function: cache.shared(decorate(function))
 
 
 kernel: Any = _compiler()
-"""Compiles a single-threaded kernel, or a function that kernels call."""
+"""Decorator that compiles a single-threaded kernel, or a function that kernels call."""
 
 parallel_kernel: Any = _compiler(parallel=True)
-"""Compiles a kernel with parallel ``prange`` tasks. Tasks write disjoint data, so results do not depend on threads."""
+"""Decorator that compiles a kernel with parallel ``prange`` tasks. Tasks write disjoint data, so
+results do not depend on the number of threads."""
 
 inline: Any = _compiler(inline="always")
-"""Compiles a small helper function that is inlined into kernels."""
+"""Decorator that compiles a small helper function, which is inlined into kernels."""
 
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
@@ -55,7 +58,10 @@ MOST = np.float32(EXPONENT)
 
 
 def threads() -> int:
-    """Returns the number of threads that kernels use: ``NUMBA_NUM_THREADS``, or all available cores."""
+    """Returns the number of threads that kernels use.
+
+    By default, the number is ``NUMBA_NUM_THREADS``, or the number of available cores.
+    """
     return int(numba.get_num_threads())
 
 
@@ -71,7 +77,10 @@ def _float_of_bits(typing_context: Any, bits: Any) -> Any:
 
 @inline
 def exp(x):
-    """Returns the exponential of x clamped to ±87, with a relative error of 2e-7. Unlike libm's, it vectorizes."""
+    """Returns the exponential of x, where x is clamped to ±87, with a relative error of 2e-7.
+
+    Unlike the function of libm, this function vectorizes.
+    """
     v = min(max(x * LOG2_E, -MOST), MOST)
     whole = np.floor(v + HALF)
     r = v - whole

@@ -1,8 +1,9 @@
 """Explicit SIMD for kernels, with sixteen float32 values in one variable.
 
-``Lanes`` corresponds to LLVM's ``<16 x float>``: one AVX-512, two AVX2 or four NEON registers. Kernels can add,
-subtract, multiply, divide and compare ``Lanes`` like numbers, with float32 operands broadcast. They can also load and
-store ``Lanes`` at a flat index of a contiguous array. Results do not depend on the compiler's loop vectorizer.
+``Lanes`` corresponds to LLVM's ``<16 x float>``, which occupies one AVX-512, two AVX2 or four NEON
+registers. Kernels can add, subtract, multiply, divide and compare ``Lanes`` like numbers. Float32
+operands are broadcast. Kernels can also load and store ``Lanes`` at a flat index of a contiguous
+array. Results do not depend on the loop vectorizer of the compiler.
 """
 
 from __future__ import annotations
@@ -82,7 +83,14 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
 
 
 def _operator(function: Any, result: Any, method: str, *how: str) -> None:
-    """Registers an operator for two ``Lanes``, or a ``Lanes`` and a float32, emitted by ``method`` of the builder."""
+    """Registers an operator for two ``Lanes``, or a ``Lanes`` and a float32.
+
+    Args:
+        function: function of the module ``operator``.
+        result: type of the result.
+        method: name of the method of LLVM's IR builder that emits the instruction.
+        how: arguments of the method that precede the operands.
+    """
 
     class Template(AbstractTemplate):
         key = function
@@ -220,7 +228,7 @@ ends = emitted(_fixed([-1.0] * 8 + [1.0] * 8))
 
 @inline
 def ramp(start):
-    """Returns the eight values ``start``, ``start`` + 4, …, repeated twice."""
+    """Returns the eight values ``start``, ``start`` + 4, …, ``start`` + 28, repeated twice."""
     return _eight_columns() + start
 
 
@@ -252,7 +260,10 @@ def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any,
 
 @emitted
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """Loads sixteen values of a float32 array, starting at a flat index; no alignment requirements or bounds checks."""
+    """Loads sixteen values of a float32 array, starting at a flat index.
+
+    The address need not be aligned. Bounds are not checked.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments)
@@ -284,7 +295,10 @@ def _first(builder: Any, count: Any) -> Any:
 
 @emitted
 def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
-    """Loads only the first ``count`` values, or all if it is 16 or more; the others are not read and set to 0."""
+    """Loads the first ``count`` values of sixteen, or all values if ``count`` is 16 or more.
+
+    The other lanes are 0, and their values are not read.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -296,7 +310,7 @@ def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
 
 @emitted
 def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
-    """Stores only the first ``count`` lanes, or all if it is 16 or more."""
+    """Stores the first ``count`` lanes, or all lanes if ``count`` is 16 or more."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -309,7 +323,10 @@ def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: 
 
 @emitted
 def only_first(typing_context: Any, value: Any, count: Any) -> Any:
-    """Keeps only the first ``count`` lanes, or all if it is 16 or more, and sets the others to 0."""
+    """Keeps the first ``count`` lanes and sets the others to 0.
+
+    If ``count`` is 16 or more, all lanes are kept.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(_first(builder, arguments[1]), arguments[0], _constant([0] * COUNT))
@@ -331,7 +348,10 @@ def aligned(array):
 
 @emitted
 def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
-    """Loads sixteen strided values from a flat index of a float32 array, for example a column of sixteen rows."""
+    """Loads sixteen values of a float32 array with a stride, starting at a flat index.
+
+    With the number of columns as the stride, the values are a column of sixteen rows.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = ir.Constant(_FLOATS, ir.Undefined)
@@ -382,7 +402,10 @@ def gather_column(typing_context: Any, array: Any, rows: Any, place: Any, column
 def scatter_column(
     typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any
 ) -> Any:
-    """Stores the lanes to the elements that ``gather_column`` would load; for duplicate rows, the last lane wins."""
+    """Stores the lanes in the elements that ``gather_column`` would load.
+
+    If several lanes have the same row, the value of the last lane is stored.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments[:5])):
@@ -407,7 +430,11 @@ def gather_rows(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
 
 @emitted
 def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any) -> Any:
-    """Adds sixteen rows, given as eight column ``Lanes``, to rows of a float32 array [n, 8], one row at a time."""
+    """Adds sixteen rows to rows of a float32 array [n, 8].
+
+    The rows are given as a tuple of eight ``Lanes``, one per column. The row indices are
+    ``rows[place:]`` (int64). Rows are added one after another, so duplicate rows accumulate.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT // 2), _LONG(0)]
@@ -445,7 +472,10 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
 
 @emitted
 def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
-    """Prefetches a row of a 2D float32 array into the L1 cache. The row may be out of bounds."""
+    """Prefetches the first cache line of a row into the L1 cache. The row may be out of bounds.
+
+    Rows are the entries along the first axis of an array.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         struct = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0])
@@ -528,8 +558,9 @@ def log2(x):
 def column_bits(typing_context: Any, ends: Any) -> Any:
     """Converts ranges of pixel rows to a 64-bit block mask, with a byte per block column and a bit per block row.
 
-    Block column k (of 8) covers the pixel rows from the value of lane k to the value of lane k + 8, which are integers.
-    If the first row exceeds the last, the column is empty. Rows outside 0…31 are ignored.
+    Block column k (of 8) covers the pixel rows from the value of lane k to the value of lane k + 8.
+    The values are integers. If the first row exceeds the last row, the column is empty. Rows
+    outside 0…31 are ignored.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -579,7 +610,10 @@ def sum_of(typing_context: Any, value: Any) -> Any:
 
 @emitted
 def sums_of(typing_context: Any, values: Any) -> Any:
-    """Returns one ``Lanes`` with the lane sums of up to sixteen ``Lanes`` in a tuple; unused lanes are 0."""
+    """Returns the sums over the lanes of up to sixteen ``Lanes``, which are given as a tuple.
+
+    Lane k of the result is the sum over the lanes of value k. Unused lanes are 0.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [builder.extract_value(arguments[0], k) for k in range(len(values))]

@@ -1,10 +1,12 @@
 """Rigidity, isometry and rotation losses over sampled neighbourhoods, with gradients.
 
-Reference implementations: ``losses.rigidity_loss``, ``losses.isometry_loss``, ``losses.rotation_loss``.
+The reference implementations are ``rigidity_loss``, ``isometry_loss`` and ``rotation_loss`` in
+``engines.torch.losses``.
 
-Sixteen sampled Gaussians are processed at a time, each with its k-th neighbour. Every pair contributes to the gradients
-of both Gaussians. A fixed number of tasks write to separate accumulators, which are then summed in a fixed order. This
-avoids atomics and makes the result independent of the number of threads.
+Sixteen sampled Gaussians are processed at a time, each with its k-th neighbour. Every pair
+contributes to the gradients of both Gaussians. A fixed number of tasks write to separate
+accumulators, which are then summed in a fixed order. The kernel thus needs no atomics, and the
+result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -34,7 +36,10 @@ def state_of(state, who):
 
 @kernel
 def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, turning, own, losses):
-    """Computes the losses [3] summed over the samples of one task, and adds their gradients to ``own`` [M, 8]."""
+    """Computes the losses [3], summed over the samples of one task, and their gradients.
+
+    The gradients are added to ``own`` [M, 8]. For the other arguments, see ``neighbour_terms``.
+    """
     count = neighbours.shape[1]
     who, other = np.empty(lanes.COUNT, np.int64), np.empty(lanes.COUNT, np.int64)
     present = np.empty(lanes.COUNT, np.float32)
@@ -59,7 +64,8 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             weight = lanes.load(present, 0) * lanes.gather_column(weights, who, 0, count, k)
             counts = weight > ZERO
             ox, oy, oz = there[0] - mx, there[1] - my, there[2] - mz
-            # Rigidity: the neighbour's offset, rotated back, should equal its offset in frame t−1.
+            # Rigidity: the offset of the neighbour, rotated back, should equal its offset in frame
+            # t−1.
             ex = r0 * ox + r3 * oy + r6 * oz - (there[7] - px)
             ey = r1 * ox + r4 * oy + r7 * oz - (there[8] - py)
             ez = r2 * ox + r5 * oy + r8 * oz - (there[9] - pz)
@@ -112,17 +118,18 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
 
 @parallel_kernel
 def neighbour_terms(state, sample, neighbours, weights, distances, strengths, accumulators, losses):
-    """Computes the three losses (Dynamic3DGaussians) over the sampled Gaussians, and the gradient of the weighted sum.
+    """Computes the three losses of Dynamic 3D Gaussians, and the gradient of their weighted sum.
 
     Args:
         state: [M, 16] state of the moving Gaussians; see ``deltas`` for the columns.
         sample: [S] int64 rows of the sampled Gaussians.
         neighbours: [M, k] int32 rows of the neighbours of each Gaussian.
-        weights: [M, k] weights of the pairs; 0 if there is no neighbour.
+        weights: [M, k] weights of the pairs, or 0 if there is no neighbour.
         distances: [M, k] distances of the pairs in frame 0, in metres.
         strengths: [3] float32 weights of rigidity, isometry and rotation, divided by the number of pairs S k.
-        accumulators: [4, M, 8] output; the first accumulator contains the gradients. See ``deltas`` for the columns.
-        losses: [4, 3] output, unweighted sums over the pairs of each task.
+        accumulators: [4, M, 8] output. The first accumulator finally contains the gradients, and
+            the others are scratch buffers. See ``deltas`` for the columns.
+        losses: [4, 3] output, unweighted sums of the losses over the pairs of each task.
     """
     size = (sample.shape[0] + TASKS - 1) // TASKS
     for task in prange(TASKS):

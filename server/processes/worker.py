@@ -157,8 +157,8 @@ class Worker:
         if isinstance(done, FrameFailedInWorker):
             self.send(done)
             return
+        self.send(FrameSolved(message.index))  # before the commit is reported
         self._commits.put(done)
-        self.send(FrameSolved(message.index))
 
     def next(self) -> Any:
         """Waits for the next message and returns it.
@@ -194,6 +194,14 @@ class Worker:
 
     def finish(self, message: FrameReady) -> PendingCommit | FrameFailedInWorker:
         """Reconstructs a frame and returns its commit, or the reason why there is none."""
+        done = self._reconstruct_or_fail(message)
+        if isinstance(done, PendingCommit):  # an error from here on ends the worker: its state is ahead of the files
+            assert self.states is not None
+            deleted = self.retain(done.deletions.append)
+            done.message = FrameCommitted(message.index, self.states.report(message.index), tuple(deleted))
+        return done
+
+    def _reconstruct_or_fail(self, message: FrameReady) -> PendingCommit | FrameFailedInWorker:
         dropped: dict[str, str] = {}
         began = time.perf_counter()
         try:
@@ -277,8 +285,6 @@ class Worker:
                 "publish_seconds": self._commits.publish_seconds,
             }
             self.reconstruction.step(frame, dropped=dropped, notes=notes, started=began, defer=commit.writes.append)
-        deleted = self.retain(commit.deletions.append)
-        commit.message = FrameCommitted(frame.index, self.states.report(frame.index), tuple(deleted))
         return commit
 
     def retain(self, defer: Defer = run_now) -> list[int]:

@@ -67,9 +67,9 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Adaptive effort",
         "",
-        "The preset `adaptive` is compared with `scas4d` at 100 iterations per frame, in alternation. *Repeats*: time",
-        "of repeated frames (each is shown twice, one four times). *Slowed*: the capture at a third of the speed,",
-        "rendered from interpolated states of a reconstruction. Unchanged captures are run with "
+        "The preset `adaptive` alternates with `scas4d` at 100 iterations per frame. *Repeats* is the time of repeated",
+        "frames; each frame is shown twice, and one is shown four times. *Slowed* is the capture at a third of its",
+        "speed, rendered from interpolated states of a reconstruction. Unchanged captures are run with "
         f"{SEEDS} seeds; ± is their standard deviation.",
         "",
         "| capture | frames | time | dB | repeats | slowed: time | slowed: dB |",
@@ -91,8 +91,8 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     lines += [
         "",
         f"Mean: {100 * np.mean(times):.0f}% of the time, {np.mean(losses):+.2f} dB; "
-        f"repeats {100 * np.mean(repeats):.0f}%. The target, at most {100 * TIME:.0f}% of the time at "
-        f"{LOSS_DB:g} dB, and {100 * REPEATS:.0f}% for repeats, is "
+        f"repeats {100 * np.mean(repeats):.0f}%. The target (at most {100 * TIME:.0f}% of the time with a "
+        f"loss of at most {LOSS_DB:g} dB, and {100 * REPEATS:.0f}% for repeats) is "
         f"{'reached on every capture' if ok else '**missed** on some captures'}.",
         "",
     ]

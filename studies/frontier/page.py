@@ -207,10 +207,10 @@ def _text(
 {_provenance(out, captures)}
 
 An iteration is a forward and backward pass over one training view, or over several where noted. Each row covers the
-first {updates} updates of a capture, starting from the same frame 0. Accuracy is averaged over these updates and the test
-cameras. Metrics are defined in `scas4d_core/metrics/`, as in [quality.md](quality.md). Times are medians per update,
-including decoding and commit. Because the machine is shared, times on other pages differ. A setting is dominated if
-another setting is at least as fast and more accurate.
+first {updates} updates of a capture, starting from the same frame 0. Accuracy is averaged over these updates and the
+test cameras. Metrics are defined in `scas4d_core/metrics/`, as in [quality.md](quality.md). Times are medians per
+update, including decoding and commit. Because the machine is shared, times on other pages differ. A setting is
+dominated if another is at least as fast and more accurate.
 
 ## Recommended settings
 
@@ -270,8 +270,7 @@ Each row changes one setting of the default (`scas4d`, 100 iterations).
 scripts/bench frontier {" ".join(f"CAPTURES/{name}" for name in captures)} --page docs/{stem}.md
 ```
 
-Times come from a separate pass (`--only times`) that alternates between all settings. Without this pass, the page shows
-CPU seconds of single-threaded runs.
+Times come from a separate pass (`--only times`) that alternates between all settings.
 """
 
 

@@ -48,7 +48,7 @@ def write_paper_page(
     )
     text = f"""# The paper's tables
 
-This page repeats the paper's experiments on our captures. Each cell contains our result, with the paper's in
+We repeated the paper's experiments on our captures. Each cell contains our result, with the paper's in
 parentheses. Our captures share names and kinds of motion with the paper's scenes, but not images, so only differences
 between settings are comparable.
 
@@ -57,27 +57,21 @@ between settings are comparable.
 ```
 
 {_provenance(out, captures)}
-Scores are means over the first {updates} updates of each capture, starting from a frame 0 shared by all its
-rows.{_elsewhere(captures, there)}
+Scores are means over the first {updates} updates of each capture. All rows of a capture start from the same
+frame 0.{_elsewhere(captures, there)}
 
 ## Agreement
 
 {summary([outcome for outcomes_of_variant in outcomes.values() for outcome in outcomes_of_variant], outcomes)}
 
-The gain is the first setting's mean minus the second's, over the captures that both cover. Two gains agree in size if
-they are within a factor of {FACTOR:g}. Two small gains (before rounding, below
-{", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well,
-whatever their signs. Otherwise, a small gain does not agree with a larger one. If the paper shows only an image, its
-claim is the sign of the gain. The last column counts the captures whose own gain agrees with the claim, at least in
+The gain is the first setting's mean score minus the second's, over the captures that both cover. Two gains agree in
+size if they are within a factor of {FACTOR:g}. Two gains also agree if both are small before rounding (below
+{", ".join(f"{value:g} {name}" for name, value in SMALL.items() if name in DIGITS)}),
+whatever their signs. A small gain agrees with a larger one only within this factor. If the paper shows only an image,
+the claim is the sign of the gain. The last column counts the captures whose gain agrees with the claim, at least in
 sign. SSIM appears only in this table.
 
 {sections}
-
-## Omissions
-
-- LPIPS, because its weights would have to be downloaded.
-- The offline methods in the paper's second table, which are separate programs.
-- Robot-Task and five Panoptic scenes, for lack of captures.
 """
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text)
@@ -151,7 +145,7 @@ def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
     if not others:
         return ""
     names = ", ".join(others)
-    return f" For {names}, PSNR is taken from [quality.md](quality.md), over the updates that both methods cover."
+    return f" For {names}, the PSNR comes from [quality.md](quality.md), over the updates that both methods cover."
 
 
 def needed() -> list[Variant]:

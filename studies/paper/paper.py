@@ -119,7 +119,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "Equal wall-clock time, PSNR", "appendix", "psnr", "PSNR in dB",
         (OURS, ClaimSetting("Dynamic3DGS, 300", BASE_300, figures.PSNR_BASELINE_300)),
         (Claim("ahead of the baseline with 3× the iterations", "Ours, 100", "Dynamic3DGS, 300"),),
-        "In the paper, 300 baseline iterations take as long as 100 of the paper's method. In these runs, a baseline "
+        "In the paper, 300 baseline iterations take as long as 100 iterations of its method. In these runs, a baseline "
         "iteration takes {ratio} as long as a `scas4d` iteration; [accuracy-and-time.md](accuracy-and-time.md) "
         "compares newer runs at equal time.",
     ),
@@ -156,7 +156,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
             Claim("three layers vs. five", "K=3", "K=5"),
         ),
         "The paper does not state the number of clusters for K = 1, 2, 4 and 5. Here, single layers have 64, 320 or "
-        "1280 clusters; for the other K, the numbers range from 64 to 1280, evenly spaced on a log scale.",
+        "1280 clusters; for other K, the layers have 64 to 1280 clusters, evenly spaced on a log scale.",
     ),
     Experiment(
         "Number of first-layer clusters", "appendix", "psnr", "PSNR in dB",
@@ -179,8 +179,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         (ClaimSetting("Entangled", DEFAULT, {}), ClaimSetting("Separate", variant("separate covariance"), {})),
         (Claim("better images", "Entangled", "Separate", 1),),
         "The paper shows only an image of its wheel. With separate covariance (`update.covariance`), the cascade moves "
-        "only the means, and only a Gaussian's own ΔR and Δs change its covariance. Both are optimized from the start "
-        "(`update.deltas_start` 0), not only after 40% of the iterations.",
+        "only the means, and only a Gaussian's own ΔR and Δs change its covariance. ΔR and Δs are optimized from the "
+        "start (`update.deltas_start` 0), not only after 40% of the iterations.",
     ),
     Experiment(
         "Tracking: 2D MTE of the best candidate", "table 3", "mte_2d_oracle",
@@ -196,7 +196,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "adjusted Rand index",
         (ClaimSetting("Ours, 100", DEFAULT, {}), ClaimSetting("Dynamic3DGS, 2000", BASE_2000, {})),
         (Claim("better parts", "Ours, 100", "Dynamic3DGS, 2000", 1),),
-        "The paper shows only images. Here, parts are compared with true labels over each row's updates.",
+        "The paper shows only images. Here, parts are compared with ground-truth labels.",
     ),
 )  # fmt: skip
 """Experiments in the order of the page."""

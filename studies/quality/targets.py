@@ -245,8 +245,8 @@ def page(rows: Rows) -> str:
     behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
 
-This page compares rendered images, tracks and parts with targets, using each capture's test cameras and ground truth.
-These commands measure the rows and write the page (`CAPTURES` is the captures folder); existing rows are kept:
+This page compares the quality of rendered images, tracks and parts with targets, using each capture's test cameras and
+ground truth. These commands measure missing rows and write the page (`CAPTURES` is the folder of captures):
 
 ```
 scripts/bench targets CAPTURES
@@ -258,9 +258,9 @@ scripts/bench table out/quality --out docs/quality.md
 - Machine: {"; ".join(machines) if machines else "–"}.
 - Source versions of the core: {", ".join(cores) if cores else "–"}.
 
-An iteration is a forward and a backward pass over one training view. Results are means over test cameras and over the
-updates listed under "updates". Differences are computed over updates that both runs cover. The metrics are defined in
-`scas4d_core/metrics/`. Other pages have times of other days on this shared machine.
+An iteration is a forward and a backward pass over one training view. Results are averaged over the test cameras and the
+updates in the column "updates". Differences are computed over the updates that both runs cover. The metrics are defined
+in `scas4d_core/metrics/`. Because the machine is shared, times on other pages differ.
 
 ## Targets
 
@@ -270,8 +270,8 @@ updates listed under "updates". Differences are computed over updates that both 
 
 ## Rows
 
-These are the runs of the default preset. The study folder also contains all other runs and the seconds per stage.
-*MB* is the peak memory of a process that also scores all frames; the target's process only reconstructs a few.
+These runs use the default preset. The study folder also contains all other runs and the seconds per stage.
+*MB* is the peak memory of a process that also scores all frames. The memory target excludes scoring.
 
 {markdown(behind) if behind else "None yet."}
 """

@@ -1,10 +1,11 @@
 """Bundle adjustment of a calibrated rig on the matches of one frame, with the calibration as a prior.
 
-Matches leave some degrees of freedom undetermined: the position, orientation and scale of the rig. Others, such as a
-slight bend of a camera ring, are nearly undetermined. Here, a Cauchy loss pulls each camera towards its calibrated
-pose. Values that the matches do not determine thus keep their calibration, and a camera that is far off does not pull
-the others along. pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of
-an exact rig by a median of 0.6 pixels (`robot`, 2026-11-23).
+The matches do not determine the position, orientation and scale of the rig. Other degrees of
+freedom, such as a slight bend of a ring of cameras, are nearly undetermined. Here, a Cauchy loss
+pulls each camera towards its calibrated pose. The camera thus keeps the calibrated value of every
+degree of freedom that the matches do not determine, and a camera that is far off does not pull
+other cameras along. pycolmap triangulates the points. The bundle adjustment of pycolmap has no such
+loss, and moved the cameras of an exact rig by a median of 0.6 pixels (`robot`, 2026-11-23).
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ from scas4d_core.first_frame.points.triangulation import group_by_track, triangu
 from scas4d_core.posed_pictures import Float
 
 BOUNDS = (16.0, 6.0, 2.0)
-"""Maximum reprojection error in pixels in each round. The first bound includes cameras that are far off; the last
-excludes wrong matches."""
+"""Maximum reprojection error in pixels in each round. The first bound includes cameras that are far
+off. The last bound excludes wrong matches."""
 NOISE = 0.5
 """Scale of the Cauchy loss on reprojection errors, in pixels."""
 MIN_PRIOR_SCALE = 0.5
-"""Minimum scale of the calibration prior's Cauchy loss, in pixels. Rotation, translation and focal length are
-weighted by the image displacement that they cause. After the first round, the scale is the rig's median displacement
-if that is larger."""
+"""Minimum scale of the Cauchy loss of the calibration prior, in pixels. Rotation, translation and
+focal length are weighted by the image displacement that they cause. After the first round, the
+scale is the median displacement of the rig if the displacement is larger."""
 MIN_ANGLE_DEG = 1.0
-"""Minimum triangulation angle in degrees; rays at smaller angles hardly constrain depth."""
+"""Minimum triangulation angle in degrees. Rays at smaller angles hardly constrain depth."""
 MAX_STEPS = 40
 """Maximum number of Levenberg-Marquardt steps per round."""
 MIN_RELATIVE_GAIN = 1e-5
 """Relative decrease of the loss below which a round ends."""
 
 Track = tuple[NDArray[np.intp], Float]
-"""Indices of distinct cameras [n], and the pixel [n, 2] in each."""
+"""Feature track: the indices [n] of distinct cameras, and the pixel [n, 2] of the feature in each
+camera."""
 
 
 def build_tracks(matches: Matches) -> list[Track]:
@@ -63,8 +65,9 @@ def bundle_adjust(
 
     Args:
         cameras: calibrated cameras to which the tracks refer.
-        tracks: feature tracks, one per point; some features may be wrong.
-        focal: whether to adjust each camera's focal length too; the ratio of fx to fy is fixed.
+        tracks: feature tracks, one per point. Some features may be wrong.
+        focal: whether to adjust the focal length of each camera too. The ratio of fx to fy is
+            fixed.
         seed: random seed of RANSAC.
     """
     current, trust = list(cameras), MIN_PRIOR_SCALE
@@ -89,7 +92,11 @@ class Observations:
 def _triangulate_tracks(
     cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int
 ) -> tuple[Observations, Float]:
-    """Triangulates tracks (LO-RANSAC, pycolmap); returns the inlier features and the points [P, 3]."""
+    """Triangulates tracks with LO-RANSAC (pycolmap).
+
+    Returns:
+        The inlier features and the points [P, 3].
+    """
     point_of = triangulator(cameras, angle=MIN_ANGLE_DEG, error=bound, trials=100, seed=seed)
     points, owner, pixels = [], [], []
     for who, uv in tracks:
@@ -108,7 +115,14 @@ def _triangulate_tracks(
 
 
 class _BundleAdjustment:
-    """Levenberg-Marquardt over poses and points; the points are eliminated (Schur complement)."""
+    """Levenberg-Marquardt over poses and points, which eliminates the points (Schur complement).
+
+    Args:
+        given: calibrated cameras.
+        seen: observed features.
+        focal: whether to adjust focal lengths.
+        trust: scale of the Cauchy loss of the calibration prior, in pixels.
+    """
 
     def __init__(self, given: Sequence[Camera], seen: Observations, focal: bool, trust: float) -> None:
         self.given, self.seen, self.focal, self.trust = given, seen, focal, trust
@@ -133,7 +147,11 @@ class _BundleAdjustment:
         return cameras
 
     def median_prior_distance(self, cameras: list[Camera], points: Float) -> float:
-        """Returns the median distance between adjusted and calibrated cameras in pixels, over cameras with features."""
+        """Returns the median image displacement of the adjusted cameras, in pixels.
+
+        The displacement is the change of a camera from its calibration. Cameras without features
+        are ignored.
+        """
         pulls = np.linalg.norm(self._prior_residuals(cameras, self._depths(cameras, points))[0], axis=1)
         return float(np.median(pulls[np.unique(self.seen.camera)]))
 
@@ -147,7 +165,10 @@ class _BundleAdjustment:
         return depths
 
     def _residuals(self, cameras: Sequence[Camera], points: Float) -> tuple[Float, Float, Float]:
-        """Returns the reprojection errors [M, 2] and the Jacobians for cameras [M, 2, 6 or 7] and points [M, 2, 3]."""
+        """Returns the reprojection errors [M, 2] and their Jacobians.
+
+        The Jacobians are [M, 2, 6 or 7] for cameras and [M, 2, 3] for points.
+        """
         seen = self.seen
         rotation = np.array([c.rotation for c in cameras])[seen.camera]
         shift = np.array([c.translation for c in cameras])[seen.camera]
@@ -165,7 +186,10 @@ class _BundleAdjustment:
         return miss, np.concatenate(columns, axis=2), by_place @ rotation
 
     def _prior_residuals(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
-        """Returns each camera's change from its calibration [V, 6 or 7] in pixels, and the pixels per unit."""
+        """Returns the change of each camera from its calibration, in pixels, [V, 6 or 7].
+
+        The second result is the number of pixels per unit of each parameter, [V, 6 or 7].
+        """
         rows, units = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
         for index, (before, now) in enumerate(zip(self.given, cameras, strict=True)):
             units[index, :3], units[index, 3:6] = now.fx, now.fx / depth[index]
@@ -234,7 +258,11 @@ def _cross(vectors: Float) -> Float:
 
 
 def _apply_step(camera: Camera, move: Float) -> Camera:
-    """Returns a camera rotated and translated in its own axes; a seventh value is the log of a focal length factor."""
+    """Returns a camera after an update [6 or 7] of its parameters.
+
+    The values are the rotation vector and the translation in camera axes, and the log of the factor
+    of the focal length if there is a seventh value.
+    """
     turn = Rotation.from_rotvec(move[:3]).as_matrix()
     pose, intrinsics = np.eye(4), camera.intrinsics.copy()
     pose[:3, :3], pose[:3, 3] = turn @ camera.rotation, turn @ camera.translation + move[3:6]

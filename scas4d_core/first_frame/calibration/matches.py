@@ -1,8 +1,9 @@
-"""SIFT matches between neighbouring cameras, based only on appearance so that calibration errors do not bias them.
+"""SIFT matches between neighbouring cameras, based only on appearance.
 
-The matches for the initial points (``points/triangulation.py``) are restricted to within two pixels of the epipolar
-lines of the given calibration. Here, the whole image is searched. This yields fewer matches, but they reveal how large
-a calibration error is.
+The matches for the initial points (``points/triangulation.py``) must be within two pixels of the
+epipolar lines of the given calibration. Here, the whole image is searched, so calibration errors do
+not bias the matches. This search yields fewer matches, but they reveal the size of a calibration
+error.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ from scas4d_core.first_frame.points.triangulation import (
 from scas4d_core.posed_pictures import Float, PosedPicture
 
 LONGEST_SIDE = 800
-"""Maximum image side, in pixels; larger images are downscaled before feature detection. Full size would reveal smaller
-errors but would take seconds per camera."""
+"""Maximum image side, in pixels. Larger images are downscaled before feature detection. Images at
+full size would reveal smaller errors but would take seconds per camera."""
 FEATURES, CONTRAST = 2048, 0.0067
-"""Maximum number of features per image, and COLMAP's contrast threshold. On `basketball`, this gives half as many
-features as for the initial points, but the same number of matches. For images of the same size, the features are a
-bit-identical subset of the features for the initial points in 50 of 51 images. The subset cannot be selected, because
-pycolmap returns keypoints without their contrast. Features are therefore detected twice, which takes up to 1.0 s of
-CPU time for `robot` and 3.0 s for `basketball`."""
+"""Maximum number of features per image, and the contrast threshold of COLMAP. On `basketball`,
+these values yield half as many features as the initial points use, but the same number of matches.
+For images of the same size, the features are a bit-identical subset of the features for the initial
+points in 50 of 51 images. The subset cannot be selected, because pycolmap returns keypoints without
+their contrast. Features are therefore detected twice, which takes up to 1.0 s of CPU time for
+`robot` and 3.0 s for `basketball`."""
 NEIGHBOURS = 6
-"""Number of nearest cameras that each camera is matched with; more distant views hardly match."""
+"""Number of nearest cameras with which each camera is matched. More distant views hardly match."""
 HELD_OUT_EVERY = 5
 """One in this many tracks is held out for testing."""
 
@@ -47,7 +49,8 @@ class Matches:
 
     Attributes:
         cameras: calibrated cameras, at the image size used for feature detection.
-        scale: factor from that image size to the full size of each camera's image; at least 1.
+        scale: factor from the size for feature detection to the full size of each camera's image,
+            at least 1.
         pixels: [K, 2] feature positions of each camera.
         pairs: maps each pair of camera indices to the [M, 2] indices of their matching features.
     """
@@ -58,7 +61,7 @@ class Matches:
     pairs: dict[Pair, NDArray[np.intp]]
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Matches:
-        """Returns the same features for a different calibration; the cameras must have the same image sizes."""
+        """Returns the same matches for a different calibration with the same image sizes."""
         return replace(self, cameras=tuple(cameras))
 
     def without(self, left_out: Collection[int]) -> Matches:
@@ -67,7 +70,12 @@ class Matches:
         return replace(self, pairs=pairs)
 
     def tracks(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Returns the track index of each feature, concatenated over cameras, and the offset of each camera."""
+        """Joins matching features to tracks.
+
+        Returns:
+            The track index of each feature, concatenated over the cameras, and the index of the
+            first feature of each camera, followed by the number of features.
+        """
         offsets = np.concatenate([[0], np.cumsum([len(uv) for uv in self.pixels])])
         edges = [rows + offsets[list(pair)] for pair, rows in self.pairs.items()]
         all_edges = np.concatenate(edges) if edges else np.zeros((0, 2), np.intp)
@@ -76,7 +84,8 @@ class Matches:
     def split(self) -> tuple[Matches, Matches]:
         """Splits the matches into a training set and a held-out set that share no features."""
         track, offsets = self.tracks()
-        # Only tracks with matches are counted, in order of their first features, so that both sets cover all cameras.
+        # Tracks without matches are not counted. The others are numbered in the order of their
+        # first features, so that both sets cover all cameras.
         matched = np.concatenate(
             [np.zeros(0, np.intp), *(track[r + offsets[list(p)]][:, 0] for p, r in self.pairs.items())]
         )
@@ -112,7 +121,9 @@ def _downscale(view: PosedPicture) -> PosedPicture:
 
 
 def neighbour_pairs(rig: Rig) -> list[Pair]:
-    """Returns the pairs of cameras to match: each camera with its ``NEIGHBOURS`` nearest in direction and position.
+    """Returns the pairs of cameras to match.
+
+    Each camera is matched with the ``NEIGHBOURS`` cameras nearest in direction and position.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> row = [np.eye(4) for _ in range(9)]
@@ -137,14 +148,17 @@ def neighbour_pairs(rig: Rig) -> list[Pair]:
 
 
 def _mutual_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Returns the [M, 2] indices of unit descriptors that are mutual nearest neighbours and pass the ratio test."""
+    """Returns the indices [M, 2] of mutual nearest descriptors that pass the ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.intp)
     return mutual_best(descriptor_distances(first, second))
 
 
 def epipolar_distances(matches: Matches, pair: Pair) -> Float:
-    """Returns the [M] epipolar distances of a pair's matches in pixels, each the larger of both images' distances."""
+    """Returns the epipolar distances [M] of the matches between two cameras, in pixels.
+
+    The distance of a match is the larger of its distances in the two images.
+    """
     (a, b), rows = pair, matches.pairs[pair]
     first, second = (np.pad(matches.pixels[v][rows[:, k]], ((0, 0), (0, 1)), constant_values=1.0)
                      for k, v in enumerate((a, b)))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Checks the calibration of a rig against the images of frame 0, and refines it on request."""
+"""Check of a rig's calibration against the images of frame 0, and refinement on request."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
 
 MIN_CAMERAS = 3
-"""Minimum number of cameras for a refinement; with two, either one could be off."""
+"""Minimum number of cameras for a refinement. With only two cameras, either camera could be off."""
 STANDARD_ERRORS = 2.0
 """Number of standard errors by which a refinement must reduce the loss of held-out matches."""
 MIN_HELD_OUT = 20
@@ -51,12 +51,16 @@ def calibrate_first_frame(
 
 
 def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> CalibrationReport | None:
-    """Measures the calibration error from a frame's images, or returns None if fewer than two cameras have an image.
+    """Measures the calibration error in the images of one frame, and refines the poses on request.
 
     Args:
-        rig: rig in the user's world, at image size.
+        rig: rig in the user's world, at the size of the images.
         images: maps each camera name to its image, [H, W, 3] uint8.
-        refine: whether to refine poses; the refined poses are used only if held-out matches improve.
+        refine: whether to refine the poses. The refined poses are accepted only if held-out matches
+            improve.
+
+    Returns:
+        The report, or None if fewer than two cameras have an image, or an image has the wrong size.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -66,7 +70,7 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
     """
     try:
         views = collect_views(rig, images, {})
-    except InitialPointsError:  # only one image, or a wrong size, which is rejected elsewhere
+    except InitialPointsError:  # fewer than two images, or a wrong size, which is rejected elsewhere
         return None
     matches = match_by_appearance(views)
     cameras, off = measure_residuals(matches)
@@ -104,7 +108,9 @@ def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], 
 
 
 def refine_rig(rig: Rig, matches: Matches) -> Refinement:
-    """Refines the poses of a rig; the result is accepted only if held-out matches improve.
+    """Refines the poses of a rig, and also the focal lengths if they reduce the error further.
+
+    Each change is accepted only if held-out matches improve.
 
     Args:
         rig: calibrated rig, in the user's world.
@@ -156,7 +162,11 @@ class _HeldOutTest:
 
     @classmethod
     def of(cls, held: Matches, given: Sequence[Camera], found: list[Camera]) -> _HeldOutTest:
-        """Compares two calibrations on held-out matches, ignoring wrong matches, which are far off in both."""
+        """Compares two calibrations on held-out matches.
+
+        Matches that are far from their epipolar lines in both calibrations are wrong, and are
+        ignored.
+        """
         pairs = list(held.pairs)
         before, after = (
             np.concatenate([np.zeros(0), *(epipolar_distances(held.with_cameras(rig), pair) for pair in pairs)])
@@ -169,7 +179,7 @@ class _HeldOutTest:
 
     @property
     def is_better(self) -> bool:
-        """Whether the loss decreased significantly."""
+        """Whether the mean loss decreased significantly."""
         count = len(self.losses)
         return (
             count >= MIN_HELD_OUT

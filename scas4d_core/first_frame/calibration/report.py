@@ -1,4 +1,7 @@
-"""Calibration results in the report of frame 0, and the refined rig that is read from it. Requires only NumPy."""
+"""Calibration results in the report of frame 0, and the refined rig that the report describes.
+
+This module requires only NumPy.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,8 @@ class CameraResidual:
     """Calibration error of a camera, estimated from its matches.
 
     Attributes:
-        pixels: median epipolar distance, in pixels of the camera's images; NaN if there are too few matches.
+        pixels: median epipolar distance, in pixels of the camera's images, or NaN if there are too
+            few matches.
         matches: approximate number of correct matches.
     """
 
@@ -27,14 +31,14 @@ class CameraResidual:
 
 @dataclass(frozen=True)
 class RefinedCamera:
-    """A camera after refinement.
+    """Camera after refinement.
 
     Attributes:
         rotation_deg: rotation from the given pose, in degrees.
         translation: displacement of the camera centre, in the user's units.
         focal: factor applied to the given focal length.
-        before: residual before refinement in pixels; NaN if there are too few matches.
-        after: residual after refinement in pixels; NaN if there are too few matches.
+        before: residual before refinement in pixels, or NaN if there are too few matches.
+        after: residual after refinement in pixels, or NaN if there are too few matches.
         fixed: whether the camera was left unchanged because it had too few matches.
         pose: [4][4] world-to-camera transform, in the user's world.
     """
@@ -55,11 +59,12 @@ class Refinement:
     Attributes:
         accepted: whether the scene uses the refined rig.
         text: user-facing explanation.
-        before: error before refinement, i.e. the epipolar distance in pixels whose loss equals the mean loss of the
-            held-out matches.
-        after: the same error after refinement.
+        before: error before refinement, in pixels. The error is the epipolar distance whose loss
+            equals the mean loss of the held-out matches.
+        after: error after refinement, in pixels.
         matches: number of held-out matches.
-        cameras: refined cameras, keyed by name; empty if the refinement was not accepted.
+        cameras: refined cameras, keyed by name. The mapping is empty if the refinement was not
+            accepted.
     """
 
     accepted: bool
@@ -70,7 +75,10 @@ class Refinement:
     cameras: dict[str, RefinedCamera] = field(default_factory=dict)
 
     def apply_to(self, camera: Camera) -> Camera:
-        """Returns a camera, at any image size, with its refined pose and focal length (unchanged if not refined)."""
+        """Returns a camera, at any image size, with its refined pose and focal length.
+
+        A camera that was not refined is returned unchanged.
+        """
         refined_camera = self.cameras.get(camera.name)
         return camera if refined_camera is None else _with_pose(camera, refined_camera.pose, refined_camera.focal)
 
@@ -82,7 +90,8 @@ class CalibrationReport:
     Attributes:
         cameras: residual of each camera before refinement, keyed by name.
         miscalibrated: names of cameras that are clearly off.
-        warnings: user-facing warnings, which describe the refined rig if there is one.
+        warnings: user-facing warnings. If a refinement was accepted, the warnings describe the
+            refined rig.
         refined: result of the refinement, or None if no refinement was requested.
     """
 

@@ -1,4 +1,4 @@
-"""Measures the epipolar residual of each camera in pixels, i.e. its calibration error in the images of frame 0."""
+"""Calibration error of each camera, measured as an epipolar residual in the images of frame 0."""
 
 from __future__ import annotations
 
@@ -13,20 +13,30 @@ from scas4d_core.first_frame.calibration.report import CameraResidual
 from scas4d_core.posed_pictures import Float
 
 NEAR, FAR = 16.0, 80.0
-"""Epipolar distance bounds, in pixels. Matches below the first are correct, except for some chance matches. Matches
-between the two are wrong and uniformly distributed; their density per pixel estimates the number of chance matches."""
+"""Bounds of the epipolar distance, in pixels. Matches below the first bound are correct, except for
+some chance matches. Matches between the two bounds are wrong and uniformly distributed. The density
+of wrong matches per pixel yields the number of chance matches."""
 MIN_INLIERS = 30
 """Minimum number of correct matches needed to estimate a camera's residual."""
 MIN_INLIER_SHARE = 0.5
-"""Minimum fraction of correct matches among those below ``NEAR``; otherwise the distances are due to chance."""
+"""Minimum fraction of correct matches among all matches below ``NEAR``. If the fraction is lower,
+the distances are due to chance."""
 MAX_RESIDUAL, MAX_TIMES_MEDIAN = 0.9, 2.0
-"""A camera is off if its residual exceeds both this number of pixels, at the image size of feature detection, and this
-multiple of the rig's median. Correct captures have residuals of 0.1 to 0.6 pixels, up to 1.6 times the median; a
-camera rotated by two pixels has 0.9 to 2.2 pixels (docs/calibration.md)."""
+"""Residual in pixels, at the image size of feature detection, and multiple of the rig's median
+residual. A camera is off if its residual exceeds both. Correct captures have residuals of 0.1 to
+0.6 pixels, up to 1.6 times the median. A camera that is rotated by two pixels has a residual of 0.9
+to 2.2 pixels (docs/calibration.md)."""
 
 
 class ResidualEstimate(NamedTuple):
-    """Median distance of correct matches, its lower bound (two standard errors), and the number of these matches."""
+    """Residual of a camera, estimated from its correct matches.
+
+    Attributes:
+        median: median epipolar distance of the correct matches in pixels, or NaN if there are too
+            few correct matches.
+        lower_bound: lower bound of the median, two standard errors below the median, or NaN.
+        inliers: number of correct matches.
+    """
 
     median: float
     lower_bound: float
@@ -34,7 +44,7 @@ class ResidualEstimate(NamedTuple):
 
 
 def estimate_residual(distances: Float) -> ResidualEstimate:
-    """Estimates the median distance of correct matches by subtracting the density of wrong ones.
+    """Estimates the median distance of correct matches by subtracting the density of wrong matches.
 
     Args:
         distances: [M] epipolar distances of correct and wrong matches, in pixels.
@@ -55,11 +65,16 @@ def estimate_residual(distances: Float) -> ResidualEstimate:
 
 
 def measure_residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
-    """Returns each camera's residual relative to correct cameras, keyed by name, and the names of cameras that are off.
+    """Measures the residual of each camera relative to correctly calibrated cameras.
 
-    A camera that is off increases the residuals of its neighbours. Therefore, as long as a camera is far worse than
-    most, the worst one is excluded and the others are measured again. If most cameras are off, the faulty ones cannot
-    be identified, and no names are returned.
+    A camera that is off increases the residuals of its neighbours. Therefore, as long as a camera
+    is far worse than most cameras, the worst camera is excluded and all residuals are measured
+    again. If more than half of the cameras would be excluded, the faulty cameras cannot be
+    identified.
+
+    Returns:
+        The residual of each camera, keyed by name, and the names of the cameras that are off. If
+        the faulty cameras cannot be identified, no names are returned.
     """
     measured = [(pair, epipolar_distances(matches, pair)) for pair in matches.pairs]
     off: list[int] = []

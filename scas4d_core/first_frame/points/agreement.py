@@ -1,4 +1,7 @@
-"""Finds points that several cameras agree on, using features, stereo, the visual hull and fitted surfaces."""
+"""Search for points on which several cameras agree.
+
+The search combines features, stereo, the visual hull and fitted surfaces.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +44,11 @@ OnProgress = Callable[[str, int, int], None]
 """Callback that receives the name of a stage, and its completed and total numbers of steps."""
 
 REFUTING_VIOLATIONS = 2
-"""Number of cameras that must see through an unconfirmed point to reject it; a single depth may be wrong."""
+"""Number of cameras that must see through an unconfirmed point to reject the point. A single depth
+may be wrong."""
 REFUTING_MASKS = 1
-"""Number of masks that must contradict a point to reject it; one suffices, because all masks support the hull."""
+"""Number of masks that must contradict a point to reject the point. One mask suffices, because all
+masks support the hull."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +57,8 @@ class PointSearch:
 
     Attributes:
         labelled: views with the given masks, if any.
-        views: the same views; if there is a backdrop, their masks are the silhouettes in front of it.
+        views: the same views. If there is a backdrop, their masks are the silhouettes in front of
+            the backdrop.
         tracks: feature tracks.
         backdrop: whether the masks of ``views`` are silhouettes in front of a backdrop.
         min_views: number of cameras that must agree on a point.
@@ -91,7 +97,8 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     on_progress("hull", 0, 1)
     hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
-    # Two cameras can agree by chance anywhere along an epipolar line, so planes through such points are unreliable.
+    # Two cameras can agree by chance anywhere along an epipolar line, so surfaces that are fitted
+    # to such points are unreliable.
     if not plain and min_views > 2 and len(triangulated.positions) >= 10:
         standing = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
@@ -123,7 +130,10 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
-    """Returns whether each triangulated point is inside the masks of most cameras that observed it, [P]."""
+    """Returns whether each triangulated point is on the foreground, [P].
+
+    A foreground point is inside the masks of most cameras that observed the point.
+    """
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for view, seen in zip(views, triangulated.views.T, strict=True):
@@ -144,7 +154,10 @@ def _stereo(
     middle: Float,
     on_progress: OnProgress,
 ) -> list[DepthMap]:
-    """Returns depth maps of all downscaled images; hull, surfaces and triangulated points initialize the search."""
+    """Returns the depth maps of all downscaled images, or no maps if there is no time for stereo.
+
+    Hull, surfaces and triangulated points limit the depth range and provide depths to try first.
+    """
     views, plain = search.views, search.backdrop
     effort = plan_stereo(views, middle, search.iterations, search.limit)
     if effort is None:
@@ -166,7 +179,8 @@ def _stereo(
             depth = np.concatenate([depth, prior[prior > 0][::16]])
         if len(depth) < 10:
             depth = np.array([0.05, 2.0]) * float(np.linalg.norm(camera.centre - middle))
-        # Features do not extend to the limits of the scene, but the hull does.
+        # The hull extends to the limits of the scene, but features do not, so their range is
+        # widened more.
         low, high = (0.9, 1.1) if plain else (0.6, 1.3)
         ranges.append((low * float(np.percentile(depth, 1)), high * float(np.percentile(depth, 99))))
         if len(hull_surface):
@@ -191,7 +205,7 @@ def _stereo(
 
 
 def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Float:
-    """Returns the [P, 3] surface points of the hull, after removing voxels that cameras see through."""
+    """Returns the surface points [P, 3] of the hull without the voxels that cameras see through."""
     if len(hull.cells) == 0:
         return np.zeros((0, 3))
     solid = count_violations(maps, hull.centres, min_views, margin=0.01) < REFUTING_VIOLATIONS

@@ -1,4 +1,4 @@
-"""Merges candidate initial points: thins, colours and labels them, and drops those that the images contradict."""
+"""Merging of candidate initial points from several sources into one point cloud."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ from scas4d_core.posed_pictures import (
 )
 
 SPACING = 1.5
-"""Spacing of neighbouring points, in pixels at the scene centre; twice that on the background."""
+"""Spacing of neighbouring points, in pixels at the scene centre. The spacing is doubled on the
+background."""
 COLOUR_SPREAD = 0.12
-"""Median deviation between cameras' colours (0…1) above which a point not confirmed by stereo is rejected."""
+"""Maximum median deviation between the cameras' colours (0…1) of a point. The limit does not apply
+to points that stereo or features confirm."""
 CROWD = 4
-"""Minimum number of stereo points in the 27 cells around a point: many pixels see true surfaces, few see outliers."""
+"""Minimum number of candidates within 1.5 cells of a stereo point, or in its cell. Many pixels see
+a true surface, but few see the same outlier."""
 
 
 def merge_candidates(
@@ -36,27 +39,34 @@ def merge_candidates(
     stereo: bool,
     max_points: int,
 ) -> InitialPoints:
-    """Thins, colours and labels the candidates, and drops those that the images contradict.
+    """Thins, colours and labels candidate points, and drops candidates that the images contradict.
 
     Args:
         labelled: views with the given masks, if any.
-        views: the same views; if the background is plain, their masks are the silhouettes in front of it.
-        sources: points on which cameras agree, hull points, and points on fitted surfaces. A point is used only if no
-            earlier source has a point nearby.
+        views: the same views. If the background is plain, their masks are the silhouettes in front
+            of the background.
+        sources: points on which cameras agree, hull points, and points on fitted surfaces. A point
+            is used only if no earlier source has a point nearby.
         pixel: size of a pixel at the scene centre, in world units.
         plain: whether the masks of ``views`` are silhouettes.
         stereo: whether the first source contains stereo points.
         max_points: maximum number of points.
+
+    Raises:
+        InitialPointsError: if there are no candidates, or the images contradict all candidates.
     """
     fine = SPACING * pixel
-    # Minimum number of cameras that see a point and agree on its colour. Points confirmed by stereo or features need
-    # none. Hull points, which all masks support, need two; walls, which other points support, need one.
+    # Minimum number of cameras that must see a point of each source. If the number is 0, the
+    # cameras need not agree on the colour of the point, because stereo or features confirm the
+    # point. Hull points need two cameras. Points on walls need only one, because points nearby
+    # support the wall.
     needed_by = (0, 2, 1)
     points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
         new, sizes = average_per_cell(candidates, fine)
         if source == 0 and stereo and len(new):
-            # This also drops isolated features. They are few, and the hull or walls cover their surfaces.
+            # This filter also drops isolated features, but these are few, and the hull or walls
+            # cover their surfaces.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
             new = new[(crowd >= CROWD) | (sizes >= CROWD)]
         elif len(points) and len(new):
@@ -71,12 +81,13 @@ def merge_candidates(
     visible = visible_from(views, points, fine)
     foreground = labelled_share(labelled, points, visible)
     if plain:
-        # A point that projects onto the plain background is next to an outline; its colour is not the background's.
+        # If a point projects onto the plain background in some view, it is next to an outline. The
+        # view then does not show the colour of the point.
         for row, view in zip(visible, views, strict=True):
             column, line, _, _ = pixels_inside(view.camera, points)
             row &= np.asarray(view.mask)[line, column]
     elif foreground is not None:
-        # Pixels of a person in front of a wall do not show the wall's colour, and vice versa.
+        # Pixels of a person in front of a wall do not show the colour of the wall, and vice versa.
         for row, view in zip(visible, views, strict=True):
             if view.mask is not None:
                 column, line, _, _ = pixels_inside(view.camera, points)
@@ -104,7 +115,16 @@ def merge_candidates(
 
 
 def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
-    """Returns, per point [P], the fraction of its possible observers whose masks contain it; None without masks."""
+    """Returns the fraction of the cameras that see each point whose masks contain the point.
+
+    Args:
+        views: V views. Views without a mask are ignored.
+        points: [P, 3] points in the world.
+        visible: [V, P] bool, whether each point is visible in each view.
+
+    Returns:
+        [P] fractions, or None if no view has a mask.
+    """
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):
         if view.mask is None:
@@ -118,7 +138,11 @@ def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) 
 
 
 def pick_one_per_cell(points: Float, cell: float) -> NDArray[np.intp]:
-    """Returns the index of one point per cubic cell: the point nearest to the mean, for an even distribution."""
+    """Returns the index of one point in each occupied cubic cell with edge length ``cell``.
+
+    The chosen point is the one nearest to the mean of the cell, so that the points are evenly
+    distributed.
+    """
     where, count = _cells(points, cell)
     means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
     order = np.lexsort((((points - means[where]) ** 2).sum(-1), where))
@@ -136,7 +160,10 @@ def average_per_cell(points: Float, cell: float) -> tuple[Float, NDArray[np.intp
 
 
 def _cells(points: Float, cell: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Returns the cell index [P] of each point, in x, y, z order, and the number of points per cell."""
+    """Returns the cell index [P] of each point, and the number of points in each occupied cell.
+
+    Occupied cells are numbered in the order of their x, y and z coordinates.
+    """
     cells = np.floor(points / cell).astype(np.int64)
     cells -= cells.min(axis=0)
     size = cells.max(axis=0) + 1

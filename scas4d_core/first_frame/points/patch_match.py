@@ -1,9 +1,10 @@
-"""PatchMatch stereo in Numba: depth and normal of every pixel of an image, matched against several neighbours.
+"""PatchMatch stereo in Numba, which computes the depth and normal of every pixel of an image.
 
-Each pixel stores a small plane. Planes that match well propagate to neighbouring pixels and are refined by random
-perturbation. Based on Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015 (red–black
-order, several views). The matching cost is the weighted normalized cross-correlation of COLMAP (Schönberger et al.
-2016).
+Each pixel stores a small plane, which is matched against several neighbouring images. Planes that
+match well propagate to neighbouring pixels and are refined by random perturbation. The algorithm
+follows Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015
+(red–black order, several views). The matching cost is the weighted normalized cross-correlation of
+COLMAP (Schönberger et al. 2016).
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ from numba import prange
 from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 REACH = 2
-"""Number of samples on either side of the centre of a patch: 5 × 5 in total."""
+"""Number of samples on either side of the centre of a patch. A patch has 5 × 5 samples."""
 STEP = 2
-"""Spacing of the samples in pixels; covers a 9-pixel-wide window at the cost of 25 samples."""
+"""Spacing of the samples in pixels. The 25 samples cover a window that is 9 pixels wide."""
 TEXTURE = 0.012
-"""Minimum standard deviation of a patch (0…1) for a meaningful match: three levels of an 8-bit image."""
+"""Minimum standard deviation of a patch (0…1) for a meaningful match. The value is three levels of
+an 8-bit image."""
 NO_MATCH = 2.0
-"""Cost of a patch that cannot be compared; otherwise the cost is 1 − NCC, between 0 and 2."""
+"""Cost of a patch that cannot be compared. The cost of any other patch is 1 − NCC, between 0 and
+2."""
 ROUNDED = 1e-6
 """Amount by which rounding may make the cost of a perfect match negative."""
 
@@ -31,7 +34,7 @@ _SAMPLES = (2 * REACH + 1) ** 2
 
 @inline
 def _random(key: int, draw: int) -> float:
-    """Returns a number in [0, 1) that depends only on the arguments, not on the thread (splitmix64)."""
+    """Returns a random number in [0, 1) that depends only on the arguments (splitmix64)."""
     z = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -45,10 +48,11 @@ def _cost(
     nx: float, ny: float, nz: float, inverse: Any, rays: Any, inverses: Any, others: Any, sizes: Any, shifts: Any,
     best: int, enough: float,
 ) -> float:  # fmt: skip
-    """Returns 1 − NCC, averaged over the ``best`` neighbours that match best.
+    """Returns the cost 1 − NCC, averaged over the ``best`` neighbours that match best.
 
-    The result is NO_MATCH if fewer neighbours see the patch, or if the cost certainly exceeds ``enough``. ``rays``
-    [V, samples, 3] are filled by ``_rays``; ``inverses`` [samples] is a scratch buffer.
+    The result is NO_MATCH if fewer neighbours see the patch, or if the cost certainly exceeds
+    ``enough``. ``rays`` [V, samples, 3] is the output of ``_rays``, and ``inverses`` [samples] is a
+    scratch buffer.
     """
     rx, ry = inverse[0] * x + inverse[1], inverse[2] * y + inverse[3]
     reach = depth * (nx * rx + ny * ry + nz)  # n · X of the plane's centre
@@ -121,7 +125,10 @@ def _cost(
 
 @inline
 def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
-    """Fills [V, samples, 3] with the rays of the samples around a pixel, transformed by each neighbour's M."""
+    """Fills ``rays`` [V, samples, 3] with the rays of the samples around a pixel.
+
+    The rays are multiplied by the matrix M of each neighbour.
+    """
     for v in range(matrices.shape[0]):
         m = matrices[v]
         k = 0
@@ -136,7 +143,11 @@ def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
 
 @kernel
 def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, float]:
-    """Fills in the samples around a pixel and their bilateral weights, and returns the mean and standard deviation."""
+    """Fills ``patch`` and ``weight`` with the samples around a pixel and their bilateral weights.
+
+    Returns:
+        Weighted mean and standard deviation of the samples.
+    """
     height, width = image.shape
     middle = image[y, x]
     sum_w, sum_i, sum_ii = 0.0, 0.0, 0.0
@@ -161,7 +172,10 @@ def _sweep(
     image: Any, active: Any, prior: Any, depth: Any, normal: Any, cost: Any, inverse: Any, others: Any, sizes: Any,
     matrices: Any, shifts: Any, near: float, far: float, round_: int, colour: int, best: int, seed: int,
 ) -> None:  # fmt: skip
-    """Runs one round over the pixels of one checkerboard colour; round 0 only initializes each pixel's plane."""
+    """Runs one round over the pixels of one checkerboard colour.
+
+    Round 0 initializes the planes of all pixels.
+    """
     height, width = image.shape
     for y in prange(height):
         patch, weight, inverses = np.empty(_SAMPLES), np.empty(_SAMPLES), np.empty(_SAMPLES)
@@ -185,7 +199,7 @@ def _sweep(
                     td = 1.0 / (1.0 / far + _random(key, 8 * attempt) * (1.0 / near - 1.0 / far))
                     if attempt > 0 and prior[y, x] > 0.0:
                         td = prior[y, x]
-                    # A normal within 60 degrees of facing the camera.
+                    # The random normal is within 60 degrees of the direction to the camera.
                     angle, tilt = 6.2831853 * _random(key, 8 * attempt + 1), np.sqrt(_random(key, 8 * attempt + 2))
                     sine = 0.86 * tilt
                     tx, ty, tz = sine * np.cos(angle), sine * np.sin(angle), -np.sqrt(1.0 - sine * sine)
@@ -196,7 +210,7 @@ def _sweep(
                     b = y + (span if side == 2 else -span if side == 3 else 0)
                     if a < 0 or b < 0 or a >= width or b >= height or cost[b, a] >= NO_MATCH:
                         continue
-                    # The neighbour's plane, intersected with this pixel's ray.
+                    # Intersect the plane of the neighbouring pixel with the ray of this pixel.
                     tx, ty, tz = normal[b, a, 0], normal[b, a, 1], normal[b, a, 2]
                     there = tx * (inverse[0] * (a + 0.5) + inverse[1]) + ty * (inverse[2] * (b + 0.5) + inverse[3]) + tz
                     here = tx * (inverse[0] * px + inverse[1]) + ty * (inverse[2] * py + inverse[3]) + tz
@@ -236,7 +250,7 @@ def patch_match(
     Args:
         image: [H, W] float32 grayscale in 0…1.
         active: [H, W] bool, pixels to compute.
-        prior: [H, W] float64 depth to try first, 0 if unknown.
+        prior: [H, W] float64 depth to try first, or 0 if there is none.
         inverse: [4] float64 inverse intrinsics (1/fx, −cx/fx, 1/fy, −cy/fy).
         others: [V, H', W'] float32 images of the neighbours, each in the upper left corner of its plane.
         sizes: [V, 2] int64 height and width of each neighbour's image.

@@ -1,4 +1,7 @@
-"""Finds the plane on which images agree: a floor or table seen from directions that differ too much for stereo."""
+"""Search for a plane on which images agree.
+
+The plane is usually a floor or table, seen from directions that differ too much for stereo.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ from scas4d_core.posed_pictures import (
 Planes = NDArray[np.float32]
 
 CELLS = 48
-"""Number of cells along the side of the search square, which is as wide as a typical image at the scene centre."""
+"""Number of cells along the side of the search square. At the scene centre, the square is as wide
+as a typical image."""
 MAX_CELLS = 160
 """Maximum number of cells along the side of the square when points are sampled."""
 REACH = 1.5
@@ -35,25 +39,29 @@ OFFSETS = 37
 TILT, TILTS = 0.2, 5
 """Maximum tilt about either axis of the square, in radians, and number of tilts per axis."""
 ROUNDS = 6
-"""Number of refinement rounds; after a round without improvement, steps are divided by ``SHRINK``."""
+"""Number of refinement rounds. After a round without improvement, step sizes are divided by
+``SHRINK``."""
 SHRINK = 1.7
 UNLIKE = 0.8
-"""Maximum cosine between the normals of two start planes; a start plane closer to a previous one is skipped."""
+"""Maximum cosine between the normals of two start planes. A start plane that is more similar to a
+previous start plane is skipped."""
 PATCH = 7
 """Side of the compared patches, in cells."""
 TEXTURE = 4.0
 """Minimum standard deviation, in grey levels, of a textured patch."""
 ALIKE, HALF_ALIKE = 0.6, 0.3
-"""Correlation of patches above which two cameras agree on a cell, and above which it adds to the score of a plane."""
+"""Correlation of patches above which two cameras agree on a cell, and correlation above which the
+cell adds to the score of the plane."""
 PAIRS = 2
-"""Number of camera pairs that must agree on a cell; two pairs involve at least three cameras."""
+"""Number of camera pairs that must agree on a cell. Two pairs involve at least three cameras."""
 BEYOND_CHANCE = 1.8
-"""Minimum score of a plane as a multiple of the score of mirrored images, which agree only by chance. The ratio is 2.2
-to 4.7 on six rigs with a floor or table, and 0.9 to 1.6 on three rigs without one."""
+"""Minimum score of a plane as a multiple of the score of mirrored images, which agree only by
+chance. The ratio is 2.2 to 4.7 on six rigs with a floor or table, and 0.9 to 1.6 on three rigs with
+neither."""
 MIN_CELLS = 40
 """Minimum number of cells of a plane on which cameras agree."""
 MAX_VIEWS = 6
-"""Maximum number of compared views, evenly spaced in the rig's order."""
+"""Maximum number of compared views, which are evenly spaced in rig order."""
 CLOSED = 15
 """Maximum width, in cells, of gaps between agreeing cells that are filled."""
 
@@ -62,7 +70,7 @@ NO_PLANE = "images: the cameras do not agree on any plane; provide a point cloud
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A square piece of a plane.
+    """Square piece of a plane.
 
     Attributes:
         middle: [3] centre in the world.
@@ -87,11 +95,12 @@ class Plane:
 
 
 def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
-    """Returns points on the plane on which most images agree, including small gaps between agreeing cells.
+    """Returns points on the plane on which the images agree most.
 
-    A plane has only two angles and an offset, so planes can be tried exhaustively (plane sweeping, Collins 1996).
-    Projected onto the correct plane, images from very different directions look the same. Patches are compared by
-    correlation, so exposures may differ.
+    A plane has only two angles and an offset, so planes can be tried exhaustively (plane sweeping,
+    Collins 1996). On the correct plane, even projected images from very different directions look
+    the same. Patches are compared by correlation, so exposures may differ. Small gaps between
+    agreeing cells are filled.
 
     Args:
         labelled: views, with masks if available.
@@ -131,10 +140,14 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
 
 
 def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
-    """Returns the plane on which images agree most: horizontal, parallel to the camera ring, or facing the cameras.
+    """Returns the plane on which images agree most.
+
+    Planes near three start planes are compared: a horizontal plane, a plane parallel to the ring of
+    cameras, and a plane that faces the cameras.
 
     Raises:
-        InitialPointsError: if the images agree hardly more than mirrored images do.
+        InitialPointsError: if the images agree on too few cells, or hardly more than mirrored
+            images do.
     """
     candidates = [(_best(views, start), start) for start in _starts(views)]
     (score, plane), start = max(candidates, key=lambda one: one[0][0])
@@ -153,7 +166,10 @@ def _agreed_cells(views: Sequence[PosedPicture], plane: Plane, count: int) -> Bo
 
 
 def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
-    """Returns start planes through the scene centre whose normals differ sufficiently."""
+    """Returns start planes through the scene centre whose normals differ sufficiently.
+
+    The candidates are the three start planes of ``agreed_plane``.
+    """
     middle = look_at_point(views)
     centres = np.array([view.camera.centre for view in views])
     up = -np.mean([view.camera.rotation[1] for view in views], axis=0)
@@ -212,7 +228,7 @@ def _axes(normal: Float) -> tuple[Float, Float]:
 
 
 def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Planes]:
-    """Returns the images in greyscale, low-pass filtered to the cell size."""
+    """Returns the images in greyscale, low-pass filtered to the size of a cell of the plane."""
     cell = 2 * plane.half / count / pixel_size_at(views, plane.middle)
     return [gaussian_filter(view.image.mean(axis=2, dtype=np.float32), max(0.5, cell / 2)) for view in views]
 
@@ -228,8 +244,8 @@ def _agreement(
         points: [T, C, C, 3] cell centres of each plane, in the world.
 
     Returns:
-        [T] score of each plane, the sum of correlations in excess of ``HALF_ALIKE``, and [T, C, C] number of camera
-        pairs that agree on each cell.
+        [T] score of each plane, and [T, C, C] number of camera pairs that agree on each cell. The
+        score is the correlation in excess of ``HALF_ALIKE``, summed over cells and camera pairs.
     """
     laid = [_warp_to_plane(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
     scores, pairs = np.zeros(len(points)), np.zeros(points.shape[:3], np.intp)
@@ -246,7 +262,12 @@ def _agreement(
 
 
 def _warp_to_plane(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
-    """Returns an image warped to planes, [T, C, C], and the mean, deviation and texture mask of its patches."""
+    """Warps an image to planes, and measures the patches around the cells.
+
+    Returns:
+        Four arrays [T, C, C]: the warped image, the mean and standard deviation of the patch around
+        each cell, and whether the patch is textured and completely inside the image.
+    """
     uv, depth = view.camera.project(points.reshape(-1, 3))
     height, width = picture.shape
     with np.errstate(invalid="ignore"):

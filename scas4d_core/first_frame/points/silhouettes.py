@@ -1,4 +1,4 @@
-"""Estimates the backdrop colour of a scene and the silhouettes in front of it from the images alone."""
+"""Backdrop colour of a scene, and silhouettes in front of the backdrop, from the images alone."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from scipy.ndimage import label
 from scas4d_core.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
-"""Maximum difference of a background pixel from the background colour in any channel, in 8-bit levels; it exceeds the
-noise from resampling and mild compression."""
+"""Maximum difference of a background pixel from the background colour in any channel, in 8-bit
+levels. The noise of resampling and mild compression is smaller."""
 PLAIN_BORDER = 0.95
-"""Minimum fraction of the border of each image that must have the same colour for a plain background."""
+"""Minimum fraction of the border of each image that must have the same colour if the background is
+plain."""
 SMALL_HOLE = 12
 """Maximum size, in pixels, of background islands inside an object that are treated as texture instead of holes."""
 
 PLAIN = 0.2
-"""Minimum fraction of all pixels that must have a similar colour for a plain backdrop; most cameras must reach half of
-this fraction."""
+"""Minimum fraction of all pixels that must have a similar colour if the backdrop is plain. In most
+images, at least half of this fraction must have that colour."""
 SAME = 0.05
-"""Minimum fraction of all pixels that must have exactly the same colour for a synthetic background. Quantized images of
-rooms reach up to 0.03."""
+"""Minimum fraction of all pixels that must have exactly the same colour if the background is
+synthetic. In quantized images of rooms, up to 0.03 of the pixels have the same colour."""
 ALIKE = 8
-"""Maximum difference between similar colours, in 8-bit levels, due to noise and JPEG artefacts."""
+"""Maximum difference between similar colours, in 8-bit levels. Noise and JPEG artefacts cause such
+differences."""
 PIXEL_STRIDE = 4
 """Spacing of the sampled pixels."""
 
@@ -73,7 +75,8 @@ def _is_backdrop(of_it: list[Bool], share: float) -> bool:
 
     Args:
         of_it: one mask per camera, true for pixels that show the backdrop.
-        share: minimum fraction of all pixels; most cameras must reach half of this fraction.
+        share: minimum fraction of all pixels. In most images, at least half of this fraction must
+            show the backdrop.
     """
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 

@@ -1,4 +1,4 @@
-"""Computes dense stereo points that several cameras' depths agree on and that few cameras see through."""
+"""Dense stereo: depth maps of several cameras, and the points on which the depth maps agree."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved, pixels_inside
 
 WIDTH = 320
-"""Maximum image width, in pixels; wider images are halved repeatedly."""
+"""Maximum image width, in pixels. Wider images are halved repeatedly."""
 PACE_WIDTH = 80
-"""Image width for measuring the pace; measuring it takes a thirtieth of the work for one image."""
+"""Maximum width of the image on which the pace is measured. The measurement takes a thirtieth of
+the work for one image."""
 PLANES_FIRST, PLANES_EACH = 3, 12
 """Number of planes tried per pixel, initially and in each round (``patch_match``)."""
 NEIGHBOURS = 4
 """Number of other cameras with which each image is compared."""
 MIN_NEIGHBOURS = 2
-"""Minimum number of neighbours of an image; a match with only one neighbour is often wrong."""
+"""Minimum number of neighbours of an image. A match with only one neighbour is often wrong."""
 ITERATIONS = 4
 """Number of rounds of propagation and refinement."""
 MAX_COST = 0.35
-"""Maximum cost 1 − NCC of an accepted match, before cameras are compared."""
+"""Maximum cost 1 − NCC of an accepted match. Accepted depths are then compared between cameras."""
 REPROJECTION = 1.0
 """Maximum reprojection error, in pixels, after projecting a point into another camera's depth map and back."""
 DEPTH_AGREEMENT = 0.01
 """Maximum relative difference between two cameras' depths of the same point."""
 MIN_ANGLE_DEG, MAX_ANGLE_DEG = 4.0, 50.0
-"""Limits on the angle between two cameras' rays to the scene centre. If it is smaller, depth is uncertain; if it is
-larger, patches look different."""
+"""Minimum and maximum angle between two cameras' rays to the scene centre. At smaller angles, depth
+is uncertain. At larger angles, patches look different."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +44,8 @@ class DepthMap:
 
     Attributes:
         view: camera and image, at the size used for stereo.
-        depth: [H, W] depth along z, in world units; 0 if unknown.
-        agreeing: [H, W] number of other cameras whose depth agrees.
+        depth: [H, W] depth along z, in world units, or 0 if the depth is unknown.
+        agreeing: [H, W] number of other cameras whose depths agree.
     """
 
     view: PosedPicture
@@ -59,14 +60,21 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class StereoBudget:
-    """Effort spent on stereo: maximum image width in pixels, and number of rounds of propagation and refinement."""
+    """Effort for stereo.
+
+    Attributes:
+        width: maximum image width in pixels.
+        iterations: number of rounds of propagation and refinement.
+    """
 
     width: int
     iterations: int
 
 
 def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> StereoBudget | None:
-    """Returns the effort that the time limit allows, based on the pace on tiny images, or None if it allows none.
+    """Returns the largest effort that the time limit allows, or None if no effort is affordable.
+
+    The pace is measured on a tiny image.
 
     Args:
         views: views at full size.
@@ -105,7 +113,10 @@ def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, l
 
 
 def load_stereo() -> None:
-    """Loads or compiles the kernel in advance, so that the time for this does not distort the measured pace."""
+    """Loads or compiles the kernel in advance.
+
+    Loading and compilation would otherwise distort the measured pace.
+    """
     grey, planes = np.zeros((16, 16), np.float32), np.zeros((1, 16, 16), np.float32)
     patch_match(
         grey, np.ones((16, 16), bool), np.zeros((16, 16)), np.ones(4), planes, np.full((1, 2), 16), np.eye(3)[None],
@@ -114,7 +125,7 @@ def load_stereo() -> None:
 
 
 def _pixels(view: PosedPicture, width: int) -> int:
-    """Returns the number of pixels in a view after ``halved``."""
+    """Returns the number of pixels of a view after ``halved``."""
     columns, rows = view.camera.width, view.camera.height
     while columns > width:
         columns, rows = columns // 2, rows // 2
@@ -122,7 +133,17 @@ def _pixels(view: PosedPicture, width: int) -> int:
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
-    """Returns the views to compare with a view: the nearest in angle about ``middle`` [3], within the angle limits."""
+    """Returns the indices of the views to compare with a view.
+
+    These are the views whose rays to the scene centre have the smallest angles to the ray of the
+    view, within the angle limits.
+
+    Args:
+        views: all views.
+        index: index of the view to compare.
+        middle: [3] scene centre.
+        count: maximum number of neighbours.
+    """
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
@@ -143,17 +164,18 @@ def depth_maps(
     fewest: int = MIN_NEIGHBOURS,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[DepthMap]:
-    """Runs PatchMatch between every view and its neighbours, then compares all depths.
+    """Computes the depth map of every view with PatchMatch, and compares the depths between views.
 
     Args:
-        views: views of equal or different sizes; see ``halved``.
+        views: views, whose sizes may differ; see ``halved``.
         ranges: (near, far) depth limits of each view, in world units.
-        priors: [H, W] depths to try first in each view; 0 if unknown.
+        priors: [H, W] depths to try first in each view, 0 where there is none.
         active: [H, W] pixels to compute in each view.
         middle: [3] scene centre, about which angles between cameras are measured.
         iterations: number of rounds of PatchMatch.
         seed: random seed for sampling planes.
-        hull: hull of the masks; depths of masked pixels outside of it are rejected.
+        hull: hull of the masks, or None. Depths of masked pixels that are not near the hull are
+            rejected.
         fewest: minimum number of neighbours of an image.
         progress: function called with (completed views, number of views).
     """
@@ -188,7 +210,7 @@ def _match(
     fewest: int,
     seed: int,
 ) -> Float:
-    """Returns the [H, W] depth of one view, 0 for unreliable matches; see ``depth_maps``."""
+    """Returns the depth [H, W] of one view, or 0 for unreliable matches; see ``depth_maps``."""
     chosen = neighbours_of(views, index, middle, NEIGHBOURS)
     camera = views[index].camera
     if len(chosen) < fewest:
@@ -217,7 +239,11 @@ def _match(
 
 
 def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Returns images padded to the largest size, [V, H, W], each in the upper left corner, and their sizes [V, 2]."""
+    """Pads images to the largest height and width.
+
+    Returns:
+        The images [V, H, W], each in the upper left corner of its plane, and their sizes [V, 2].
+    """
     sizes = np.array([picture.shape for picture in pictures], np.int64)
     planes = np.zeros((len(pictures), *sizes.max(axis=0)), np.float32)
     for plane, picture in zip(planes, pictures, strict=True):
@@ -226,7 +252,10 @@ def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.f
 
 
 def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
-    """Clears, in place, depths of foreground pixels that are not near the hull, which contains all foreground."""
+    """Sets depths of foreground pixels to 0, in place, if their points are not near the hull.
+
+    The hull contains the entire foreground.
+    """
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
         return
@@ -236,7 +265,11 @@ def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
 
 
 def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
-    """Returns how many other cameras' depth maps project each pixel's point back to that pixel, [H, W]."""
+    """Returns the number of other cameras [H, W] whose depth maps agree with each pixel.
+
+    The point of the pixel is projected into the depth map of the other camera. The two depths of
+    the point must be similar, and the point of the other depth map must project back to the pixel.
+    """
     camera, depth = views[index].camera, depths[index]
     rows, columns = np.nonzero(depth > 0)
     uv = np.stack([columns + 0.5, rows + 0.5], axis=-1)
@@ -258,11 +291,12 @@ def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: in
 
 
 def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
-    """Returns the [P, 3] points of all depth maps that ``min_views`` cameras agree on and few see through.
+    """Returns the points [P, 3] of all depth maps on which at least ``min_views`` cameras agree.
 
-    A camera sees through a point if its trusted depth is clearly behind the point. A point is rejected as a floater if
-    the number of cameras that see through it exceeds ``max_violations`` times the number of cameras that agree on it
-    (after Merrell et al. 2007).
+    A camera sees through a point if its trusted depth is clearly behind the point. A point is
+    rejected as a floater if too many cameras see through the point. Their maximum number is
+    ``max_violations`` times the number of cameras that agree on the point (after Merrell et al.
+    2007).
     """
     fused = [np.zeros((0, 3))]
     for index, one in enumerate(maps):
@@ -277,10 +311,18 @@ def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float
 def count_violations(
     maps: Sequence[DepthMap], points: Float, min_views: int, margin: float = 0.03, skip: int = -1
 ) -> NDArray[np.intp]:
-    """Returns, for each of the points [P, 3], the number of cameras that see through it, [P].
+    """Returns the number of cameras [P] that see through each of the points [P, 3].
 
-    A camera sees through a point if its trusted depth is more than ``margin`` (relative) behind the point. All 3 × 3
-    pixels around the point must agree, because next to an outline, the adjacent pixel sees past the point.
+    A camera sees through a point if its trusted depth is behind the point by more than the relative
+    ``margin``. The condition must be true of all 3 × 3 pixels around the point, because next to an
+    outline, an adjacent pixel may see past the point.
+
+    Args:
+        maps: depth maps of the cameras.
+        points: [P, 3] points in the world.
+        min_views: number of cameras that must agree on a trusted depth.
+        margin: minimum relative difference in depth.
+        skip: index of a depth map to ignore, or -1.
     """
     through = np.zeros(len(points), dtype=np.intp)
     for index, one in enumerate(maps):

@@ -1,7 +1,8 @@
-"""Fits planes and spheres to triangulated points, for large smooth surfaces such as walls, floors and domes.
+"""Large smooth surfaces, such as walls, floors and domes, fitted to triangulated points.
 
-Smooth walls have few features, and stereo produces floaters on them. A plane or sphere through many triangulated points
-fills in the wall between them. The fit uses RANSAC (Fischler & Bolles 1981), refined by least squares.
+Smooth walls have few features, and stereo produces floaters near such walls. A plane or sphere
+through many triangulated points fills in the wall between the points. The fit uses RANSAC (Fischler
+& Bolles 1981), followed by least squares.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy.spatial import cKDTree
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture
 
 MAX_SURFACES = 3
-"""Maximum number of planes and spheres; scenes rarely have more walls, floors and domes."""
+"""Maximum number of planes and spheres. Scenes rarely have more walls, floors and domes."""
 TOLERANCE = 0.012
 """Maximum distance of an inlier from a fitted surface, in rig radii."""
 TRIALS = 1500
@@ -25,18 +26,21 @@ MIN_SHARE = 0.1
 """Minimum fraction of the triangulated points that a surface must explain."""
 MIN_INLIERS = 30
 CAMERA_SLACK = 1.25
-"""Maximum distance of a camera from the centre of a dome, in dome radii; cameras are often mounted in its surface."""
+"""Maximum distance of a camera from the centre of a dome, in dome radii. Cameras are often mounted
+on the dome itself."""
 MAX_BEHIND = 0.15
-"""Maximum fraction of the triangulated points behind a surface; almost nothing is behind a wall of a room."""
+"""Maximum fraction of the triangulated points behind a surface. Almost no point is behind the wall
+of a room."""
 MAX_RADIUS = 2.0
-"""Maximum radius of a dome, in rig radii; a larger sphere is a wall, for which a plane needs fewer parameters."""
+"""Maximum radius of a dome, in rig radii. A larger sphere resembles a wall, for which a plane needs
+fewer parameters."""
 GAP_PLANE = 0.5
 GAP_SPHERE = 1.5
 """Maximum distance, in rig radii, from a surface sample to the nearest triangulated point on the surface."""
 
 
 class Surface(Protocol):
-    """A surface seen from inside the room that it bounds."""
+    """Surface that bounds a room and is seen from inside the room."""
 
     def offsets(self, points: Float) -> Float:
         """Returns the [P] signed distances of points [P, 3] along ``normals``."""
@@ -45,12 +49,20 @@ class Surface(Protocol):
         """Returns the [P, 3] unit normals at the surface points nearest to points [P, 3]."""
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """Returns the [R] ray parameters of the intersections from inside the room, or infinity if there is none."""
+        """Returns the ray parameters [R] at which rays from inside the room meet the surface.
+
+        Args:
+            origin: [3] start of all rays.
+            directions: [R, 3] directions of the rays.
+
+        Returns:
+            [R] ray parameters, or infinity for rays that do not meet the surface.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class PatchPlane:
-    """A plane normal · x = offset with |normal| = 1."""
+    """Plane with the equation normal · x = offset, where |normal| = 1."""
 
     normal: Float
     offset: float
@@ -65,7 +77,7 @@ class PatchPlane:
         return np.broadcast_to(self.normal, points.shape)
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """Returns the [R] ray parameters, or infinity if the ray points away."""
+        """Returns the ray parameters [R] of the intersections, or infinity if a ray points away."""
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (self.offset - origin @ self.normal) / (directions @ self.normal)
         result: Float = np.where(along > 0, along, np.inf)
@@ -74,7 +86,7 @@ class PatchPlane:
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A dome around the cameras; rays intersect its far side."""
+    """Dome around the cameras. Rays meet the far side of the sphere."""
 
     centre: Float
     radius: float
@@ -91,7 +103,7 @@ class Sphere:
         return result
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """Returns the [R] ray parameters of the far intersections, or infinity if the ray misses the sphere."""
+        """Returns the ray parameters [R] of the far intersections, or infinity if a ray misses."""
         offset = origin - self.centre
         a = (directions**2).sum(-1)
         b = directions @ offset
@@ -104,7 +116,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """A surface and its inlier points [S, 3]."""
+    """Fitted surface, and the inlier points [S, 3] that support the surface."""
 
     surface: Surface
     points: Float
@@ -176,13 +188,13 @@ def fit_surfaces(
         if on.sum() < needed:
             break
         supports.append(Support(best, rest[on]))
-        # Points close to this surface must not support a second, nearly identical one.
+        # Points close to this surface must not support a second, nearly identical surface.
         rest = rest[np.abs(best.offsets(rest)) > 2.0 * tolerance]
     return supports
 
 
 def _bounds(surface: Surface, points: Float, centres: Float, tolerance: float) -> bool:
-    """Returns whether the cameras and nearly all points are on the same side of the surface."""
+    """Returns whether the surface bounds a room that contains the cameras and nearly all points."""
     cameras, behind = surface.offsets(centres), surface.offsets(points)
     if isinstance(surface, Sphere):
         reach = np.linalg.norm(centres - surface.centre, axis=1).max()
@@ -222,7 +234,8 @@ def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) ->
     """Intersects the rays through pixels [R, 2] with the surfaces.
 
     Returns:
-        The first intersection of each ray [R, 3] and its depth along z [R]; NaN and infinity if there is none.
+        The first intersection [R, 3] of each ray, and its depth along z [R]. If there is no
+        intersection, the values are NaN and infinity.
     """
     camera = view.camera
     ones = np.ones(len(uv))
@@ -237,13 +250,13 @@ def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) ->
 
 
 def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], stride: int, scale: float) -> Float:
-    """Returns [P, 3] surface points that the cameras see, one for every ``stride``-th pixel outside the masks.
+    """Returns surface points [P, 3] that the cameras see, for every ``stride``-th row and column.
 
-    Samples far from every triangulated point of their surface (``GAP_…``) are skipped, unless they are inside a fitted
-    dome.
+    Pixels inside the masks are ignored. A sample far from every triangulated point of its surface
+    (see ``GAP_…``) is skipped, unless the sample is inside a fitted dome.
 
     Args:
-        views: views of the cameras; pixels inside the mask show other objects.
+        views: views of the cameras. Pixels inside the mask show other objects.
         supports: fitted surfaces.
         stride: spacing of the sampled pixels.
         scale: radius of the rig, in world units.
@@ -281,15 +294,16 @@ def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], 
 def snap_to_points(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
     """Moves surface samples along the surface normal towards the measured points around them.
 
-    Domes consist of panels, and floors are not quite flat. The measured offsets are averaged over the neighbours of
-    each sample, with the fitted surface itself as one more measurement.
+    Domes consist of panels, and floors are not quite flat. Each sample is therefore moved by the
+    mean offset of the measured points around the sample. The fitted surface itself counts as one
+    more measurement with offset 0.
 
     Args:
         points: [P, 3] samples on the surfaces.
         supports: fitted surfaces.
         seen: [M, 3] measured points.
-        reach: distance in world units. Measured points farther from the sample have little weight, and points farther
-            from the surface have none.
+        reach: distance in world units. Measured points farther away from the sample have little
+            weight, and measured points farther away from the surface have none.
     """
     if len(points) == 0 or len(seen) == 0:
         return points

@@ -1,4 +1,4 @@
-"""Surroundings: image content beyond the scene, represented by coloured points far behind it."""
+"""Surroundings of the scene, represented by coloured points far behind the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture, look_at_point
 
 ACROSS = 40
-"""Number of points along the longer side of an image; the fit refines them."""
+"""Number of points along the longer side of an image. The fit refines the points."""
 BEHIND = 2.0
 """Distance of the points behind the scene centre, relative to the largest distance of a camera from the centre."""
 STAGE = 1.5
@@ -50,12 +50,13 @@ class Stage:
 def surroundings(views: Sequence[PosedPicture], distances: Sequence[float]) -> InitialPoints:
     """Returns points far behind the scene, along rays through the pixels of each camera.
 
-    If the cameras are few and far apart, most of what one camera sees, such as walls, is invisible to the others. Its
-    depth is unknown. Points nearby would hide the scene from the other cameras. Points this far away are rarely visible
-    in another camera's image, and look like a backdrop if they are.
+    If the cameras are few and far apart, each camera sees walls and other surfaces that no other
+    camera sees. The depth of these surfaces is unknown. Points at a small depth would hide the
+    scene from the other cameras. Points far behind the scene are rarely visible to the other
+    cameras, and then look like a backdrop.
 
     Args:
-        views: views of the cameras; pixels inside the mask show the scene and get no point.
+        views: views of the cameras. Pixels inside the mask show the scene and get no point.
         distances: distance of each camera from the scene centre, in world units.
 
     Returns:

@@ -1,7 +1,9 @@
-"""Triangulates SIFT features that several calibrated cameras see, using pycolmap with known poses.
+"""Triangulation of SIFT features that several calibrated cameras see, with pycolmap and known
+poses.
 
-Because the poses are known, matches are searched only along epipolar lines. Compared with a search over the whole
-image, far fewer wrong candidates pass the ratio test, and matches across wide baselines are kept.
+Because the poses are known, matches are searched only along epipolar lines. Compared with a search
+over the whole image, far fewer wrong candidates take part in the ratio test, and matches across
+wide baselines are kept.
 """
 
 from __future__ import annotations
@@ -24,16 +26,18 @@ RATIO = 0.8
 MAX_DESCRIPTOR_DISTANCE = 0.7
 """Maximum distance between two matching unit descriptors, as in COLMAP."""
 MAX_FEATURES = 4096
-"""Maximum number of SIFT features per image; matching time grows with the product of two images' feature counts."""
+"""Maximum number of SIFT features per image. The matching time of two images is proportional to the
+product of their numbers of features."""
 EPIPOLAR_ERROR = 2.0
 """Maximum epipolar distance of a match and maximum reprojection error, in pixels. Calibration residuals are typically
 near 0.5."""
 FEW_PAIRS = 10
-"""Minimum number of image pairs to match; these pairs also serve to measure the pace."""
+"""Minimum number of image pairs to match. The pace is measured on these pairs."""
 FAINT_CONTRAST = 0.0017
-"""SIFT contrast threshold, a quarter of COLMAP's: smooth walls are faint, and known poses reject wrong matches."""
+"""SIFT contrast threshold, a quarter of the threshold of COLMAP. Features on smooth walls are
+faint, and known poses reject wrong matches."""
 MIN_ANGLE_DEG = 2.0
-"""Minimum triangulation angle in degrees; rays at smaller angles hardly constrain depth."""
+"""Minimum triangulation angle in degrees. Rays at smaller angles hardly constrain depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +62,18 @@ def extract_features(
     most: int = MAX_FEATURES,
     contrast: float = FAINT_CONTRAST,
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """Extracts SIFT keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128] of every view.
+    """Extracts the SIFT features of every view.
 
     Args:
         views: views whose images are searched.
-        limit: time limit of frame 0; if time is short, the images are downscaled by a factor of two or four.
-        most: maximum number of features per image, largest first.
+        limit: time limit of frame 0, or None for no limit. If time is short, the images are
+            downscaled by a factor of two or four.
+        most: maximum number of features per image. The largest features are kept.
         contrast: minimum difference of Gaussians, for images in 0…1.
+
+    Returns:
+        Keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128] of each
+        view.
     """
     import pycolmap
 
@@ -85,7 +94,10 @@ def extract_features(
 def _all_features(
     views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """Extracts the features of all views with a function for greyscale images; the first view measures the pace."""
+    """Extracts the features of all views with a function for greyscale images.
+
+    The pace is measured on the first view.
+    """
     features_by_view: list[tuple[Float, NDArray[np.float32]]] = []
     size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
     for view in views:
@@ -103,7 +115,10 @@ def _all_features(
 def _features(
     view: PosedPicture, extract: Callable[[NDArray[np.float32]], Any], divisor: int
 ) -> tuple[Float, NDArray[np.float32]]:
-    """Returns the features of a view in full-size pixels; the image is downscaled by ``divisor``, a power of two."""
+    """Returns the keypoints of a view, in pixels of the full size, and the descriptors.
+
+    Before the extraction, the image is downscaled by ``divisor``, a power of two.
+    """
     image = view.image if divisor == 1 else halved(view, -(-view.camera.width // divisor)).image
     grey = image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     keypoints, raw = extract(np.ascontiguousarray(grey / np.float32(255)))
@@ -125,7 +140,9 @@ def guided_matches(
     first: tuple[Camera, Float, NDArray[np.float32]],
     second: tuple[Camera, Float, NDArray[np.float32]],
 ) -> NDArray[np.intp]:
-    """Returns the [M, 2] mutual best matches among features within ``EPIPOLAR_ERROR`` pixels of the epipolar lines.
+    """Returns the mutual best matches [M, 2] between the features of two views.
+
+    Only features within ``EPIPOLAR_ERROR`` pixels of each other's epipolar lines are compared.
 
     Args:
         first: camera, feature positions [A, 2] and unit descriptors [A, 128] of a view.
@@ -190,11 +207,12 @@ class FeatureTracks:
 
 
 def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> FeatureTracks:
-    """Matches SIFT features over all pairs of views; masks are ignored.
+    """Matches SIFT features over all pairs of views. Masks are ignored.
 
     Args:
         views: views of one frame.
-        limit: time limit of frame 0; if time is short, pairs whose viewing directions differ most are skipped.
+        limit: time limit of frame 0, or None for no limit. If time is short, the pairs whose
+            viewing directions differ most are skipped.
     """
     limit = limit or TimeLimit(None)
     features_by_view = extract_features(views, limit)
@@ -211,7 +229,9 @@ def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) 
 
 
 def label_tracks(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Returns the track index of each of ``count`` features; the two features of an edge [E, 2] share a track.
+    """Returns the track index of each of ``count`` features.
+
+    The two features of an edge [E, 2] belong to the same track.
 
     >>> label_tracks(np.array([[0, 3], [3, 1]]), 4).tolist()
     [0, 0, 1, 0]
@@ -233,7 +253,11 @@ def group_by_track(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _affordable_pairs(
     found: Sequence[tuple[Camera, Float, NDArray[np.float32]]], limit: TimeLimit
 ) -> list[tuple[int, int]]:
-    """Returns the pairs of views that can be matched in time: all pairs, or those with the most similar directions."""
+    """Returns the pairs of views that can be matched in time.
+
+    If there is no time for all pairs, the pairs with the most similar viewing directions are
+    returned.
+    """
     pairs = [(a, b) for a in range(len(found)) for b in range(a + 1, len(found))]
     if not limit.bounded or len(pairs) <= FEW_PAIRS:
         return pairs

@@ -1,6 +1,7 @@
-"""The visual hull, the largest shape that agrees with the masks (Laurentini 1994), as an octree of voxels.
+"""Visual hull: the largest shape that agrees with the masks (Laurentini 1994), as voxels.
 
-A camera is ignored for voxels outside its image; a voxel is kept only if at least ``min_views`` cameras see it.
+The voxels are refined like an octree. A camera is ignored for voxels outside its image. A voxel is
+kept only if at least ``min_views`` cameras see the voxel.
 """
 
 from __future__ import annotations
@@ -23,16 +24,18 @@ from scas4d_core.posed_pictures import (
 )
 
 SEEN_SHARE = 0.35
-"""Minimum fraction of the masked cameras that must see a voxel, to avoid ghosts where few cameras see the scene."""
+"""Minimum fraction of the masked cameras that must see a voxel. The limit avoids ghosts where few
+cameras see the scene."""
 VOXEL_PIXELS = 1.5
 """Maximum edge length of the smallest voxels, in pixels at the scene centre."""
 MISSES = 0.05
-"""Fraction of the cameras whose masks may miss a voxel, because automatic masks are ragged. Silhouettes in front of a
-plain background are exact and use 0."""
+"""Maximum fraction of the cameras whose masks may miss a voxel, because automatic masks are ragged.
+For silhouettes in front of a plain background, which are exact, the fraction is 0."""
 COARSE = 32
 """Number of voxels along an edge of the first, coarsest grid."""
 MAX_VOXELS = 4_000_000
-"""Maximum number of voxels per level, to bound memory; refinement stops before it is exceeded."""
+"""Maximum number of voxels per level, which bounds memory. Refinement stops before this number is
+exceeded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +74,11 @@ class VisualHull:
 
     @cached_property
     def _surroundings(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Half-resolution grid: lowest cell, size, strides, and sorted keys of the cells in or next to the hull.
+        """Half-resolution grid of the cells that are in or next to the hull.
 
-        The grid is cached, because stereo uses it for every image and the hull may have millions of voxels.
+        The four values are the lowest cell, the size, the strides and the sorted keys of the cells.
+        The grid is cached, because stereo uses the grid for every image, and the hull may have
+        millions of voxels.
         """
         halved = self.cells // 2
         low = halved.min(0) - 2
@@ -85,7 +90,10 @@ class VisualHull:
         return low, size, strides, keys
 
     def surface(self) -> Bool:
-        """Returns whether at least one of the six neighbours of each voxel is empty, [M]."""
+        """Returns whether each voxel is on the surface, [M].
+
+        At least one of the six neighbours of a surface voxel is empty.
+        """
         if len(self.cells) == 0:
             return np.zeros(0, dtype=bool)
         low = self.cells.min(0) - 1
@@ -101,7 +109,10 @@ class VisualHull:
 
 
 def pixel_size_at(views: Sequence[PosedPicture], point: Float) -> float:
-    """Returns the median pixel size at ``point`` [3] over the cameras that face it, in world units, or 1 if none do."""
+    """Returns the size of a pixel at ``point`` [3], in world units.
+
+    The result is the median over the cameras that face the point, or 1 if no camera does.
+    """
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
     ]
@@ -114,12 +125,13 @@ def carve(
     """Carves the visual hull of the masks.
 
     Args:
-        views: views of the cameras; views without a mask are ignored.
-        voxel_pixels: maximum edge length of the smallest voxels, in pixels at the scene centre; voxels are halved until
-            it is reached.
-        misses: maximum fraction of the cameras seeing a voxel whose masks do not contain it.
-        min_views: minimum number of cameras that see a voxel; at least ``SEEN_SHARE`` of the masked cameras must see it
-            too.
+        views: views of the cameras. Views without a mask are ignored.
+        voxel_pixels: edge length, in pixels at the scene centre, at which voxels are no longer
+            subdivided.
+        misses: maximum fraction of the cameras whose masks do not contain a voxel, among the
+            cameras that see the voxel.
+        min_views: minimum number of cameras that must see a voxel. At least ``SEEN_SHARE`` of the
+            masked cameras must also see the voxel.
     """
     masked = [view for view in views if view.mask is not None]
     middle = look_at_point(views)
@@ -146,14 +158,15 @@ def carve(
 def count_contradictions(
     views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float
 ) -> NDArray[np.intp]:
-    """Returns the [P] number of masks that contradict each point [P, 3].
+    """Returns the number of masks [P] that contradict each point.
 
-    A point within the silhouettes is foreground and is not contradicted. Any other point is background and must not lie
-    in front of the hull at a foreground pixel. Stereo produces such points next to outlines, where a patch covers both
-    foreground and background.
+    A point within the silhouettes is foreground and is not contradicted. Any other point is
+    background. A mask contradicts a background point that is in front of the hull at a foreground
+    pixel. Stereo produces such points next to outlines, where a patch covers both foreground and
+    background.
 
     Args:
-        views: views of the cameras; views without a mask are ignored.
+        views: views of the cameras. Views without a mask are ignored.
         hull: hull of the masks.
         points: [P, 3] points in the world.
         misses: maximum fraction of the masks that may miss a foreground point.
@@ -173,7 +186,7 @@ def count_contradictions(
 
 
 def _distance(mask: Bool) -> Float:
-    """Returns the [H, W] distance in pixels to the nearest silhouette pixel, or infinity if there is no such pixel."""
+    """Returns the distance [H, W] to the nearest silhouette pixel in pixels, or infinity if empty."""
     if not mask.any():
         return np.full(mask.shape, np.inf)
     result: Float = distance_transform_edt(~mask)
@@ -189,17 +202,21 @@ def _inside_silhouettes(
     min_views: int,
     last: bool,
 ) -> Bool:
-    """Returns, per voxel [M], whether at most a fraction ``misses`` of its cameras see it outside the silhouette."""
+    """Returns whether each voxel is kept on a level of the octree, [M].
+
+    A voxel is kept if enough cameras see the voxel, and at most the fraction ``misses`` of these
+    cameras see the voxel outside the silhouette.
+    """
     missed = np.zeros(len(centres), dtype=np.int32)
     seen = np.zeros(len(centres), dtype=np.int32)
     may_see = np.zeros(len(centres), dtype=np.int32)
     for view, distance in zip(views, distances, strict=True):
         camera = view.camera
         column, line, depth, inside = pixels_inside(camera, centres)
-        # Before the last level, a voxel is kept if any part of it may be in the silhouette: the slack is half its
-        # diagonal plus 1.5 pixels. On the last level, its centre decides, with a slack of half a voxel plus half a
-        # pixel diagonal. Masks are sampled at pixel centres; if many masks had to agree exactly, rounding errors would
-        # carve into the hull.
+        # Before the last level, a voxel is kept if any part of the voxel may be in the silhouette. The slack is
+        # half the diagonal of the voxel plus 1.5 pixels. On the last level, the centre of the voxel decides,
+        # with a slack of half a voxel plus half the diagonal of a pixel. Masks are sampled at pixel centres.
+        # If many masks had to agree exactly, rounding errors would carve into the hull.
         half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
         slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
         judged = inside & (depth > half)

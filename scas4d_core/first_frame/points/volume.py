@@ -1,4 +1,4 @@
-"""Samples unconfirmed points in the volume that cameras share, as a last resort for initial points."""
+"""Unconfirmed points in the volume that cameras share, the last resort for initial points."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from scas4d_core.posed_pictures import (
 )
 
 SAMPLES = 60_000
-"""Number of sampled points: about one per four pixels of the stereo images."""
+"""Number of sampled points, about one for every four pixels of the stereo images."""
 KEPT = 0.25
-"""Fraction of the points that are kept: those whose colour differs least between cameras."""
+"""Fraction of the points that are kept. The colours of these points differ least between
+cameras."""
 NEAR, FAR = 0.3, 1.7
 """Range of sampled depths, relative to the distance of the camera from the scene centre."""
 FEW = 10
@@ -28,12 +29,13 @@ FEW = 10
 
 
 def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], seed: int) -> InitialPoints:
-    """Samples points along pixel rays and keeps those whose colour differs least between cameras.
+    """Samples points along pixel rays, and keeps points whose colour is similar in all cameras.
 
-    The points are not known to lie on surfaces; the fit of frame 0 moves, removes and adds Gaussians.
+    The points need not lie on surfaces, because the fit of frame 0 moves, removes and adds
+    Gaussians.
 
     Args:
-        views: views of the cameras; points outside the mask of any view that sees them are removed.
+        views: views of the cameras. A point is removed if any view sees the point outside its mask.
         distances: distance of each camera from the scene centre, in world units.
         seed: random seed of the samples.
 
@@ -72,25 +74,29 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
-    # Points outside any mask have been removed, so the others are in the masks of all cameras that see them.
+    # Points outside any mask were removed above. All other points are therefore foreground.
     masked = any(view.mask is not None for view in views)
     labels = np.ones(len(best), np.float32) if masked else None
     return InitialPoints(points[shared][best], seen.colours[best], labels)
 
 
 def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:
-    """Returns two [P] arrays: whether the image contains a point, and whether that pixel is outside the mask."""
+    """Returns whether each point is in the image, and whether it is also outside the mask, [P]."""
     column, line, _, inside = pixels_inside(view.camera, points)
     return inside, inside & ~view.mask[line, column] if view.mask is not None else np.zeros_like(inside)
 
 
 def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) -> list[float]:
-    """Returns each camera's distance to the scene: to known points or, without any, to where the optical axes meet.
+    """Returns the distance of each camera from the scene, measured along the viewing direction.
+
+    The distance is the median depth of the known points in front of the camera. If there are too
+    few points, the distance is the depth of the point where the optical axes meet.
 
     Args:
         views: views of the cameras.
-        known: [P, 3] triangulated points; may be empty.
-        radius: radius of the rig, which is used as the distance if the viewing directions are parallel.
+        known: [P, 3] triangulated points. The array may be empty.
+        radius: radius of the rig. It is used as the distance if the optical axes do not meet in
+            front of the camera.
     """
     middle = look_at_point(views)
     distances = []

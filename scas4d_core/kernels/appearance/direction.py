@@ -5,13 +5,15 @@ s its gloss, n its normal, v the direction to the camera, μ = n·v, and r = 2μ
 
     T = c|c| (1 − FALL f min(s, 1)) + s (E(r + k (x − x₀)) + sheen f),    f = (1 − μ)⁴,    colour = T / √|T|
 
-E is the environment, an RGB grid over directions (octahedral map, Cigolle et al. 2014) that is sampled bilinearly. It
-stays fixed in the world while objects rotate. The direction to a nearby light depends on the position of the Gaussian.
-The lookup accounts for this with the inverse distance k of the light and the centre x₀ of the scene. The sheen is the
-reflection at grazing angles, where diffuse light decreases.
+E is the environment, an RGB grid over directions (octahedral map, Cigolle et al. 2014) that is
+sampled bilinearly. The environment stays fixed in the world while objects rotate. The direction to
+a nearby light depends on the position x of the Gaussian. The lookup therefore uses the inverse
+distance k of the light and the centre x₀ of the scene. The sheen is the reflection at grazing
+angles, where diffuse light decreases.
 
-Reference implementation: ``engines.torch.gloss``. Gradients with respect to positions and rotations are omitted. The
-direction to a camera hardly changes during an update, and rotations are determined by texture and silhouettes.
+The reference implementation is ``engines.torch.gloss``. Gradients with respect to positions and
+rotations are omitted. The direction to a camera hardly changes during an update, and texture and
+silhouettes determine rotations.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from numpy.typing import NDArray
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, parallel_kernel
 
 SIDE = 16
-"""Cells per side of the grid. Each covers 12 degrees, about the width of a lamp's highlight on a glazed surface."""
+"""Number of cells along a side of the grid. A cell covers 12 degrees, about the width of the
+highlight of a lamp on a glazed surface."""
 CELLS = SIDE * SIDE
 SHEEN, MIDDLE, NEARNESS = CELLS, CELLS + 1, CELLS + 2
 """Indices of the environment rows that follow the cells: sheen (RGB), x₀, and (k, 0, 0)."""
@@ -76,15 +79,16 @@ def shade_backward(
     g_shown: NDArray[np.float32],
     g_gloss: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Converts the gradient of ``shown`` to the gradient of ``colours`` in place, and fills the gradient of ``gloss``.
+    """Backpropagates through ``shade``.
 
     Args:
         means, gloss, turns, colours, environment, centre: see ``shade``.
-        g_shown: [N, 4] gradient of ``shown``, replaced by the gradient of ``colours``.
+        g_shown: [N, 4] gradient of ``shown``. The gradient of ``colours`` replaces the first three
+            columns.
         g_gloss: [M, 3] output, gradient of ``gloss``.
 
     Returns:
-        [ROWS, 3] gradient of the environment; the row of x₀ is 0.
+        [ROWS, 3] gradient of the environment. The row of x₀ is 0.
     """
     sums = np.zeros((-(-len(means) // CHUNK), ROWS, 3), np.float32)
     shade_rows_backward(means, gloss, turns, colours, environment, centre, g_shown, g_gloss, sums)
@@ -144,7 +148,11 @@ def shade_rows(means, gloss, turns, colours, environment, centre, shown):
 
 @parallel_kernel
 def shade_rows_backward(means, gloss, turns, colours, environment, centre, g_shown, g_gloss, sums):
-    """Implements ``shade_backward`` with parallel tasks, which add to ``sums`` [tasks, ROWS, 3], initially zero."""
+    """Implements ``shade_backward`` with parallel tasks.
+
+    Each task adds its gradient of the environment to ``sums`` [tasks, ROWS, 3], which is initially
+    zero.
+    """
     count, glossy = means.shape[0], gloss.shape[0]
     k = environment[NEARNESS, 0]
     for task in prange((count + CHUNK - 1) // CHUNK):
@@ -228,7 +236,7 @@ def shade_rows_backward(means, gloss, turns, colours, environment, centre, g_sho
             hx = (hx - nx * radial) / s + nx * g_s
             hy = (hy - ny * radial) / s + ny * g_s
             hz = (hz - nz * radial) / s + nz * g_s
-            tx, ty, tz = TWO * (hy * z - hz * y), TWO * (hz * x - hx * z), TWO * (hx * y - hy * x)  # rotated back
+            tx, ty, tz = TWO * (hy * z - hz * y), TWO * (hz * x - hx * z), TWO * (hx * y - hy * x)  # inverse rotation
             g_gloss[i, 0] = hx + w * tx + tz * -y + ty * z
             g_gloss[i, 1] = hy + w * ty + tx * -z + tz * x
             g_gloss[i, 2] = hz + w * tz + ty * -x + tx * y
