@@ -17,8 +17,8 @@ from scas4d_core.compilation.manifest import Kernel
 from scas4d_core.kernels.cache import locked
 
 SLOT_WAIT_S = 1.0
-"""Seconds for which a process keeps trying to get a slot. `is_compiling` briefly locks slots to
-check them."""
+"""Seconds for which a process keeps trying to get a slot. The first attempt may fail, because
+`is_compiling` briefly locks slots to check them."""
 
 
 def open_markers() -> CompiledMarkers | None:
@@ -66,8 +66,7 @@ class CompiledMarkers:
     def claim(self, kernel: Kernel) -> Iterator[bool]:
         """Context manager that lets one process at a time compile a kernel.
 
-        Yields True if this process may compile the kernel, and False if another process compiles
-        it.
+        Yields True if this process may compile the kernel, and False if another process does so.
         """
         with locked(self.folder / f"{kernel.key}.lock", wait=False) as mine:
             yield mine

@@ -1,4 +1,4 @@
-"""Interface that every effect implements: texts for users, a contribution to updates, and evidence.
+"""Interface that every effect implements: descriptions for users, a contribution to updates, and evidence.
 
 Effect modules must not import Numba or torch at import time, because the validation of settings imports them.
 """
@@ -65,7 +65,7 @@ class Effect:
         return None
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Returns the arrays of frame 0 that the effect needs in later frames, or None if it needs none.
+        """Returns the arrays from frame 0 that the effect needs in later frames, or None if it does not need any.
 
         Not called if the effect is refused or pinned off.
         """
@@ -99,7 +99,7 @@ class Effect:
         """Returns the result of a frame with Gaussians added, retired or revived.
 
         Called while the effect is on, after each learnt frame and before its commit. No other method may change the
-        number or order of rows. Existing rows keep their order: return ``replace(seen.result, gaussians=...,
+        number or order of rows. Existing rows must keep their order: return ``replace(seen.result, gaussians=...,
         parents=..., carried=...)`` with Gaussians from ``Gaussians.concatenate``, ``retire`` and ``revive``.
         ``parents`` must also contain the parents from previous effects. Afterwards, arrays in ``carried`` with one row
         per Gaussian are extended by copies of the parents' rows, or by zeros for Gaussians without a parent.

@@ -1,7 +1,7 @@
 """On/off switches of a scene's effects, which are pinned by the settings or set by evidence, with hysteresis.
 
-A switch changes between two frames. It is committed with the frame whose evidence changed it. A resumed scene continues
-with the switches of its checkpoint, so a replay makes the same decisions.
+A switch changes only between two frames. The change is committed with the frame whose evidence caused it. A resumed
+scene continues with the switches of its checkpoint, so a replay makes the same decisions.
 """
 
 from __future__ import annotations

@@ -20,22 +20,25 @@ from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.fit.gaussian_fit import FitStep
 
 MIN_ITERATIONS = 500
-"""Minimum number of iterations, even if they exceed the time limit."""
+"""Number of iterations below which a fit is not shortened, even if it exceeds the time limit."""
 FIRST_TIMED = 10
 """Number of initial iterations that are not timed, because they load kernels and fill caches."""
 PLAN_EVERY = 25
-"""Number of iterations between updates of the plan; the pace is measured over this interval."""
+"""Number of iterations between updates of the plan. The pace is measured over this interval."""
 TIME_TOLERANCE = 1.03
-"""Ratio of predicted to remaining time up to which the fit is not shortened, given the accuracy of predictions."""
+"""Maximum ratio of predicted to remaining time at which the fit is not shortened. Predictions are not
+accurate enough for a lower ratio."""
 MIN_PLAN_CHANGE = 0.02
 """Relative change in the number of iterations above which a new plan is recorded."""
 REPORTED_SHORTFALL = 0.05
-"""Fraction of missing iterations above which the report mentions them; smaller fractions have less effect than the
-random seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10 and 20% fewer iterations, it reaches
-35.20, 35.29 and 35.24 dB, and with half the iterations, 35.03 dB. *cloth* at half size (one seed) reaches 28.91 dB;
-with 5 and 20% fewer iterations, it reaches 28.91 and 28.88 dB."""
+"""Fraction of omitted iterations from which the report mentions the omission. Smaller fractions have
+less effect than the random seed. The sample at half size (two seeds) reaches 35.33 dB. With 5, 10
+and 20% fewer iterations, the sample reaches 35.20, 35.29 and 35.24 dB, and with half the iterations,
+35.03 dB. *cloth* at half size (one seed) reaches 28.91 dB. With 5 and 20% fewer iterations, *cloth*
+reaches 28.91 and 28.88 dB."""
 MIN_COUNT_RATIO = 1.3
-"""Minimum ratio of the largest to the smallest Gaussian count for separating per-Gaussian cost from pixel cost."""
+"""Minimum ratio of the largest to the smallest number of Gaussians for separating the cost per
+Gaussian from the cost of the pixels."""
 
 
 @dataclass(frozen=True)

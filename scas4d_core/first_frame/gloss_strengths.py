@@ -27,21 +27,25 @@ ENOUGH = 0.05
 WHITE = 0.97
 """Channel value, in 0…1, from which a colour is treated as saturated."""
 FLATTEST = 0.2
-"""Minimum cosine between normal and camera direction; below it, footprints extend beyond the object's outline."""
+"""Minimum cosine between the normal of a Gaussian and the direction to the camera. Gaussians at smaller
+cosines extend beyond the outline of the object in the image."""
 NEAR = 64
-"""Number of neighbours over which a slope is estimated; a single Gaussian rarely reflects two highlights."""
+"""Number of neighbours over which a slope is estimated. A single Gaussian rarely reflects two
+highlights."""
 CLEAR = 0.3
-"""Fraction of the light variation that the line must explain for full confidence in its slope. If it explains less,
-confidence is proportional to the explained fraction."""
+"""Fraction of the light variation that the regression line must explain for full confidence in its
+slope. If the line explains less, the confidence is proportional to the explained fraction."""
 ROUNDS = 3
-"""Number of rounds of neighbour averaging, which infers uncertain strengths from reliable ones nearby."""
+"""Number of rounds of averaging over neighbours, which infers uncertain strengths from reliable
+strengths nearby."""
 GLOSSY = 0.12
-"""Minimum fraction of the light variation that must be explained, on average, around a point of a glossy surface. On
-frame 0 of `gloss`, the median is 0.005 on the matte stand, and 0.25 and 0.17 on vase and ring. Where there is less
-evidence, strengths decrease to 0. Without this, the stand kept the initial strength of 0.5 in places that reflect no
-lamp, and false highlights cost 0.3 dB over all images."""
+"""Minimum fraction of the light variation that regression lines must explain, on average, around a
+point of a glossy surface. On frame 0 of `gloss`, the median fraction is 0.005 on the matte stand, and
+0.25 and 0.17 on vase and ring. Below this minimum, strengths decrease to 0. Without this decrease, the
+stand kept the initial strength of 0.5 in places that reflect no lamp, and false highlights cost 0.3 dB
+over all images."""
 FAINTEST, STRONGEST = 0.004, 1.0
-"""Bounds of the strength; a strength of 0 would leave the normal undefined."""
+"""Minimum and maximum strength. A strength of 0 would leave the normal undefined."""
 TINY = 1e-12
 
 

@@ -31,27 +31,34 @@ from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit
 Array = NDArray[np.float32]
 
 TRIAL = 0.15
-"""Fraction of the iterations after which the trial runs; a surface exists by then, but few false Gaussians."""
+"""Fraction of the iterations after which the trial runs. By then, the fit has found the surface, but
+has added few Gaussians off the surface."""
 MIN_ITERATIONS = 100
-"""Minimum number of iterations of a fit with a trial; in a shorter fit, other errors dominate the residual."""
+"""Minimum number of iterations of a fit with a trial. In a shorter fit, other errors dominate the
+residual."""
 MIN_VIEWS = 12
-"""Minimum number of views for the trial; with fewer, only one camera sees each highlight and any model explains it."""
+"""Minimum number of views for the trial. With fewer views, only one camera sees each highlight, and
+any colour model explains the highlight."""
 MAX_STRIDE = 1.5
-"""Schedule stride above which there is no time for a trial, which takes as long as 350 iterations. Moreover, the
-surface of a shortened fit explains less of the images, so view dependence seems to explain more: on basketball, 7%
-after 600 iterations, but nothing after 3000."""
+"""Schedule stride above which there is no time for a trial, which takes as long as 350 iterations.
+Moreover, the surface of a shortened fit explains less of the images, so view-dependent colours seem
+to explain more. On basketball, they explain 7% of the residual after 600 iterations, but nothing
+after 3000."""
 ROUNDS = 8
 """Number of passes over all views in the trial."""
 RATE = 2.5e-3
 """Adam learning rate of colours in the trial."""
 LEARN_UNTIL = 0.5
-"""Fraction of the iterations until which the environment is learnt on the first surface; then the fit restarts."""
+"""Fraction of the iterations until which the environment is learnt on the first surface. The fit then
+restarts."""
 NORMALS_EVERY = 0.1
 """Interval between estimates of the normals while the environment is learnt, as a fraction of the iterations."""
 LEARN_NORMALS_FROM = 0.6
-"""Fraction of the iterations after which normals are learnt; until then, the normals of the first surface are used."""
+"""Fraction of the iterations after which normals are learnt. Until then, the normals are repeatedly
+reset to those of the first surface."""
 SMOOTH_EVERY = 10
-"""Interval, in iterations, at which the gloss is averaged over neighbours."""
+"""Interval, in iterations, at which changes of the gloss are averaged over neighbours while normals
+are learnt."""
 
 
 def fit_with_gloss_trial(

@@ -35,14 +35,16 @@ OnProgress = Callable[[str, int, int], None]
 """Callback that receives the name of a stage, and its completed and total numbers of steps."""
 
 MAX_POINTS = 60_000
-"""Maximum number of points; if there are more, the spacing is increased."""
+"""Maximum number of points. If more points are found, the spacing between points is increased."""
 MIN_VIEWS = 3
-"""Number of cameras that must agree on a point; two cameras can agree by chance anywhere along an epipolar line."""
+"""Number of cameras that must agree on a point. Two cameras can agree by chance anywhere along an
+epipolar line."""
 CELLS = 32
 """Number of cells along the longer side of an image, for measuring coverage."""
 ENOUGH_COVERAGE = COVERS_LITTLE
-"""Coverage (see ``image_coverage``) at which a cloud is sufficient and no further methods are tried. Captures with
-eighteen cameras or more reach 0.99 to 1; sparse rigs of four to seven reach 0 to 0.4 without further methods."""
+"""Coverage (see ``image_coverage``) at which a cloud is sufficient and no further methods are tried.
+Captures with eighteen cameras or more reach 0.99 to 1. Sparse rigs of four to seven cameras reach 0
+to 0.4 with the first method alone."""
 LITTLE_COVERAGE = 0.05
 """Coverage up to which unconfirmed points are added, because they are better than none."""
 

@@ -19,14 +19,16 @@ Array = NDArray[np.float32]
 BLUR = 1.5
 """Standard deviation, in pixels, of the blur applied to depth before differentiation."""
 STEEPEST = 0.2
-"""Minimum cosine between normal and viewing ray for a pixel's normal to be used."""
+"""Minimum cosine between the normal of a pixel and its viewing ray. Steeper normals are ignored."""
 REACH, NEAR = 0.03, 64
-"""Radius (as a fraction of the extent) and number of neighbours over which normals are averaged."""
+"""Standard deviation of the weights (as a fraction of the extent) and number of the neighbours over
+which normals are averaged."""
 SKIN = 1 / 3
-"""Exponent applied to opacities. The fit represents a surface as a haze in front of opaque Gaussians; the haze is at
-the depth of the surface. On `gloss`, the rendered depth was 15 mm behind the surface. Median normal errors on vase and
-ring were 8 and 6 degrees with the rendered depth, and 4 and 4 degrees with this exponent. With twice the neighbours at
-1.5 times the radius, they were 3 and 4 degrees."""
+"""Exponent applied to opacities before depth is rendered. The fit represents a surface as a haze in
+front of opaque Gaussians, and the haze is at the depth of the surface. On `gloss`, the depth rendered
+without this exponent was 15 mm behind the surface. Median normal errors on vase and ring were 8 and 6
+degrees without the exponent, and 4 and 4 degrees with it. With twice the neighbours at 1.5 times the
+radius, the errors were 3 and 4 degrees."""
 OPAQUE = 0.99
 SOLID = 0.5
 """Minimum alpha of a pixel that shows a surface."""

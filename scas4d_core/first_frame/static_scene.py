@@ -37,34 +37,37 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 INITIAL_SHARE = 0.6
-"""Maximum fraction of the Gaussian budget used by the initial points; a larger cloud is subsampled at random."""
+"""Maximum fraction of the Gaussian budget that the initial points use. A larger cloud is subsampled at
+random."""
 DENSIFY_FROM = 200
-"""First iteration with densification; earlier gradients are too noisy."""
+"""First iteration with densification. Earlier gradients are too noisy."""
 DENSIFY_EVERY = 100
 """Number of iterations between densification steps, as in 3DGS."""
 DENSIFY_UNTIL = 0.6
 """Fraction of the iterations after which no Gaussians are added, so that the existing ones can converge."""
 DENSIFY_GRADIENT = 1e-6
-"""Minimum mean screen-space gradient (per half image, as in 3DGS) for densifying a Gaussian. The budget limits the
-number of densified Gaussians; those with the largest gradients come first."""
+"""Minimum mean screen-space gradient (per half image, as in 3DGS) for densifying a Gaussian. The budget
+limits the number of densified Gaussians. Gaussians with the largest gradients are densified first."""
 PRUNE_OPACITY = 0.01
 """Opacity below which densification removes a Gaussian."""
 MIN_VIEWS = 2
-"""Number of training cameras that must see a Gaussian; otherwise it is removed."""
+"""Number of training cameras that must see a Gaussian. A Gaussian that fewer cameras see is removed."""
 SEEN_PIXELS = 0.05
 """Blending weight, in pixels, above which a camera is considered to see a Gaussian."""
 RATE_POSITION, RATE_POSITION_END = 1.6e-4, 1.6e-6
-"""Adam learning rates of means at the start and end, per metre of scene radius, with exponential decay (3DGS)."""
+"""Adam learning rates of means at the start and at the end of the fit, per metre of rig radius. The
+rate decays exponentially, as in 3DGS."""
 RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION, RATE_EXPOSURE = 2.5e-3, 5e-2, 5e-3, 2e-3, 1e-3
-"""Adam learning rates of colours, opacity logits, log scales and quaternions (as in 3DGS, but twice the rate for
-rotations), and of the cameras' gain and offset."""
+"""Adam learning rates of colours, opacity logits, log scales, quaternions, and the cameras' gain and
+offset. The values are those of 3DGS, but twice as large for quaternions. 3DGS has no gain and
+offset."""
 WEIGHT_MASK = 3.0
-"""Weight of the mask loss if there are masks; in frame 0 it only trains the labels."""
+"""Weight of the mask loss if there are masks. In frame 0, the mask loss only trains the labels."""
 SPLIT_SHRINK = 1.6
 """Factor by which the scales of a Gaussian are divided when it is split in two, as in 3DGS."""
 STOP_ROUNDS = 5
-"""Number of passes over all views whose mean loss the stopping rule compares with that of the same number of preceding
-passes; fewer are too noisy."""
+"""Number of passes over all views that the stopping rule averages. The rule compares the mean loss of
+these passes with the mean loss of the same number of passes before. Fewer passes are too noisy."""
 
 
 class StaticTrainer:
@@ -236,7 +239,7 @@ class StaticTrainer:
             self.fit.replace_rows(np.flatnonzero(keep), np.zeros((0, COLUMNS), np.float32), none)
 
     def _half(self, half: Array, factors: Array) -> Array:
-        """Returns copies of Gaussians with smaller scales, and with means sampled from the originals.
+        """Returns copies of Gaussians with smaller scales, and means sampled from the originals.
 
         Args:
             half: [K, 15] parameter rows of the Gaussians.

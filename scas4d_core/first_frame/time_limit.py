@@ -11,12 +11,12 @@ FEATURES = 0.15
 MATCHES = 0.2
 """Fraction of the time limit by which feature matching should be finished."""
 STEREO = 0.35
-"""Fraction of the time limit by which stereo should end, each time it is tried. Without a limit, computing the initial
-points takes a third of frame 0 on basketball (27 cameras at 640x360). On rigs of four to seven cameras, it takes less
-than a fifth."""
+"""Fraction of the time limit by which every run of stereo should end. Without a limit, computing the
+initial points takes a third of the time of frame 0 on basketball (27 cameras at 640x360). On rigs of
+four to seven cameras, the points take less than a fifth."""
 AFTER_S = 2.5
-"""Seconds reserved for the steps after the fit: clustering, the neighbour graph and the commit took 1 to 2 seconds for
-50,000 to 90,000 Gaussians."""
+"""Seconds reserved for the steps after the fit. Clustering, the neighbour graph and the commit took 1 to
+2 seconds for 50,000 to 90,000 Gaussians."""
 AFTER_SHARE = 0.1
 """Maximum fraction of the time limit reserved for the steps after the fit."""
 

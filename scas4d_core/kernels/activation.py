@@ -1,7 +1,9 @@
 """Activation functions that convert fit parameters to rasterizer inputs, and their backward pass.
 
-F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A zero quaternion is treated as the identity; see
-``guards.QUATERNION_FLOOR``. The reference implementation in PyTorch is part of the tests.
+    F = R(q/|q|) diag(exp s),    opacity = sigmoid(o),    label = sigmoid(m)
+
+A zero quaternion is treated as the identity; see ``guards.QUATERNION_FLOOR``. The reference
+implementation in PyTorch is part of the tests.
 """
 
 from __future__ import annotations
@@ -54,7 +56,10 @@ def activate(
 
 @inline
 def direction(p):
-    """Returns the unit quaternion of a parameter row and its inverse norm, or the identity and 0 if it is zero."""
+    """Returns the unit quaternion of a parameter row, and the inverse norm of the parameters.
+
+    For a zero quaternion, the result is the identity and 0.
+    """
     square = p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]
     directed = square > SHORTEST
     norm = ONE / np.float32(np.sqrt(square)) if directed else ZERO
@@ -93,7 +98,7 @@ def activate_rows(parameters, means, factors, opacities, features, guard_counts)
 
 @parallel_kernel
 def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):
-    """Computes dL/dparameters [N, 15] from the gradients of the rasterizer inputs."""
+    """Computes dL/dparameters, ``gradients`` [N, 15], from the gradients of the outputs."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):

@@ -1,8 +1,8 @@
 """Adam step (Kingma and Ba 2015) for a parameter table, with a learning rate per column.
 
-Reference implementation: ``torch.optim.Adam``. Gradients that are non-finite, or so large or small that the moments
-would overflow or become subnormal, are clamped and counted; see ``guards.GRADIENT_CEILING`` and
-``guards.MOMENT_FLOOR``.
+The reference implementation is ``torch.optim.Adam``. Gradients that are non-finite, or so large or
+small that the moments would overflow or become subnormal, are clamped and counted; see
+``guards.GRADIENT_CEILING`` and ``guards.MOMENT_FLOOR``.
 """
 
 from __future__ import annotations
@@ -63,8 +63,12 @@ def adam(
 
 @kernel
 def guard_gradients(gradients, first, last, guard_counts):
-    """Clamps gradients in the flat index range [first, last), and counts clamped values in ``guard_counts`` [2]."""
-    # A single sum shows whether any value must be clamped, because NaN and infinity propagate.
+    """Clamps gradients in the flat index range [first, last).
+
+    The numbers of clamped values are added to ``guard_counts`` [2].
+    """
+    # The sum and the smallest nonzero size show whether any value must be clamped. NaN and infinity
+    # propagate to the sum.
     total, least = lanes.fill(ZERO), lanes.fill(ONE)
     for place in range(first, last, lanes.COUNT):
         size = lanes.magnitude(lanes.load_first(gradients, place, last - place))

@@ -1,7 +1,8 @@
-"""Front-to-back blending of tiles, and its backward pass. Reference implementation: ``engines.torch.rasterizer``.
+"""Front-to-back blending of tiles, and its backward pass.
 
-A tile consists of 8×8 blocks of 4×4 pixels, and a block is processed as one ``Lanes``. For each Gaussian, the blocks
-that intersect its support (``tiles.cover``) are visited in bit order.
+A tile consists of 8×8 blocks of 4×4 pixels, and a block is processed as one ``Lanes``. For each
+Gaussian, the blocks that intersect its support (``tiles.cover``) are visited in bit order. The
+reference implementation is ``engines.torch.rasterizer``.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def without_lowest_block(cover):
 
 @inline
 def fetch_ahead(entry, end, items, splats, features):
-    """Prefetches the data of the entry ``AHEAD`` positions later."""
+    """Prefetches the data of the entry that is ``AHEAD`` positions later in the list of a tile."""
     i = items[min(entry + AHEAD, end - 1)]
     lanes.prefetch_row(splats, i)
     lanes.prefetch_row(features, i)
@@ -54,9 +55,11 @@ def fetch_ahead(entry, end, items, splats, features):
 
 @kernel
 def copy_blocks(plane, y_first, x_first, state, start, step, inward):
-    """Copies blocks from a tile of a plane to the block state if ``inward``, otherwise from the state to the plane.
+    """Copies the blocks of a tile between a plane and the block state.
 
-    The first block is at index ``start`` of the state, and consecutive blocks are ``step`` apart.
+    If ``inward`` is true, blocks are copied from the plane to the state, and otherwise from the
+    state to the plane. The first block starts at index ``start`` of the state, and consecutive
+    blocks are ``step`` apart.
     """
     for column in range(TILE // BLOCK):
         for row in range(TILE // BLOCK):
@@ -128,8 +131,9 @@ def blend_task(
                 after = before - weight
                 drawn = (power >= faintest) & (after >= stop)
                 if not lanes.any_of(drawn):
-                    # Nothing is visible, but this Gaussian may finish some pixels. If not, the backward pass can skip
-                    # the block. Blocks in which all pixels are finished are not visited again.
+                    # The Gaussian is not visible in this block, but may finish some pixels. If the
+                    # Gaussian finishes no pixel, the backward pass can skip the block. A block is
+                    # not visited again after all of its pixels are finished.
                     bit = np.uint64(1) << np.uint64(block)
                     ended = (power >= faintest) & (before > ZERO)
                     if lanes.any_of(ended):
@@ -200,8 +204,10 @@ def blend(
         items: [entries] Gaussian of each entry.
         covers: [entries] uint64 block mask of each entry; see ``tiles.cover``. Blocks in which the Gaussian has no
             effect are cleared from the mask.
-        wanted: [tiles] uint64 mask of the blocks to render; all others are filled with the background.
-        tile_order: int64 tiles to render, distributed to tasks in this order. All other tiles stay unchanged.
+        wanted: [tiles] uint64 mask of the blocks to render. All other blocks are filled with the
+            background.
+        tile_order: int64 tiles to render, which are distributed to tasks in this order. All other
+            tiles remain unchanged.
         tasks: number of parallel tasks.
         size: image size (width, height) in pixels.
         background: [C] background features.
@@ -256,7 +262,8 @@ def blend_backward_task(
     channels = GROUP * len(groups)
     columns = records.shape[1]
     tiles_x = (size[0] + TILE - 1) // TILE
-    # State of a block: transmittance (negative for finished pixels), contribution of later entries, image gradients.
+    # State of a block: transmittance (negative for finished pixels), contribution of later entries,
+    # and image gradients.
     step = lanes.COUNT * (2 + channels)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -280,7 +287,7 @@ def blend_backward_task(
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
         end = starts[tile + 1]
-        while end > starts[tile] and learnt[items[end - 1]] == 0:  # later entries are already in the total
+        while end > starts[tile] and learnt[items[end - 1]] == 0:  # already part of the total
             end -= 1
         for entry in range(starts[tile], end):
             cover = covers[entry]
@@ -404,15 +411,17 @@ def blend_backward(
 ):
     """Computes the gradients of every entry, i.e. of every Gaussian–tile pair.
 
-    Like the forward pass, it runs front to back. Later entries only matter through the product of their blended
-    features and the image gradient. For each pixel, this is a single number: the total minus the contribution of all
-    entries so far.
+    Like the forward pass, the backward pass runs front to back. Later entries affect the gradients
+    only through the product of their blended features and the image gradient. For each pixel, this
+    product is a single number: the total of all entries minus the contribution of all entries so
+    far.
 
     Args:
         splats, features, groups, starts, items, tile_order, tasks, size, limits: see ``blend``.
         slots: [entries] pair of each entry, i.e. its row in ``records``.
         covers: [entries] block masks, as updated by ``blend``.
-        learnt: [N] uint8 mask; if 0, the Gaussian needs no gradient and its records are not written.
+        learnt: [N] uint8 mask. If the value is 0, the Gaussian needs no gradient, and its records
+            are not written.
         image, transmittance: outputs of ``blend``.
         g_image: [C, rows, stride] dL/dimage.
         g_alpha: [rows, stride] dL/dalpha, where alpha = 1 - transmittance.

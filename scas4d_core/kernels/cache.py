@@ -55,7 +55,7 @@ def base() -> Path:
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         path = Path(given)
-        return path.parent if path.name.startswith(PREFIX) else path  # `use` in a parent process set it
+        return path.parent if path.name.startswith(PREFIX) else path  # set by `use` in a parent process
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scas4d" / "numba"
 
 

@@ -1,16 +1,17 @@
 """Cascade of cluster maps and its backward pass (paper, single-layer deformation function and nesting).
 
-Each step processes sixteen Gaussians of one cluster, so per-cluster values are scalars and per-Gaussian values are
-vectors (``Lanes``). ``deform`` combines the steps. Each layer transforms a point x, the Gaussian's factor F (nine
-entries, row-major; the map's Jacobian is applied to it directly) and its rotation Q. Reference implementation:
-``deformation.cascade``.
+Each step processes sixteen Gaussians of one cluster, so values per cluster are scalars and values
+per Gaussian are vectors (``Lanes``). ``deform`` combines the steps. Each layer transforms a point
+x, the factor F of the Gaussian (nine entries, row-major) and its rotation Q. The Jacobian J of the
+map is applied directly to F. The reference implementation is ``engines.torch.deformation.cascade``.
 
 Cluster map, with y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
 centred x' = p + t + f R y, published x' = f (R y + p + t). Both have J = R (f I + f' e cᵀ),
 with e = y (centred) or e = y + Rᵀ(p + t) (published). With separate covariance, factors remain unchanged.
 
-Points are updated by adding a displacement: x' = w + (f − 1) u with w = x + t + (R − I) y, and u = R y (centred) or
-u = w (published). All terms except x are 0 if the parameters are 0, so the identity is bit-exact on every processor.
+Points are updated by adding a displacement: x' = w + (f − 1) u with w = x + t + (R − I) y, and
+u = R y (centred) or u = w (published). All terms except x are 0 if the parameters are 0, so the
+identity is bit-exact on every processor.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ def rotation_entries(w, x, y, z):
 
 @inline
 def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
-    """Converts dL/dmatrix (nine entries, row-major) to dL/dquaternion; the backward pass of ``rotation_entries``."""
+    """Backpropagates through ``rotation_entries``.
+
+    Converts dL/dmatrix (nine entries, row-major) to dL/dquaternion.
+    """
     gw = TWO * (-z * g1 + y * g2 + z * g3 - x * g5 - y * g6 + x * g7)
     gx = TWO * (y * g1 + z * g2 + y * g3 - TWO * x * g4 - w * g5 + z * g6 + w * g7 - TWO * x * g8)
     gy = TWO * (-TWO * y * g0 + x * g1 + w * g2 + x * g3 + z * g5 - w * g6 + z * g7 - TWO * y * g8)
@@ -102,7 +106,11 @@ def cluster_table(parameters, sums, first, last, count, table):
 
 @inline
 def scaling_terms(table, about_origin, x, y, z):
-    """Returns f, y, u and −2z for points, where u = R y or u = R y + p + t is the vector that f scales."""
+    """Returns f, y, u and −2z for points.
+
+    The vector that f scales is u = R y for the centred map, and u = R y + p + t for the published
+    map.
+    """
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
         table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7], table[8]
     )  # fmt: skip
@@ -117,7 +125,7 @@ def scaling_terms(table, about_origin, x, y, z):
 
 @inline
 def move_through_layer(table, about_origin, x, y, z):
-    """Returns points after a layer."""
+    """Returns the coordinates of points after a layer."""
     f, yx, yy, yz, ux, uy, uz, _ = scaling_terms(table, about_origin, x, y, z)
     more = f - ONE
     return (
@@ -162,12 +170,12 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
     Args:
         table: [26] table of the block's cluster.
         about_origin: 0 for the centred cluster map, 1 for the published one.
-        separate: if None, J is applied to the factors; otherwise, factors stay unchanged.
+        separate: if None, J is applied to the factors. Otherwise, factors remain unchanged.
         points: points before the layer; x, y and z of the block start at flat index ``place``.
         v: [13, 16] factors (rows 0–8) and rotations (rows 9–12), updated in place.
         present: mask, starting at flat index ``lane``: 0 for Gaussians that are not counted, otherwise 1.
-        guard_counts: [3 or more] int64 counts, to which the number of Gaussians that triggered each guard in
-            ``COUNTED_GUARDS`` is added; None disables counting.
+        guard_counts: [3 or more] int64 counts, to which the number of Gaussians that triggered each
+            guard in ``COUNTED_GUARDS`` is added. None disables counting.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
@@ -197,7 +205,8 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
     lanes.store(v, 12 * lanes.COUNT, oz)
     if guard_counts is not None:  # resolved at compile time
         clamped = lanes.magnitude(exponent) > LARGEST
-        # det J = f³ (1 + (2 − f) e·c), and the cosine is the second factor plus 1. Half turns are folds too.
+        # det J = f³ (1 + (2 − f) e·c), and the cosine is the second factor plus 1. The map folds
+        # space if the determinant is not positive. Half turns are folds too.
         folded = a[11] <= ONE
         if lanes.any_of(clamped):
             guard_counts[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
@@ -214,9 +223,10 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
     Args:
         table, about_origin, separate, points, place: see ``apply_cluster_map``.
         v: factors and rotations before the layer, starting at flat index ``entering``.
-        g: [16, 16] gradients of points (rows 0–2), factors (rows 3–11) and rotations (rows 12–15). Output gradients are
-            replaced by input gradients.
-        records: output, starting at flat index ``record``: the block's contribution to the gradient of its cluster.
+        g: [16, 16] gradients of points (rows 0–2), factors (rows 3–11) and rotations (rows 12–15).
+            Gradients of the output of the layer are replaced by gradients of its input.
+        records: output, starting at flat index ``record``: the contribution of the block to the
+            gradient of its cluster.
     """
     n = lanes.COUNT
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
@@ -242,7 +252,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
             g1 = lanes.load(g, n * (6 + column))
             g2 = lanes.load(g, n * (9 + column))
             along = j0 * cx + j1 * cy + j2 * cz
-            # Gradients of f and of the factor's columns, rotated by the inverse of R.
+            # Gradients of f and of the columns of the factor, rotated by the inverse of R.
             h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
             g_f += h0 * j0 + h1 * j1 + h2 * j2
             outer = ux * g0 + uy * g1 + uz * g2

@@ -1,11 +1,13 @@
 """Deformation D_t of all moving Gaussians and its backward pass, combining ``cascade`` and ``deltas``.
 
-Gaussians are processed in blocks of sixteen that belong to one cluster of the finest layer, and hence to one cluster
-in every layer. If the size of a cluster is not a multiple of sixteen, its last block repeats its last Gaussian.
+Gaussians are processed in blocks of sixteen. All Gaussians of a block belong to one cluster of the
+finest layer, and hence to one cluster in every layer. If the size of a cluster is not a multiple of
+sixteen, the last block of the cluster repeats its last Gaussian.
 
-Only points are stored between layers, because pivots are means of points. The backward pass recomputes factors and
-rotations, which is cheaper than reading them from memory. Frozen layers are applied once (``freeze_layer``), and
-later passes skip them. Reference implementation: ``engines.torch.deformation``.
+Only points are stored between layers, because pivots are means of points. The backward pass
+recomputes factors and rotations, because recomputation is cheaper than memory access. A frozen
+layer is applied once (``freeze_layer``), and later passes skip the layer. The reference
+implementation is ``engines.torch.deformation``.
 """
 
 from __future__ import annotations
@@ -33,7 +35,10 @@ CARRIED = 13 * lanes.COUNT
 
 @kernel
 def prefetch(block, rows, one, two):
-    """Prefetches the Gaussians of a block from two arrays, because their rows are scattered in memory."""
+    """Prefetches the rows of the Gaussians of a block from two arrays.
+
+    Prefetching pays off because the rows are scattered in memory.
+    """
     block = min(block, rows.shape[0] - 1)
     for lane in range(lanes.COUNT):
         lanes.prefetch_row(one, rows[block, lane])
@@ -42,7 +47,10 @@ def prefetch(block, rows, one, two):
 
 @kernel
 def move_points(block, table, about_origin, points, layer, out, place):
-    """Applies a layer to the points of a block in ``points[layer]``, and stores them in ``out`` at index ``place``."""
+    """Applies a layer to the points of a block in ``points[layer]``.
+
+    The result is stored in ``out``, starting at flat index ``place``.
+    """
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
     x, y, z = move_through_layer(
         table, about_origin, lanes.load(points, first), lanes.load(points, first + lanes.COUNT),
@@ -73,14 +81,15 @@ def block_sums(points, present, sums):
 def freeze_layer(
     layer, parameters, offsets, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
 ):  # fmt: skip
-    """Freezes a layer by applying it to its inputs, so that ``entering`` becomes the input of the next layer.
+    """Freezes a layer by applying the layer to its input.
 
-    It also fills points and sums of the next layer, and the tables of this layer's clusters. See ``deform`` for the
-    other arguments.
+    The function also fills the points and sums of the next layer, and the tables of the clusters of
+    this layer. For the other arguments, see ``deform``.
 
     Args:
-        layer: layer to freeze; must not be the last layer.
-        entering: [B, 13 · 16] factors and rotations, updated in place.
+        layer: layer to freeze, which must not be the last layer.
+        entering: [B, 13 · 16] factors and rotations before this layer, replaced by factors and
+            rotations before the next layer.
     """
     blocks = clusters.shape[0]
     for j in prange(offsets[layer], offsets[layer + 1]):
@@ -111,26 +120,28 @@ def deform(
     """Deforms M of N Gaussians, grouped into B blocks, with L layers that have K clusters in total.
 
     Args:
-        first: first layer that is not frozen. Points, sums and tables of earlier layers are reused.
+        first: first layer that is not frozen. Points, sums and tables of frozen layers are reused.
         parameters: [K, 10] parameters of all clusters, ordered by layer from coarse to fine.
         offsets: [L + 1] int64 first cluster of each layer.
-        ranges: [K, 3] int64 first block, last block + 1, and number of Gaussians of each cluster.
+        ranges: [K, 3] int64 first block, last block + 1, and number of Gaussians of each cluster
+            that are not held back.
         clusters: [B, L] int64 cluster of each block in each layer.
         entries: [B, 16] int64 indices of the Gaussians among the M moving ones.
         rows: [B, 16] int64 indices of the Gaussians among all N.
-        present: [B, 16] float32 mask: 0 for repeated Gaussians, otherwise 1.
+        present: [B, 16] float32 mask: 0 for repeated Gaussians and for Gaussians that are held back
+            because of non-finite values, otherwise 1.
         entering: [B, 13 · 16] factors 0–8 and rotations 9–12 before layer ``first``. Without frozen layers, these are
             the factors of frame t−1 and the identity.
         deltas: [M, 9] per-Gaussian deltas Δp, Δr, Δs.
         about_origin: 0 for the centred cluster map, 1 for the published one.
-        separate: if None, J is applied to the factors; otherwise, it is not.
-        points: [max(L, 1), B, 3, 16] points before each layer. They are read for layer ``first`` and filled for later
-            layers.
+        separate: if None, J is applied to the factors. Otherwise, factors remain unchanged.
+        points: [max(L, 1), B, 3, 16] points before each layer. The points of layer ``first`` are
+            read, and the points of later layers are filled.
         sums: [max(L, 1), B, 3] sums of the points in each block, read and filled like ``points``.
         tables: [K, 26] output, tables of the clusters.
         means: [N, 3] output, written at ``rows``.
         factors: [N, 3, 3] output, written at ``rows``.
-        state: [M, 16] output; means and rotations are written. See ``deltas`` for the columns.
+        state: [M, 16] output. Only means and rotations are written. See ``deltas`` for the columns.
         guard_counts: [tasks of ``BLOCKS`` blocks, 3] int64 output, number of times each guard in
             ``cascade.COUNTED_GUARDS`` was triggered.
     """
@@ -191,8 +202,8 @@ def deform_backward(
 
     Args:
         first … tables: see ``deform``, which must have been called first. Frozen layers receive no gradient.
-        scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If 0, the loss has no
-            gradient.
+        scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If the
+            weight is 0, the loss has no gradient.
         bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
         g_means: [N, 3] gradients of the means.
         g_factors: [N, 3, 3] gradients of the factors.

@@ -47,8 +47,8 @@ def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, mean
         entries: int64 indices of the Gaussians among the M moving ones, starting at flat index ``place``.
         rows: int64 indices of the Gaussians among all N, starting at flat index ``place``.
         place: flat index of the first Gaussian in ``entries``, ``rows`` and ``present``.
-        present: mask, starting at flat index ``place``: 0 for repeated Gaussians, otherwise 1. The
-            guards do not count repeated Gaussians.
+        present: mask, starting at flat index ``place``; see ``deform.deform``. The guards count
+            only Gaussians whose value is 1.
         v: [13, 16] factors (rows 0–8) and rotations (rows 9–12) from the cascade.
         points: [3, 16] points from the cascade.
         means: [N, 3] output, written at ``rows``.
@@ -95,7 +95,7 @@ def apply_gaussian_deltas_backward(
 
     Args:
         deltas, entries, rows, place: see ``apply_gaussian_deltas``.
-        present: mask, starting at flat index ``place``: 0 for repeated Gaussians, otherwise 1.
+        present: mask, starting at flat index ``place``; see ``deform.deform``.
         v: factors and rotations from the cascade, starting at flat index ``leaving``.
         leaving: flat index of the first value in ``v``.
         scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If the

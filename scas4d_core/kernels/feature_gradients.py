@@ -1,8 +1,9 @@
 """Backward pass for features only, used if positions and shapes need no gradients.
 
-The gradient of a feature is the image gradient, summed over pixels with the Gaussian's blending weights. As in
-``blend``, the weights are recomputed front to back; later entries in a tile do not affect them. Results are
-bit-identical to ``blend_backward``. Reference implementation: ``engines.torch.rasterizer``.
+The gradient of a feature is the image gradient, summed over the pixels with the blending weights of
+the Gaussian. As in ``blend``, the weights are recomputed front to back. Later entries in a tile do
+not affect the weights. Results are bit-identical to ``blend_backward``. The reference
+implementation is ``engines.torch.rasterizer``.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def blend_features_task(
 
 @parallel_kernel
 def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records):
-    """Sums the image gradient over the pixels of every entry (a Gaussian–tile pair), weighted by blending weights.
+    """Computes the feature gradients of every entry, i.e. of every Gaussian–tile pair.
 
     Args:
         splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits: see ``blend.blend_backward``.
@@ -120,8 +121,8 @@ def sum_features(counts, firsts, records, g_features, guard_counts):
         counts: [N] number of pairs of each Gaussian.
         firsts: [N] first pair of each Gaussian.
         records: [pairs, 16] records from ``blend_features``.
-        g_features: [N, 4] output; 0 for Gaussians without pairs or with overflowing sums.
-        guard_counts: [tasks of ``CHUNK``, 1] int64 output, number of Gaussians with overflowing sums.
+        g_features: [N, 4] output, or 0 for Gaussians that have no pairs or whose sums overflow.
+        guard_counts: [tasks of ``CHUNK``, 1] int64 output, number of Gaussians whose sums overflow.
     """
     count = g_features.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):

@@ -1,12 +1,13 @@
 """Image loss 0.8 L1 + 0.2 (1 − SSIM) of images [C, H, W], and its gradient.
 
-SSIM is defined as in 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03².
-Because the window is separable, images are filtered in two passes, along rows and across rows. Both process sixteen
-pixels at a time.
+SSIM is defined as in 3D Gaussian Splatting, with an 11×11 Gaussian window, sigma 1.5, zero padding,
+C1 = 0.01² and C2 = 0.03². Because the window is separable, images are filtered in two passes, along
+rows and across rows. Both passes process sixteen pixels at a time.
 
-In many images, large areas are black in both target and rendering. A window that is 0 in both has an SSIM of 1 and no
-gradient, so only columns near non-black pixels are computed. If only part of the image is requested (``near``), groups
-of sixteen columns far from that part are skipped too. Reference implementation: ``losses.image_loss``.
+In many images, large areas are black in both target and rendering. A window that is 0 in both
+images has an SSIM of 1 and no gradient, so only columns near pixels that are not black are
+computed. If only part of the image is requested (``near``), groups of sixteen columns far from this
+part are skipped too. The reference implementation is ``engines.torch.losses.image_loss``.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ SSIM_SHARE = np.float32(0.2)
 
 
 PAD = lanes.COUNT
-"""Number of zeros with which rows are padded on either side before they are filtered."""
+"""Number of zeros with which a row is padded on either side before the row is filtered."""
 
 
 BAND = 16
@@ -48,7 +49,9 @@ LOSSES = WINDOWS | LOSS
 
 
 def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Returns the flags [H, columns] needed for the gradient of the given pixels and all losses affected by them.
+    """Returns the flags [H, columns] for the gradient of pixels and for all affected losses.
+
+    A column of the result covers sixteen columns of the image.
 
     Args:
         shown: [H, W] mask of the pixels.
@@ -75,13 +78,13 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 
 def stride(width: int) -> int:
-    """Returns the row length of scratch buffers: the width, rounded up to a multiple of ``Lanes``."""
+    """Returns the row length of scratch buffers: the width, rounded up to a multiple of sixteen."""
     return -(-width // lanes.COUNT) * lanes.COUNT
 
 
 @inline
 def filter_along_row(row, place):
-    """Filters sixteen values along a row, starting at flat index ``place``."""
+    """Filters a row along its columns, and returns sixteen values from flat index ``place``."""
     return (
         T0 * (lanes.load(row, place - 5) + lanes.load(row, place + 5))
         + T1 * (lanes.load(row, place - 4) + lanes.load(row, place + 4))
@@ -94,7 +97,10 @@ def filter_along_row(row, place):
 
 @inline
 def filter_across_rows(scratch, place, pitch):
-    """Filters sixteen values across eleven rows that start at flat index ``place`` and are ``pitch`` apart."""
+    """Filters across eleven rows, and returns sixteen values.
+
+    The first row starts at flat index ``place``, and consecutive rows are ``pitch`` apart.
+    """
     return (
         T0 * (lanes.load(scratch, place) + lanes.load(scratch, place + 10 * pitch))
         + T1 * (lanes.load(scratch, place + pitch) + lanes.load(scratch, place + 9 * pitch))
@@ -107,7 +113,7 @@ def filter_across_rows(scratch, place, pitch):
 
 @inline
 def apply_exposure(value, gain, offset):
-    """Returns the pixel value that a camera records: rendered value times gain, plus offset."""
+    """Returns the pixel value that a camera records: the rendered value times gain, plus offset."""
     return gain * value + offset
 
 
@@ -128,7 +134,8 @@ def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what
         kind, channel, y: index of the first output row in ``scratch``.
         span: range of columns to filter, multiples of ``Lanes``.
         cleared: range of columns to set to 0 outside ``span``.
-        what, wanted: arguments of ``is_needed``; columns that are not requested stay unchanged.
+        what, wanted: arguments of ``is_needed``. Columns in ``span`` that are not requested remain
+            unchanged.
     """
     _, channels, height, pitch = scratch.shape
     for k in range(quantities):
@@ -153,8 +160,10 @@ def span_of(image, gain, offset, target, channel, y, pitch, spans):
     """Finds the column ranges of a row near pixels that are not black in both images.
 
     Args:
-        spans: [4] output: column range (first, last + 1) of the windows that contain such pixels, followed by the range
-            of all pixels in these windows. Both are rounded to multiples of ``Lanes``, and (pitch, 0) if empty.
+        spans: [4] output: column range (first, last + 1) of the centres of windows that contain
+            such pixels, followed by the range of all pixels in these windows. Both ranges are
+            rounded to multiples of sixteen. If there are no such pixels, both ranges are (pitch,
+            0).
     """
     width = target.shape[2]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -187,7 +196,7 @@ def union_of_spans(spans, which, y, reach):
 
 @parallel_kernel
 def target_moments(target, scratch, means, squares):
-    """Computes the windowed means of a target and of its square; needed once per frame and view.
+    """Computes the windowed means of a target image and of its square, once per frame and view.
 
     Args:
         target: [C, H, W] target image.
@@ -218,7 +227,10 @@ def target_moments(target, scratch, means, squares):
 
 @kernel
 def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted):
-    """Runs the first pass of ``image_loss`` on a row: computes windowed quantities, filtered along the row."""
+    """Runs the first pass of ``image_loss`` on a row.
+
+    The pass filters the image, its square, and its product with the target along the row.
+    """
     width, pitch = target.shape[2], scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -245,7 +257,10 @@ def loss_of_row(
     image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses, channel, y,
     wanted,
 ):  # fmt: skip
-    """Runs the second pass on a row: computes its loss, and the loss gradients filtered along the row."""
+    """Runs the second pass of ``image_loss`` on a row.
+
+    The pass computes the loss of the row, and the loss gradients filtered along the row.
+    """
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
@@ -287,7 +302,7 @@ def loss_of_row(
 
 @kernel
 def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted):
-    """Runs the third pass on a row: computes its gradient."""
+    """Runs the third pass of ``image_loss`` on a row, which computes the gradient of the row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     share = weights[channel] / np.float32(pixels)
@@ -335,11 +350,12 @@ def image_loss(
         target: [C, H, W] target image.
         target_means, target_squares: [C, H, W] results of ``target_moments``.
         weights: [C] weight of each channel's mean loss.
-        pixels: number of pixels over which losses are averaged; H W for a full image.
+        pixels: number of pixels over which losses are averaged, H W for a full image.
         scratch: [6, C, H + 10, stride(W)] buffer for three windowed quantities and their gradients. The first and last
             5 rows must be 0.
         wanted: flags of the requested quantities; see ``near`` and ``EVERYWHERE``.
-        g_image: [>= C, >= H, >= W] output, dL/dimage; undefined where it is not requested.
+        g_image: [>= C, >= H, >= W] output, dL/dimage. The gradient is undefined where it is not
+            requested.
         losses: [C, H, 2] output, loss contribution and sum of squared differences of each row.
         g_exposure: [C, H, 2] output, contribution of each row to the gradients of gain and offset.
     """

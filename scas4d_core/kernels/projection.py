@@ -3,9 +3,9 @@
 A camera is represented by ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
 (fx, fy, cx, cy, width, height) in pixels, with pixel centres at +0.5.
 
-Gaussians with invalid values are not rendered, because they would corrupt every pixel that they cover. Overflowing
-gradients are discarded. Both events are counted; see ``guards``. Reference implementation:
-``engines.torch.rasterizer``.
+Gaussians with invalid values are not rendered, because they would corrupt every pixel that they
+cover. Gradients that overflow are discarded. Both events are counted; see ``guards``. The reference
+implementation is ``engines.torch.rasterizer``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ CHUNK = 256
 """Number of Gaussians per task, a compromise between overhead and load balance."""
 
 AHEAD = 16
-"""Prefetch distance in Gaussians. Prefetching pays off because their records are scattered in memory."""
+"""Prefetch distance in Gaussians. Prefetching pays off because the records of Gaussians are
+scattered in memory."""
 
 FARTHEST = np.float32(NOT_FINITE)
 BRIGHTEST = np.float32(FEATURE_CEILING)
@@ -49,7 +50,11 @@ SPLAT_COLUMNS = 16
 
 @inline
 def tangents(u, v, lens, margin):
-    """Clamps x/z and y/z for the Jacobian; returns the clamped values, and masks of the values within the bounds."""
+    """Clamps u = x/z and v = y/z for the Jacobian.
+
+    Returns:
+        The clamped u and v, and masks of the values of u and v within the bounds.
+    """
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     margin_x = margin * HALF * width / fx
     margin_y = margin * HALF * height / fy
@@ -69,7 +74,11 @@ def rotate_coordinate(pose, row, x, y, z):
 
 @inline
 def sound_features(features, first):
-    """Returns, for sixteen Gaussians starting at row ``first``, 1 if all features are within bounds, otherwise 0."""
+    """Checks the features of sixteen Gaussians, starting at row ``first``.
+
+    Returns:
+        1 for Gaussians whose features are all finite and within bounds, 0 for all others.
+    """
     columns = features.shape[1]
     sound = lanes.fill(ONE)
     total = lanes.fill(ZERO)
@@ -88,8 +97,9 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
 
     Args:
         splats: output, starting at row ``place``.
-        boxes: [5 · 16] output, tile ranges x0, y0, x1, y1 of each Gaussian and number of tiles.
-        guard_counts: [2] counts, accumulated.
+        boxes: [5 · 16] output, tile ranges x0, y0, x1, y1 of each Gaussian, and number of tiles.
+        guard_counts: [2] counts, to which the number of Gaussians that triggered each guard is
+            added.
     """
     alpha_floor, low_pass, near, margin = limits[0], limits[3], limits[4], limits[5]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -143,7 +153,8 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
     reach = lanes.maximum(reach, zero)
     half_x = lanes.square_root(reach * sxx)
     half_y = lanes.square_root(reach * syy)
-    # Pixel centres are at +0.5: the centre of the first covered column is at or to the right of mx - half_x.
+    # Pixel centres are at +0.5. The centre of the first covered column is therefore at or to the
+    # right of mx - half_x.
     left, right = mx - half_x - HALF, mx + half_x + HALF
     top, bottom = my - half_y - HALF, my + half_y + HALF
     visible = visible & (right > ZERO) & (left < width) & (bottom > ZERO) & (top < height)
@@ -230,12 +241,12 @@ def project(means, factors, opacities, features, pose, lens, limits, splats, rec
         means: [N, 3] float32 means in world coordinates.
         factors: [N, 3, 3] float32 covariance factors F, with Σ = F Fᵀ.
         opacities: [N] float32 opacities.
-        features: [N, C] float32 features, which are only checked for invalid values.
+        features: [N, C] float32 features. The function only checks them for invalid values.
         pose, lens: camera; see the module docstring.
         limits: [6] float32 rasterizer constants, in the order of the ``Limits`` fields.
         splats: [N + 15 or more, 16] float32 output; see the column constants above.
-        rects: [N, 4] int32 output, bounding box of each support in tiles: x0, y0, x1, y1 (exclusive). It is empty if
-            the Gaussian is culled.
+        rects: [N, 4] int32 output, bounding box of each support in tiles: x0, y0, x1, y1
+            (exclusive). The box of a culled Gaussian is empty.
         counts: [N] int32 output, number of tiles in each bounding box.
         guard_counts: [tasks of ``CHUNK``, 2] int64 output, number of Gaussians that triggered each guard in
             ``COUNTED_GUARDS``.
@@ -251,13 +262,16 @@ def project_backward_group(
     first, place, means, factors, pose, lens, limits, splats, sums, columns, depth_channel, g_means, g_factors,
     g_opacities, g_screen,
 ):  # fmt: skip
-    """Backpropagates the gradients of sixteen Gaussians from the image to the world; see ``project_backward``.
+    """Backpropagates the gradients of sixteen Gaussians from the image to the world.
+
+    For the other arguments, see ``project_backward``.
 
     Args:
         first: row of the first Gaussian in ``means`` and ``factors``.
         place: row of the first Gaussian in ``splats``.
-        sums: [16, columns] record of each Gaussian summed over its pairs, followed by a flag: 1 if it has pairs,
-            otherwise 0. If the gradient of the Gaussian overflows, the flag is cleared.
+        sums: [16, columns] sum of the records of each Gaussian over its pairs, followed by a flag:
+            1 if the Gaussian has pairs, otherwise 0. If the gradient of the Gaussian overflows, the
+            flag is cleared.
         g_means, g_factors, g_opacities, g_screen: outputs, starting at row ``first``.
 
     Returns:
@@ -346,7 +360,7 @@ def project_backward_group(
 
 @kernel
 def clear_steep_gradients(sums, counts, first, some, used):
-    """Clears the sums and flags of all Gaussians whose summed gradients exceed ``STEEPEST`` or are NaN."""
+    """Clears the sums and flags of all Gaussians whose sums exceed ``STEEPEST`` or are NaN."""
     for k in range(some):
         steep = ZERO
         for column in range(used):
@@ -433,9 +447,10 @@ def project_backward(
     g_screen,
     guard_counts,
 ):
-    """Sums the gradients of each Gaussian's pairs, in a fixed order, and backpropagates them to the world.
+    """Backpropagates gradients from the image to the Gaussians in the world.
 
-    Sixteen Gaussians are processed at a time. The gradients of culled Gaussians are 0.
+    The gradient records of a Gaussian are first summed over its pairs, in a fixed order. Sixteen
+    Gaussians are processed at a time. The gradients of culled Gaussians are 0.
 
     Args:
         means, factors, pose, lens, limits, splats: see ``project``.

@@ -1,4 +1,8 @@
-"""Depth sorting and tile lists. Gaussians are sorted once globally; lists filled in this order are also sorted."""
+"""Depth sorting, and the list of Gaussians of each tile.
+
+Gaussians are sorted by depth only once, for the entire image. The lists of the tiles are filled in
+this order, so they are also sorted.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +36,16 @@ SOME = 4096
 """Number of rows per task."""
 
 AHEAD = 8
-"""Prefetch distance in Gaussians. Prefetching pays off because depth order scatters memory accesses."""
+"""Prefetch distance in Gaussians. Prefetching pays off because memory accesses in depth order are
+scattered."""
 
 
 @inline
 def cover(splat, tile_x, tile_y):
     """Returns the mask of a tile's blocks that a Gaussian's support (an ellipse) intersects.
 
-    Bit 8 x + y represents the block in column x and row y. The mask is exact, because the topmost and bottommost rows
-    of the support are computed for each column of blocks.
+    Bit 8 x + y represents the block in column x and row y. The mask is exact up to a small margin,
+    because the topmost and bottommost rows of the support are computed for each column of blocks.
     """
     left = lanes.ramp(np.float32(tile_x * TILE) + HALF - splat[MEAN_X])
     # Eight lanes contain the upper ends of the support in the block columns, the other eight the lower ends.
@@ -50,7 +55,8 @@ def cover(splat, tile_x, tile_y):
     dx = lanes.minimum(lanes.maximum(down * splat[LOWEST_X], left), left + np.float32(lanes.ACROSS - 1))
     room = reach - dx * dx * splat[THIN]
     dy = dx * splat[SLOPE] + down * lanes.square_root(lanes.maximum(room * splat[SPREAD], lanes.fill(ZERO)))
-    # Rows whose centres are inside the support: from the ceiling of the upper end to the floor of the lower end.
+    # The rows whose centres are inside the support range from the ceiling of the upper end to the
+    # floor of the lower end.
     row = down * lanes.floor(down * (dy + (splat[MEAN_Y] - HALF - np.float32(tile_y * TILE))))
     row = lanes.choose(room >= ZERO, row, down * np.float32(-1e4))
     row = lanes.minimum(lanes.maximum(row, lanes.fill(np.float32(-1.0))), lanes.fill(np.float32(TILE)))
@@ -61,13 +67,13 @@ def cover(splat, tile_x, tile_y):
 def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
     """Sorts the visible Gaussians by depth, nearest first. Gaussians with equal depths stay in row order.
 
-    Because depths are positive, their float32 bit patterns can be sorted as integers. A stable radix sort with 12 bits
-    per pass is applied to differences from the nearest depth. Two passes suffice if the farthest depth is at most four
-    times the nearest.
+    Because depths are positive, their float32 bit patterns can be sorted as integers. A stable
+    radix sort with 12 bits per pass is applied to differences from the nearest depth. Two passes
+    suffice if the farthest depth is at most four times the nearest depth.
 
     Args:
         splats: [N, 16] projected Gaussians.
-        counts: [N] number of tiles of each Gaussian; 0 if culled.
+        counts: [N] number of tiles of each Gaussian, or 0 if the Gaussian is culled.
         keys, keys_too: [N] uint32 scratch buffers.
         order, order_too: [N] int32 buffers, one of which receives the result.
         histogram: [DIGITS] int64 scratch buffer.
@@ -115,7 +121,9 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
 
 @kernel
 def share_pairs(order, visible, counts, begins):
-    """Computes the first pair of each task, ``begins`` [tasks] int64. Each task gets an equal share of the Gaussians.
+    """Computes the first pair of each task, ``begins`` [tasks] int64.
+
+    Each task processes an equal share of the Gaussians.
 
     Returns:
         Upper bound on the number of Gaussian–tile pairs: the number of tiles in all bounding boxes.
@@ -154,7 +162,8 @@ def cover_tiles_task(
                 blocks = cover(splats[i], tile_x, tile_y)
                 outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
                 blocks &= drawn[tile]
-                # Pairs are always written but only kept if they intersect, which avoids branch mispredictions.
+                # A pair is always written but only kept if Gaussian and tile intersect. This order
+                # avoids mispredicted branches.
                 reached = np.int64(blocks != 0)
                 pairs[pair, 0] = i
                 pairs[pair, 1] = tile
@@ -176,8 +185,8 @@ def cover_tiles(
         splats, rects: outputs of ``projection.project``.
         order, visible: outputs of ``depth_order``.
         tiles_x: number of tile columns.
-        drawn: [tiles] uint64 mask of the blocks to render; other blocks are ignored.
-        learnt: [N] uint8 mask of the Gaussians that must stay within the rendered blocks.
+        drawn: [tiles] uint64 mask of the blocks to render. Other blocks are ignored.
+        learnt: [N] uint8 mask of the Gaussians that should stay within the rendered blocks.
         begins: [tasks] first pair of each task, from ``share_pairs``.
         ends: [tasks] int64 output, end of each task's pairs.
         counts: [N] number of tiles in each bounding box, replaced by the number of pairs of each Gaussian.
@@ -187,7 +196,7 @@ def cover_tiles(
         tile_counts: [tasks, tiles] int32 output, number of pairs in each tile.
 
     Returns:
-        Number of pairs in which a learned Gaussian extends beyond the rendered blocks.
+        Number of pairs in which such a Gaussian extends beyond the rendered blocks.
     """
     tasks = begins.shape[0]
     left = np.zeros(tasks, np.int64)
@@ -292,7 +301,7 @@ def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
 
 @kernel
 def write_blocks(part, blocks, tiles_x, box, planes):
-    """Copies the given blocks from a box back to an image. All other blocks stay unchanged.
+    """Copies the given blocks from a box back to an image. All other blocks remain unchanged.
 
     Args:
         part: [C, h, w] float32 input, the image inside the box.
@@ -332,7 +341,9 @@ def tile_offsets(tile_counts, starts, cursors):
 
 @parallel_kernel
 def fill_tiles(begins, ends, pairs, covers, cursors, items, slots, entry_covers):
-    """Writes the tile lists in depth order. Each task writes its part at the offsets from ``tile_offsets``.
+    """Writes the lists of the tiles in depth order.
+
+    Each task writes its part of every list at the offsets from ``tile_offsets``.
 
     Args:
         begins, ends, pairs, covers: see ``cover_tiles``.

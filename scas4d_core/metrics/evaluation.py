@@ -6,9 +6,9 @@ These definitions complement those in ``scas4d_core.metrics``:
 - *Foreground* pixels are inside the mask of the test camera. *Changed* pixels differ by more than 0.1 in at least one
   channel from the ground-truth image of frame 0.
 - 3D tracks start at the ground-truth points in frame 0. 2D tracks start at the pixels of the moving points that are
-  visible in a test camera in frame 0. Each is evaluated only in frames where its point is visible.
-- Parts are rendered with as many labels as the scene has foreground parts. They are compared at the pixels that show a
-  part in the ground truth.
+  visible in a test camera in frame 0. Each track is evaluated only in frames in which its point is visible.
+- Parts are rendered with as many labels as the scene has foreground parts. The labels are compared at the pixels that
+  show a part in the ground truth.
 - *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
   evaluated frames. *Flicker* is the mean temporal standard deviation of the rendered values at these pixels, in levels.
 """

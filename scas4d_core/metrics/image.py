@@ -31,7 +31,7 @@ class Score:
 
     Attributes:
         value: value of the metric, or None if it could not be computed.
-        reason: why the value is missing, and how to obtain one. Empty if there is a value.
+        reason: why the value is missing and how to make it available; empty if there is a value.
     """
 
     value: float | None
@@ -71,7 +71,7 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
 def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
     """Returns the structural similarity (Wang et al. 2004), averaged over pixels and channels.
 
-    As in 3D Gaussian Splatting, it uses an 11×11 Gaussian window with σ = 1.5 px, zero padding, C1 = 0.01²,
+    As in 3D Gaussian Splatting, SSIM uses an 11×11 Gaussian window with σ = 1.5 px, zero padding, C1 = 0.01²,
     C2 = 0.03², biased variances and values in 0…1.
 
     Args:

@@ -1,7 +1,7 @@
 """Metrics that compare point tracks with ground truth.
 
-If a track has no finite position in a frame (behind the camera, or lost), its error is one image diagonal in 2D and
-infinity in 3D. The query frame is excluded, because its positions are given.
+If a track has no finite position in a frame, because it is lost or behind the camera, its error is one image diagonal
+in 2D and infinity in 3D. The query frame is excluded, because its positions are given.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def median_trajectory_error(
 ) -> float:
     """Returns the 2D median trajectory error (MTE) in % of the image diagonal.
 
-    It is the median pixel error of each track, averaged over tracks. As in Dynamic 3D Gaussians, the definition follows
-    PointOdyssey (Zheng et al. 2023, ``median_l2``), but excludes the query frame. As in the paper (Point-Tracking), it
-    is normalized by the image diagonal.
+    The MTE is the median pixel error of each track, averaged over tracks. As in Dynamic 3D Gaussians, the definition
+    follows PointOdyssey (Zheng et al. 2023, ``median_l2``), but excludes the query frame. As in the paper
+    (Point-Tracking), it is normalized by the image diagonal.
 
     Args:
         tracks: [T, Q, 2] predicted positions in pixels, NaN if lost.
@@ -85,8 +85,8 @@ def oracle_tracks(
     """Returns oracle tracks, which follow the best candidate near each point, as defined in the paper.
 
     Among the candidates near a point in the query frame, the oracle selects the one with the smallest error. The oracle
-    uses the ground truth, so the ``median_trajectory_error`` of these tracks is a bound for the centroids and does not
-    measure tracking. Report it together with the error of the actual tracks.
+    uses the ground truth, so the ``median_trajectory_error`` of these tracks is a bound on the accuracy of centroids
+    and does not measure tracking. Report this error together with the error of the actual tracks.
 
     Args:
         candidates: [T, N, 2] positions of all Gaussian centroids in pixels, NaN behind the camera.
@@ -136,7 +136,7 @@ def track_error_3d(
     Args:
         tracks: [T, P, 3] predicted positions in user units, not finite if lost.
         truth: [T, P, 3] true positions in user units.
-        moving: [P] bool mask of the moving points. Only these are evaluated, because static points would lower the
+        moving: [P] bool mask of the moving points. Static points are not evaluated, because they would lower the
             median.
         extent: longest side of the foreground's bounding box, in user units.
         query: index in T of the query frame, which is excluded from the error.

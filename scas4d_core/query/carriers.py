@@ -10,13 +10,13 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 WEISZFELD_ROUNDS = 12
-"""Number of iterations for the geometric median. More would change it by a small fraction of the carriers' spread."""
+"""Number of iterations for the geometric median. Further ones change it by a small fraction of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
 """Working memory limit for the carrier search, in bytes."""
 ABSENT = -1e9
 """Log opacity assigned to retired Gaussians, so that they carry no points."""
 MIN_PRESENT_WEIGHT = 0.05
-"""Minimum total weight of a point's present carriers. A few distant carriers cannot determine its position."""
+"""Minimum total weight of a point's present carriers. A few distant carriers cannot determine the point's position."""
 
 
 def carriers(

@@ -22,8 +22,8 @@ FAR_M = 1e4
 def harmonics(gaussians: Gaussians) -> Float:
     """Returns the harmonic coefficients [N, 16, 3] of each Gaussian's RGB − 0.5 as a function of viewing direction.
 
-    Directions are in world axes. The coefficients are only valid for this frame, because highlights are fixed to the
-    world while objects rotate. Degree 3 is too coarse for the highlight of a lamp, which becomes wider and dimmer.
+    Directions are in world axes. The coefficients are valid only for the frame of the state, because highlights stay
+    fixed in the world while objects rotate. Degree 3 is too coarse for sharp highlights, which become wider and dimmer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[0.5, 0.5, 1.0])
     >>> dull = state.replace(gloss=np.zeros((1, 3), np.float32), environment=np.zeros((259, 3), np.float32))

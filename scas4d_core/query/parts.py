@@ -28,7 +28,7 @@ Features = NDArray[np.float32]
 NO_PART = -1
 """Label of static Gaussians, which belong to no part."""
 SILHOUETTE_SAMPLE = 1000
-"""Number of samples for choosing the number of parts. The silhouette score needs all their pairwise distances."""
+"""Number of samples for choosing the number of parts. The silhouette score requires all of their pairwise distances."""
 ROWS_AT_ONCE = 8192
 """Number of Gaussians labelled at a time, to limit the memory for features."""
 
@@ -36,11 +36,11 @@ LAMBDA_POSITION = 0.25
 """λp, the weight of p over time, with p in units of the extent."""
 LAMBDA_ROTATION = 1.0
 """λR, the weight of the entries of R over time, which a rotation by angle a changes by 2.8 sin(a/2). Rotations separate
-most parts, and positions only those that rotate alike. A larger position weight would split long parts."""
+most parts, whereas positions separate only parts that rotate alike. A larger position weight would split long parts."""
 LAMBDA_INITIAL = 0.25
 """λp0, the weight of p in the first frame, which the paper repeats in every frame."""
 MAX_FRAMES = 32
-"""Maximum number of frames in the features, evenly spaced over the history. It limits memory use."""
+"""Maximum number of frames in the features, evenly spaced over the history. The limit bounds memory use."""
 SAMPLE = 20_000
 """Maximum number of Gaussians used for clustering. All moving Gaussians are labelled afterwards."""
 MAX_PARTS = 12
@@ -130,7 +130,7 @@ def parts(
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
     """Renumbers parts to maximize their overlap with the previous labels (Hungarian method).
 
-    A part that overlaps no previous part, or whose match was assigned to another part, gets the lowest free label.
+    A part that overlaps no previous part, or whose match was assigned to another part, receives the lowest free label.
 
     Args:
         labels: [N] new labels from 0; negative labels belong to no part and are unchanged.
@@ -164,8 +164,8 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Returns positions [T, M, 3] and material rotations [T, M, 4] of Gaussians over time.
 
-    At most ``frames`` evenly spaced frames are used. Before a Gaussian was added, it is assumed to move with its
-    parent, or to be static if it has none.
+    At most ``frames`` evenly spaced frames are used. Before its birth, a Gaussian is assumed to move with its
+    parent, or to be static if it has no parent.
     """
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
@@ -201,8 +201,8 @@ def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) 
 def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float) -> Features:
     """Returns the features of M Gaussians over T frames, [M, 12 T + 3] float32.
 
-    The paper repeats p(0) in every frame. Here it is included once, scaled by √T, which gives the same distances. All
-    features are divided by √T, so that distances do not grow with the number of frames.
+    The paper repeats p(0) in every frame. Here, p(0) is included once, scaled by √T, so the distances are the same. All
+    features are divided by √T, because distances would otherwise grow with the number of frames.
 
     Args:
         positions: [T, M, 3] positions in metres.

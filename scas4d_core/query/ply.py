@@ -31,7 +31,7 @@ SH_DEGREE_0 = 0.28209479177387814
 OPACITY_MARGIN = 1e-6
 """Minimum distance of opacities from 0 and 1, where the logit is infinite."""
 JACOBI_SWEEPS = 12
-"""Number of one-sided Jacobi sweeps. A 3×3 matrix takes about five, because convergence is quadratic."""
+"""Number of one-sided Jacobi sweeps. A 3×3 matrix requires about five, because convergence is quadratic."""
 ORTHOGONAL = 1e-6
 """Cosine below which two axes are considered orthogonal, given the precision of float32 factors."""
 

@@ -25,7 +25,7 @@ TILE_PX = 16
 RAYS_AT_ONCE = 64
 """Number of rays processed at once, to limit working memory to a few megabytes."""
 DEEPEST = 96
-"""Maximum number of Gaussians per ray. Only those that absorb the most light have a visible effect."""
+"""Maximum number of Gaussians per ray: those that absorb the most light. All others have no visible effect."""
 BISECTIONS = 26
 """Number of bisection steps, which reduce a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
@@ -46,7 +46,7 @@ def ray_depths(
         gaussians: state of N Gaussians in the internal world.
         camera: camera in the internal world.
         uv: [Q, 2] pixel positions; (0.5, 0.5) is the centre of the first pixel.
-        limits: rasterizer constants. They ensure that a ray hits the same Gaussians that the rendered pixel shows.
+        limits: rasterizer constants. They ensure that a ray hits the same Gaussians as in the rendered pixel.
         softening: uncertainty of the surface in metres, added in quadrature to every axis of each Gaussian.
 
     Returns:

@@ -250,7 +250,7 @@ def find_visibility(
     positions. Pixels that are less than half covered do not occlude points.
 
     Args:
-        positions: [T, Q, 3] positions in the user's world. Points at NaN are not visible.
+        positions: [T, Q, 3] positions in the user's world. Points with NaN coordinates are not visible.
         indices: [T] committed frames.
         camera: camera in the user's world.
         render_depth: function that returns rendered depth and alpha.

@@ -23,7 +23,8 @@ TINT = (0.05, 0.1)
 """Maximum deviation of one colour channel from the other two, relative to the camera's past and the other cameras. The
 first value applies to two consecutive frames, and the second to a single frame. Clean captures reach 0.03."""
 GAIN = (0.15, 0.25)
-"""Same as ``TINT``, but for the common deviation of all channels. Clean captures reach 0.09, for a sheet edge-on."""
+"""Same as ``TINT``, but for the common deviation of all channels. Clean captures reach 0.09, when a sheet is seen
+edge-on."""
 SPREAD = 4.0
 """``TINT`` and ``GAIN`` are raised to at least this multiple of the median deviation over the cameras of the frame.
 If all cameras fit badly, as on small images, colours are unreliable."""

@@ -2,17 +2,17 @@
 
 A black frame contains no invalid values, but 100 iterations on it would turn the scene black. Lights flicker, and
 auto-exposure changes all cameras together. If such a change were learnt as colours, it would have to be unlearnt in the
-next frame. Its gain is therefore removed from the images. The gain is measured relative to the previous scene, as the
+next frame. Its gain is therefore removed from the images. The gain is measured relative to the previous state, as the
 median over pixels, because in most pixels only the lighting has changed. A lighting change may also persist, or
-continue from frame to frame like that of a dimming lamp. ``solve_frame`` then scales the scene's colours by the gain
-and leaves the images unchanged.
+continue from frame to frame, as when a lamp dims. ``solve_frame`` then scales the scene's colours by the gain and
+leaves the images unchanged.
 
 A frame may repeat the images of the previous frame, because a camera runs at half the rate of its rig or an idle rig
-resends its last frame. Nothing is learnt from such a frame. It does not count as a pause in the motion, so the next
-frame starts from the motion before the repeated images.
+resends its last frame. Nothing is learnt from such a frame. Repeated images do not count as a pause in the motion,
+so the next frame starts from the motion before them.
 
 A state that is not finite, bounded and plausible is never committed. Single faulty Gaussians keep their previous state.
-If there are more than a few of them, the whole attempt has failed.
+With more than a few faulty Gaussians, the whole attempt fails.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 EXPOSURE = 1.05
-"""Median brightness ratio over cameras above which the exposure of a frame differs. Clean captures reach 1.04."""
+"""Median brightness ratio over cameras above which the exposure of a frame counts as different. Clean captures reach
+1.04."""
 ALIKE = 1.03
 """Maximum ratio between consecutive brightness steps of a light that changes continuously. A lamp that crosses a room
-and dims to half its brightness in ten frames has a ratio of 1.017. Flickering lights have no similar steps."""
+and dims to half its brightness in ten frames has a ratio of 1.017. The steps of flickering lights are not similar."""
 ENOUGH = 8
 """Minimum number of cameras for estimating exposure. A turning object can change the brightness of one image by a
 third."""
@@ -109,7 +110,7 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
 
 
 def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
-    """Returns the median ratio of the images' brightness to the last frame, or 1 if too few cameras are usable."""
+    """Returns the median ratio of the images' brightness to the last frame's, or 1 if too few cameras are usable."""
     ratios = [
         value / past.last_brightness[name]
         for name, value in bright.items()
@@ -121,8 +122,8 @@ def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
 def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
     """Returns whether a lighting change continues at the same rate as in the previous frame and exceeds noise.
 
-    If so, the scene's own lighting changes, and the colours follow immediately. Flicker reverses, and a sudden jump
-    has no previous step.
+    In this case, the scene's own lighting is changing, and the colours are adapted immediately. Flicker reverses, and a
+    sudden jump has no previous step.
     """
     step = measure_brightness_ratio(past, bright)
     if 1 / EXPOSURE <= step <= EXPOSURE or (step > 1) != (past.brightness_ratio > 1):
@@ -278,7 +279,7 @@ def check_plausible(
 
 
 def _over_columns(function: np.ufunc, array: Array) -> Array:
-    """Returns the sums or maxima [M] over the few columns of an array [M, C], five times as fast as a reduction."""
+    """Returns the sums or maxima [M] over the few columns of an array [M, C], five times as fast as NumPy."""
     return reduce(function, np.moveaxis(array, 1, 0))
 
 

@@ -2,8 +2,8 @@
 
 Which local minimum the update reaches is a matter of chance. With a bad order, it ends 1 to 5 dB below other orders,
 and later updates do not recover. The orders also differ in their learning rates, because steps that are too large for
-one scene are too small for another. The errors in all training views decide which result is best. A few small images
-are not sufficient (docs/method.md).
+one scene are too small for another. The errors in all training views decide which result is best. Errors in a few
+small images are not sufficient (docs/method.md).
 """
 
 from __future__ import annotations

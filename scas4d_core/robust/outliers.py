@@ -20,8 +20,8 @@ FIRST_DB = -9.0
 """Offset from a camera's usual level, when first rendered, below which it is excluded at once. Clean captures reach
 -6.1."""
 LAST_DB = -5.0
-"""Same as ``FIRST_DB``, but when last rendered. The camera is then excluded from the next frame on. Clean captures
-reach -3.7, and cameras that moved by one or two pixels reach -6 to -15."""
+"""Same as ``FIRST_DB``, but when last rendered. The camera is then excluded starting with the next frame. Clean
+captures reach -3.7, and cameras that moved by one or two pixels reach -6 to -15."""
 NEAR_DB = -4.0
 """Offset below which a camera is suspect. Its usual level is then not updated, so a lasting fault remains visible. Two
 consecutive suspect frames raise an alarm. Clean captures reach -3.7."""
@@ -30,23 +30,26 @@ FITS_DB = -4.0
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""
 DROP_DB = 6.0
-"""Drop of the cameras' median PSNR below its usual value from which an update has not fitted its frame."""
+"""Drop of the cameras' median PSNR below its usual value at which an update counts as not fitting its frame."""
 DROPS_DB = (14.0, 9.0, 9.0)
 """Same as ``DROP_DB``, but for the first updates, when the usual value is known only from frame 0 or a longer
 update."""
 HALVED_DB = 3.0
-"""Additional tolerance per halving of the iterations. On the captures, 100 to 50 cost 1.7 dB, and 50 to 25 cost 3.2."""
+"""Additional tolerance per halving of the iterations. On the captures, 50 instead of 100 cost 1.7 dB, and 25 instead of
+50 cost 3.2."""
 BEHIND_DB = 1.5
 """Drop above which updates after rejected or skipped frames are continued, because objects have moved on."""
 RESTS_DB = 3.0
-"""Drop up to which a scene without visible motion counts as static. Noise that frame 0 fits costs 1 to 2 dB."""
+"""Drop up to which a scene without visible motion counts as static. If frame 0 was fitted to noise, the drop is 1 to 2
+dB."""
 CATCH_UP = 3
 """Maximum number of consecutive frames after a rejected or skipped frame that count as lagging."""
 MAX_OUT = 0.5
-"""Maximum share of excluded cameras. If more do not fit, the frame itself has changed."""
+"""Maximum share of excluded cameras. If more cameras do not fit, the frame itself has changed."""
 
 CLEAN_DB = 40.0
-"""Upper limit of PSNR values. Above it, 5 dB correspond to a thousandth of the value range and indicate no fault."""
+"""Upper limit of PSNR values. Above it, 5 dB correspond to a thousandth of the value range and do not indicate a
+fault."""
 
 ERROR_RISE = 1.02
 """Maximum factor by which the usual error of a probe view rises per update."""
@@ -227,7 +230,7 @@ def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) ->
         past: usual values before the update.
         psnr: PSNR of each camera when last rendered, in dB.
         iterations: number of iterations. If there were fewer than in the previous update, a lower PSNR is accepted. 0
-            means the same number.
+            means as many as in the previous update.
     """
     if not psnr or past.level != past.level:
         return None
@@ -329,7 +332,7 @@ def past_after_update(
 def usual_errors(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
     """Returns the usual error of each view, which falls immediately but rises slowly.
 
-    If it rose immediately, the frame after a noisy frame could be skipped although objects moved.
+    If the usual error rose immediately, the frame after a noisy frame could be skipped even though objects have moved.
     """
     return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}
 

@@ -1,4 +1,4 @@
-"""Relocation of an object after a jump, because an update tracks motion only up to about the object's size.
+"""Relocation of an object that has jumped farther than about its own size, which an update alone cannot track.
 
 Each image is compared with a rendering of the scene without moving Gaussians; pixels that differ show the object. The
 rays of all cameras through the object's centre are intersected, once for the images and once for renderings of the

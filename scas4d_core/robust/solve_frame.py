@@ -177,8 +177,8 @@ class FrameSolver:
         """Solves a frame under permanently changed lighting by scaling the colours of the scene.
 
         If the lighting is unchanged, a frame that seemed unusable is solved without scaling, because only a new object
-        made its images brighter or darker. Returns None if a usable frame has no changed lighting, or if no gain can be
-        measured.
+        made its images brighter or darker. Returns None if the frame is usable and its lighting is unchanged, or if no
+        gain can be measured.
         """
         gain = measure_light_gain(self._renderer, given.state, given.views)
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
@@ -209,7 +209,7 @@ class FrameSolver:
         return result, fault
 
     def _is_first_motion(self, given: UpdateInput, template: AttemptOptions) -> bool:
-        """Returns whether an attempt is the first with motion in a scene, and may take longer without a time limit.
+        """Returns whether an attempt is the first with motion in its scene, and is not limited in time.
 
         A scene that resumes without its carry-over does not count, because it has no usual values for its cameras. Nor
         does a scene after rejected frames, for which a longer search has already been made.

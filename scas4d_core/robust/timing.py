@@ -1,7 +1,7 @@
 """Camera timing: without genlock, cameras capture images up to half a frame before or after the other cameras.
 
 After an update, a few cameras are measured (different cameras in each frame). Moving Gaussians move from Θ_{t−1} to Θ_t
-within a frame. Renderings extrapolated forward and backward by half of this motion predict images of other times. The
+within a frame. Renderings extrapolated forward and backward by half of this motion predict images at other times. The
 capture time is the fraction of the motion that best explains the residual of the image relative to Θ_t. Measurements of
 a camera are averaged with exponential forgetting. An offset that all cameras share is a tracking lag, so the median
 over cameras is defined as 0. Nothing is corrected, and no state depends on these values.
@@ -26,11 +26,11 @@ from scas4d_core.update.result import UpdateResult
 
 LOOKS, ITERATIONS = 4, 25
 """Maximum number of measured cameras per frame, and minimum number of iterations of the update per measured camera.
-Each camera needs two or three renderings."""
+Measuring a camera requires two or three renderings."""
 HALF = 0.5
 """Fraction of a frame's motion by which moving Gaussians are extrapolated. Larger offsets are not expected."""
 STEEP = 0.02
-"""Minimum change of a pixel value (0…1) in half a frame that is above noise."""
+"""Minimum change of a pixel value (0…1) over half a frame that exceeds noise."""
 BRIGHT = 0.98
 """Image value above which a pixel may be saturated."""
 FEW, MOST = 50, 1500

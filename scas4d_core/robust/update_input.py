@@ -1,4 +1,4 @@
-"""Input of one frame's update: state, images, and values carried over from earlier frames."""
+"""Input to the update of one frame: state, images, and values carried over from earlier frames."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.warm_start import Motion
 
 RESTING = 10
-"""Maximum number of initial frames that may count as static. Objects can enter only in frames that do not."""
+"""Maximum number of initial frames that may count as static. Objects can enter only in frames that do not count as
+static."""
 
 
 @dataclass(frozen=True, eq=False)
 class UpdateInput:
-    """The input of one frame's update.
+    """Input to the update of one frame.
 
     Attributes:
         state: previous state Θ_{t−1}.
@@ -34,7 +35,7 @@ class UpdateInput:
         past: usual values of the scene and its cameras.
         lengths: [N, 3] axis lengths in frame 0, in metres.
         exposure: brightness ratio of the frame; see ``checks.check_brightness``.
-        light_moves: whether the lighting change continues from frame to frame; see ``checks.light_continues``.
+        light_moves: whether a lighting change continues from frame to frame; see ``checks.light_continues``.
         may_be_static: whether the images have shown no motion yet, in scenes that learn labels from motion.
         same: names of the cameras whose image equals that of the last accepted frame.
         sharp: sharpness of each camera's image; see ``alarms.sharpness``.

@@ -1,6 +1,6 @@
 """Births, retirements and revivals of Gaussians: the event log, lifetimes, and roots of newborn Gaussians.
 
-The file of each frame contains the log of all frames up to it, so the log survives when retention deletes files. Each
+The file of each frame contains the log up to that frame, so the log survives when retention deletes files. Each
 birth has its own file, which all later frames need. Requires only NumPy.
 """
 
@@ -22,7 +22,7 @@ COLUMNS = 4
 """Number of columns of the log: frame, kind, first id and last id."""
 NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
 NO_PARENT = -1
-"""Value for the parent of a Gaussian that has none, in place of a row."""
+"""Value stored instead of a parent's row for a Gaussian without a parent."""
 
 
 class Event(IntEnum):
@@ -40,8 +40,8 @@ class Life:
     Attributes:
         id: id of the Gaussian.
         born: frame of its birth; for initial Gaussians, the first frame.
-        retired: frames in which the Gaussian was retired, in increasing order. It is present from its birth, or from a
-            revival, until the next retirement.
+        retired: frames in which the Gaussian was retired, in increasing order. The Gaussian is present from its birth,
+            or from a revival, until the next retirement.
         revived: frames in which the Gaussian was revived, in increasing order.
     """
 

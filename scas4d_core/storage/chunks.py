@@ -1,8 +1,9 @@
 """Chunks: compact files in a history's folder, each with a series of older frames. Requires NumPy and zstandard.
 
 ``states_<index>.s4d`` starts with the frame of that index. A frame is in a chunk once the record of its state is
-complete. The preceding note contains the frame's report. If a frame also has its own file, that file takes precedence.
-Exact data is stored elsewhere: ids and opacities with the first frame and the births, and retirements in later logs.
+complete. The note before the record contains the frame's report. If a frame also has its own file, that file takes
+precedence. Exact data is stored elsewhere: ids and opacities with the first frame and births, and retirements in the
+logs of later frames.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class Chunk:
         changed: modification time in ns when the file was last checked.
         times: time of each frame in seconds, keyed by frame index.
         stamps: stamp of each frame, keyed by frame index. It consists of the frame's size in the file in bytes, and −1
-            minus the checksum of the state. The negative value distinguishes it from stamps of frame files.
+            minus the checksum of the state. The negative value distinguishes such a stamp from those of frame
+            files.
         damage: description of the first damage in the file, or None. Frames after the damage are not listed.
         foreign: whether the file has an unsupported format.
     """
@@ -141,7 +143,7 @@ class Chunks:
         return [str(chunk.damage) for chunk in self.known.values() if chunk.foreign]
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Reads arrays of a frame, with the same names as in the file of a frame.
+        """Reads arrays of a frame by the names that frame files use.
 
         Args:
             index: index of the frame.

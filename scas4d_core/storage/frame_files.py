@@ -5,8 +5,8 @@ Every file is written under a temporary name, synced and renamed. A file with it
 the directory listing is the only index. All frames depend on ``fixed.npz`` and the first frame, so these files have
 copies that are read if the original is damaged or missing.
 
-``born_<index>.npz`` contains the Gaussians born in a frame. It also has a copy, because all later frames need it. It is
-written before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks
+``born_<index>.npz`` contains the Gaussians born in a frame. This file also has a copy, because all later frames need
+it. It is written before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks
 (``chunks``). A frame's own file takes precedence over its chunk.
 """
 
@@ -273,7 +273,7 @@ class FrameFiles:
         return mended
 
     def remove(self, index: int) -> None:
-        """Deletes a frame if it exists, together with all later frames of its chunk if it is in one."""
+        """Deletes a frame if it exists. If it is in a chunk, all later frames of the chunk are deleted too."""
         self.path(index).unlink(missing_ok=True)
         self.chunks.truncate(index)
 

@@ -239,7 +239,7 @@ class FramesReader:
         """Returns the event log [E, 4] of the newest readable frame."""
         while (newest := self._newest()) >= 0:
             known, log = self._log
-            if known > newest or (known >= 0 and self._files is None):  # frames have been truncated since
+            if known > newest or (known >= 0 and self._files is None):  # frames have since been truncated
                 log = log[log[:, 0] <= newest]
             elif known < newest:
                 try:
@@ -268,7 +268,7 @@ class FramesReader:
         return {name: array[:count] for name, array in arrays.items()}
 
     def _born(self, birth: tuple[int, int, int]) -> Arrays:
-        """Returns the stored arrays of the Gaussians of a birth, given as (frame, first id, last id)."""
+        """Returns the stored arrays of a birth, which is given as (frame, first id, last id)."""
         index, first, last = birth
         known = self._births.get(index)
         if self._files is not None and (known is None or known["ids"][0] != first):

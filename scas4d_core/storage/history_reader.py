@@ -124,7 +124,7 @@ class HistoryReader(FramesReader):
 
     @property
     def count(self) -> int:
-        """Number of Gaussians so far, including retired ones."""
+        """Number of Gaussians that have been added so far, including retired ones."""
         return len(self.ids)
 
     @property
@@ -142,7 +142,7 @@ class HistoryReader(FramesReader):
 
     @property
     def highest_id(self) -> int:
-        """Highest id of any Gaussian ever, including Gaussians of truncated frames; −1 if there are none."""
+        """Highest id ever assigned to a Gaussian, including Gaussians of truncated frames; −1 if there are none."""
         known = [self.ids, *(arrays["ids"] for arrays in self._births.values())]
         if (files := self._files) is not None:
             for index in set(files.births()) - self._births.keys():

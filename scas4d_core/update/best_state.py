@@ -49,7 +49,8 @@ WHOLE = " whole"
 """Suffix of the names of views compared at full size, in the errors kept across frames."""
 
 COMMITTED = " committed"
-"""Suffix of the names of views in which a committed state was evaluated at full size, in the same errors."""
+"""Suffix of the names of views in which a committed state was evaluated at full size, in the errors kept across
+frames."""
 CONFIRMING = 2
 """Number of views in which a committed state is evaluated. Full-size images have four times as many pixels."""
 SLOW = 0.5
@@ -309,7 +310,7 @@ class BestState:
 
 
 def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
-    """Returns whether the mean error of the views with a limit is at most the mean limit, or false without such views.
+    """Returns whether the mean error of the views that have a limit is at most the mean limit; false if there are none.
 
     >>> mean_is_within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), mean_is_within({"a": 1.0}, {"b": 2.0})
     (True, False)

@@ -1,6 +1,6 @@
 """Update of one frame: from Θ_{t−1} and the images of frame t to Θ_t (paper, algorithm 1).
 
-The loop is ``FrameUpdate.run``. An iteration is one call of the engine (``engines.engine.UpdateEngine.iterate``).
+The loop is ``FrameUpdate.run``. An iteration is one call to the engine (``engines.engine.UpdateEngine.iterate``).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Contributions of effects to updates: values of the plan, and parts that act before and after an attempt.
 
-Contributions inside an iteration are values of the plan, which the engine executes. A part runs on the host once per
-attempt.
+The engine executes the plan in each iteration. Parts run on the host, at the beginning and at the end of each attempt.
 """
 
 from __future__ import annotations

@@ -18,26 +18,26 @@ if TYPE_CHECKING:
     from scas4d_core.settings import UpdateSettings
 
 RATE_SCALING = 0.002
-"""Learning rate of a cluster's c (1/m) and s, per iteration."""
+"""Learning rate per iteration of a cluster's scaling parameters c (1/m) and s."""
 STANDARD_RADIUS_M = 4.0
 """Scene radius to which the layers' translation rates refer, in metres."""
 
 
 LAYER_STARTS = (0.0, 0.2, 0.4)
-"""Share of the iterations after which a layer starts to learn, coarse to fine. The last value repeats for more layers.
-If all layers started at once, each cluster of the finer layers would absorb part of the coarse motion."""
+"""Share of the iterations after which a layer starts to learn, coarse to fine. With more layers, the last value
+repeats. If all layers started at once, each cluster of the finer layers would absorb part of the coarse motion."""
 
 LAYER_ENDS = (0.5, 0.75, 1.0)
-"""Share of the iterations after which a layer is frozen, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 gave similar results
-(docs/tried.md)."""
+"""Share of the iterations after which a layer is frozen, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 gave similar
+results."""
 FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
 """Same as ``LAYER_ENDS``, but for the first update, which runs in several view orders. If one order misses a motion,
-another order finds it. These values gained 0.0 to 0.5 dB (docs/tried.md)."""
+another order finds it. These values gained 0.0 to 0.5 dB."""
 NEAR_FINEST = 4.0
 """Factor on the rates of the finest layer if the layers above it are frozen early."""
 NEAR_OWN = 2.0
 """Same as ``NEAR_FINEST``, but for the Gaussians' own displacements, which account for the remaining motion. Their
-rotations and scales keep their rates, because synthetic scenes fit less well with higher rates (docs/tried.md)."""
+rotations and scales keep their rates, because synthetic scenes fit less well with higher rates."""
 LEAST_TIME = 0.3
 """Minimum share of the iterations in which a layer learns before it is frozen."""
 NEAR = 0.6

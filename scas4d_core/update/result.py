@@ -142,7 +142,7 @@ class UpdateTrace:
         whole: whether ``errors`` are for full-size images.
         shown: rendering of each camera in the last ``engine.KEPT_PICTURES`` iterations, from which evidence is computed
             without rendering again. Empty if the update ended earlier than planned.
-        guards: number of interventions of each guard that intervened.
+        guards: number of interventions by each guard that intervened.
     """
 
     losses: list[float] = field(default_factory=list)

@@ -116,7 +116,8 @@ RATE = 0.3
 FOR_BIRTHS = 0.4
 """Share of the time budget for fitting added Gaussians, which takes about as long as an update if an object enters."""
 AFTER_S = 0.05
-"""Predicted time after the last iteration, in seconds, until a frame has been measured."""
+"""Initial prediction of the time after the last iteration, in seconds, which is used until a frame has been
+measured."""
 
 
 class Stopping:
@@ -208,7 +209,7 @@ class TimeBudget:
         iteration_seconds: predicted time per iteration in seconds, or None if unknown.
         after: predicted time from the last iteration to the end of the commit in seconds, without fits of added
             Gaussians.
-        births: whether time is reserved for fits of added Gaussians, because the previous frame had some.
+        births: whether time is reserved for fits of added Gaussians, because the previous frame had such fits.
     """
 
     def __init__(self, milliseconds: float | None) -> None:

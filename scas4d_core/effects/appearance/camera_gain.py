@@ -1,13 +1,13 @@
 """Camera gains: a fixed or drifting brightness factor per camera and channel.
 
 A gain is applied to linear light, before the sRGB curve. On the power part of the curve, s = 1.055 L^(1/2.4) − 0.055, a
-gain γ turns a value s into a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, it multiplies s + 0.055 by a. One
-number per channel is therefore estimated: the median over pixels of (image + 0.055) / (rendering + 0.055). Independent
-gains and offsets, as in frame 0, would trade off against each other.
+gain γ multiplies s + 0.055 by a = γ^(1/2.4). Therefore, only one number per channel is estimated: the median over
+pixels of (image + 0.055) / (rendering + 0.055). Independent gains and offsets, as in frame 0, would trade off against
+each other.
 
-The estimate uses the renderings of the update. Each pass over the cameras updates each gain once, by half of the
-estimated difference. Later frames start from these gains. When the effect is switched off, the gains keep their last
-values.
+The gains are estimated from the renderings of the update. Each pass over the cameras updates each gain once, by half of
+the estimated difference. Later frames start from these gains. When the effect is switched off, the gains keep their
+last values.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, Update
 NAME = "camera_gain"
 POWER = 2.4
 """Exponent of the sRGB curve. A gain in linear light is the gain of s + 0.055, raised to this power."""
-# Measured spreads on which the thresholds are based: at most 0.011 on the five objects (on cloth) and 0.002 on stage,
-# whose cameras are identical; 0.025 on basketball, whose gains are known from frame 0 and which improves by 0.03 dB
-# with the effect; 0.078 to 0.094 on lamps.
+# The thresholds are based on these measured spreads: at most 0.011 on the five objects (on cloth) and 0.002 on stage,
+# whose cameras are identical; 0.025 on basketball, whose gains are known from frame 0, and where the effect gains
+# 0.03 dB; 0.078 to 0.094 on lamps.
 
 
 def current_exposures(
@@ -78,9 +78,9 @@ def _centre(gains: Array) -> Array:
 def spread_of(seen: FrameObservation) -> float | None:
     """Returns the standard deviation of colour gains over cameras, or None if too few cameras were measured.
 
-    The gains are in linear light, estimated from the mean colours of images and renderings. The factor common to all
-    channels of a camera is removed, because glossy objects on a black background and objects that are rendered slightly
-    too small affect all channels equally.
+    The gains are in linear light, estimated from the mean colours of images and renderings. The factor that
+    all channels of a camera share is removed, because glossy objects on a black background and objects that are
+    rendered slightly too small affect all channels equally.
     """
     spreads = []
     for view in seen.views:

@@ -3,8 +3,8 @@
 Each step changes a Gaussian's colour by the mean residual (image minus rendering) over the pixels of some views,
 weighted by the Gaussian's share of each pixel. This is SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
 1994). Steps of size 1 do not overshoot, because the shares of a pixel sum to at most 1. The kernels are shared
-with the rasterizer. The last subset dominates where views disagree, for example at a new object that the state does not
-contain yet. Therefore each subset contains views from all sides, and each pixel's residual is clamped.
+with the rasterizer. Where views disagree, for example at a new object that the state does not contain yet, the last
+subset dominates. Each subset therefore contains views from all sides, and each pixel's residual is clamped.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""View-dependent colour: glossy objects reflect their surroundings, which stay fixed while the objects turn.
+"""View-dependent colour: glossy objects reflect their surroundings, which stay fixed while the objects rotate.
 
 Each Gaussian has a normal and a strength, and all share one environment (``kernels.appearance.direction``). Spherical
-harmonics that turn with each Gaussian would be wrong after a few frames, because the highlight of a fixed lamp moves
-over a turning surface. The gloss is learnt with frame 0 (``first_frame.glossy``) and refined by updates. Rotation
-moves highlights to new places, which constrains normals and lamps better than a single frame.
+harmonics that rotate with each Gaussian would be wrong after a few frames, because the highlight of a fixed light moves
+across a rotating surface. The gloss is learnt with frame 0 (``first_frame.glossy``) and refined by updates. As an
+object rotates, highlights move across its surface, which constrains normals and lights better than a single frame does.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 TURNED_TOGETHER = 32
 """Number of neighbouring Gaussians whose positions determine the rotation of a normal."""
 FEW = 4
-"""Number of views used for the evidence."""
+"""Number of views from which the evidence is computed."""
 
 
 def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
     """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
 
-    Normals rotate with their neighbourhood instead of with their own Gaussian, because a normal belongs to a surface,
-    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants gave the same result.
+    Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a surface,
+    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the same result.
 
     Args:
         before, after: [N, 3] positions of the Gaussians in the two states, in metres.
@@ -100,7 +100,7 @@ class Direction(Effect):
     def register(self, builder: PlanBuilder) -> None:
         """Adds a ``DirectionPart`` and requests full images.
 
-        Static surfaces must be rendered too, because they also look different in each frame.
+        Static surfaces must also be rendered, because their appearance can change from frame to frame too.
         """
         builder.plan.full_images = builder.plan.gloss = True
         builder.parts.append(DirectionPart(builder))

@@ -1,6 +1,6 @@
-"""Changing light: colours adapt faster, and those of moving Gaussians at least as fast as those of static ones.
+"""Changing light: colours adapt faster, and moving Gaussians adapt at least as fast as static ones.
 
-A lamp that moves or dims changes colours with few degrees of freedom: surfaces with similar orientation and position
+If a light moves or dims, the colours change with few degrees of freedom: surfaces with similar orientation and position
 become brighter or darker together. This joint change is the evidence. The colours themselves adapt individually.
 Learning an additional relative change, linear or quadratic in orientation and position, did not improve the renderings.
 """
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.settings import Settings
 
-# Measured changes per frame on which the thresholds are based: at most 0.032 on the five objects (on robot, which turns
+# The thresholds are based on these measured changes per frame: at most 0.032 on the five objects (on robot, which turns
 # fastest and whose shading therefore changes under constant light), 0.012 on stage with its moving shadows, 0.023 to
-# 0.061 on lamps while the lamp moves.
+# 0.061 on lamps while the light moves.
 SAMPLE = 2000
 """Approximate number of Gaussians used for the evidence, which is sufficient for 7 unknowns per channel. The actual
 number may be up to twice as large."""

@@ -1,8 +1,8 @@
-"""Shading of moving Gaussians: their colours follow the images once per frame, in closed form, as objects turn.
+"""Shading of moving Gaussians: as objects rotate, colours are updated from the images once per frame, in closed form.
 
-With a learning rate low enough not to absorb motion, Adam cannot follow the shading of turning objects. The error then
-carries over to the next frame and grows. At the end of an update, the motion is known, so the remaining residual is a
-change of appearance (``closed_form``).
+With a learning rate low enough not to absorb motion, Adam cannot follow the shading of rotating objects. The error then
+carries over to the next frame and grows. At the end of an update, the motion is known, so ``closed_form`` treats the
+remaining residual as a change in appearance.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ShadingPart(UpdatePart):
         self._moves[builder.hierarchy.rows] = 1
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Updates the colours unless the update fell back to Θ_{t−1} or learns no colours of moving Gaussians."""
+        """Updates the colours unless the update fell back to Θ_{t−1} or keeps the colours of moving Gaussians."""
         if attempt.kept is Candidate.PREVIOUS or attempt.rates.colour == 0 or not self._moves.any():
             return state
         return follow_pictures(state, attempt.views, attempt.renderer, self._moves)

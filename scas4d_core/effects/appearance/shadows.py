@@ -1,4 +1,4 @@
-"""Moving shadows and light: the colours of static Gaussians follow the images once per frame, in closed form.
+"""Moving shadows and light: colours of static Gaussians are updated from the images once per frame, in closed form.
 
 At the end of an update, the colours of static Gaussians are updated as in ``closed_form``, but only in frames in which
 the static scene looks different from frame 0. In other frames, this step would fit noise and disagreement between
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 NAME = "shadows"
 CHANGED = 0.02
-"""Difference of a mean colour, RGB in 0…1, above which a square of pixels looks different from frame 0."""
+"""Difference of a mean colour, RGB in 0…1, above which a block of pixels looks different from frame 0."""
 HARDLY = 0.005
-"""Maximum share of changed static squares at which nothing is learnt from a frame. With a tenth of this value,
+"""Maximum share of changed static blocks at which nothing is learnt from a frame. With a tenth of this value,
 `basketball` gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""
 ENOUGH = 0.5
 """Minimum share of frame 0's cameras that a frame must contain for an update; with fewer, noise would be learnt."""
 STANDS = 0.05
-"""Minimum share of static Gaussians; with fewer, there is no background for shadows."""
+"""Minimum share of static Gaussians; with fewer, there is no background to receive shadows."""
 
 
 class ShadowsPart(UpdatePart):
@@ -72,7 +72,7 @@ class Shadows(Effect):
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
         """Returns a [h, w, 4] float16 array per view, or None if only a few Gaussians are static.
 
-        An array contains the mean colour of each square of pixels, and 1 if moving Gaussians reach the square.
+        An array contains the mean colour of each block of pixels, followed by 1 if moving Gaussians reach the block.
         """
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
@@ -91,7 +91,7 @@ class Shadows(Effect):
         return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the share of changed squares among all squares that are static both in frame 0 and now."""
+        """Returns the share of changed blocks among all blocks that are static in frame 0 and in this frame."""
         before: Arrays = seen.result.carried.get(NAME, {})
         if seen.result.gaussians.moving.all():
             return None
@@ -114,7 +114,7 @@ class Shadows(Effect):
 
 
 def _means(view: TrainingView) -> Array:
-    """Returns the [h, w, 3] mean colours of the complete squares of an image, with the camera's exposure removed."""
+    """Returns the [h, w, 3] mean colours of the complete blocks of an image, with the camera's exposure removed."""
     gain, offset = view.exposure[:3, 0], view.exposure[:3, 1]
     return (view.squares - offset) / gain
 
@@ -122,13 +122,13 @@ def _means(view: TrainingView) -> Array:
 def _compared(
     before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns [h, w] masks of changed squares, and of squares without moving Gaussians both in frame 0 and now."""
+    """Returns [h, w] masks of changed blocks, and of blocks without moving Gaussians in frame 0 and in this frame."""
     changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
     return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
 
 
 def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray[np.bool_]:
-    """Returns the [h, w] mask of squares that moving Gaussians reach."""
+    """Returns the [h, w] mask of blocks that moving Gaussians reach."""
     height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
     blocks = renderer.reached(state, view.camera)
     grid = blocks[: height * each, : width * each]

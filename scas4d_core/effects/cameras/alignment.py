@@ -1,9 +1,9 @@
 """Direct photometric alignment: finds the small twist of a camera's pose that aligns a rendering with the image.
 
-A twist consists of a translation (metres) and a rotation (radians) in camera axes. It is applied on the left of the
-pose: ``world_to_camera' = exp(twist) world_to_camera``. It displaces the content of a pixel by ``flow``, which changes
-the rendering by −gradient · flow. Gauss-Newton uses the mean gradient of image and rendering (Benhimane and Malis 2004)
-and Cauchy weights. Each frame takes a single step, and later frames continue from its result.
+A twist consists of a translation (metres) and a rotation (radians) in camera axes. It multiplies the pose from the
+left: ``world_to_camera' = exp(twist) world_to_camera``. The twist displaces the content of a pixel by ``flow``, which
+changes the rendering by −gradient · flow. Gauss-Newton uses the mean gradient of image and rendering (Benhimane and
+Malis 2004) and Cauchy weights. Each frame performs a single step, and later frames continue from its result.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ MOST = 1000
 STEEP = 0.02
 """Minimum gradient magnitude of an informative pixel, for values in 0…1; flatter pixels mostly show noise."""
 CAUCHY = 2.4
-"""Residual, as a multiple of the usual residual, at which the Cauchy weight is one half. It has 95% efficiency for
-Gaussian noise."""
+"""Residual, as a multiple of the usual residual, at which the Cauchy weight is one half. With this value, the
+estimator is 95% efficient for Gaussian noise."""
 QUIETEST = 1 / 255
 """Lower bound on the usual residual, for values in 0…1: the quantization step of 8-bit images."""
 FEW = 50
 """Minimum number of informative pixels for an estimate."""
 TURNED, SHIFTED = 4.0, 0.25
 """Prior standard deviations, in pixels, of a rotation and of a translation (at the depth of the image centre). Tripods
-sag or are knocked, which rotates a camera more than it translates it. The prior decides where the two look alike. With
-1 pixel for translations, and a prior on each step instead of on the total, translations of 1 cm compensated for
-rotations of 0.5°."""
+sag or are knocked, which rotates a camera more than it translates it. Where both look alike, the prior decides between
+them. With 1 pixel for translations, and a prior on each step instead of on the total, translations of 1 cm compensated
+for rotations of 0.5°."""
 SMALLEST = 1e-9
-"""Regularization, relative to the trace, of equations that may be singular."""
+"""Regularization of equations that may be singular, relative to their trace."""
 RESIDUAL_SCALE = 0.02
 """Residual, in 0…1, at which ``FEW`` pixels with a gradient of 1 weigh as much as the prior."""
 
@@ -77,7 +77,7 @@ class Equations(NamedTuple):
 def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels | None:
     """Returns an image and its rendering at informative pixels, or None if there are too few such pixels.
 
-    The gradients are averaged over both, unless the rendering is subsampled.
+    Gradients of the image and the rendering are averaged, unless the rendering is subsampled.
 
     Args:
         target: [3, H, W] image.
@@ -133,8 +133,8 @@ def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> D
 def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equations:
     """Returns the normal equations for given displacement fields.
 
-    The weights are computed twice, because weights from the initial residual alone would treat residuals that a shift
-    explains as outliers.
+    The weights are computed twice, because weights from the initial residuals alone would treat residuals that are
+    due to a shift as outliers.
 
     Args:
         seen: image and rendering at the informative pixels.
@@ -164,7 +164,7 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
     Args:
         lens: camera parameters; see ``flow``.
         seen: image and rendering at the informative pixels.
-        depth: [H, W] depth along z, in metres; NaN (nothing rendered) is replaced by the median depth.
+        depth: [H, W] depth along z, in metres; NaN, where nothing is rendered, is replaced by the median depth.
     """
     here = depth.reshape(-1)[seen.pixels].astype(np.float64)
     known = np.isfinite(here)
@@ -175,7 +175,8 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
 def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
     """Returns the normal equations of a rotation in three unknowns, in pixels: horizontal, vertical, and roll.
 
-    Roll is the displacement at a quarter of the image width from the centre. The equations do not depend on depth.
+    Roll is measured as the displacement of a point a quarter of the image width away from the centre. The equations do
+    not depend on depth.
     """
     return equations(seen, np.einsum("dkp,kl->dlp", flow(lens, seen.places)[:, 3:], turn_from_pixels(lens)))
 
@@ -187,7 +188,7 @@ def turn_from_pixels(lens: Array) -> Double:
 
 
 def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
-    """Returns the [3] horizontal and vertical displacement of the image centre and the roll of a twist, in pixels.
+    """Returns the effect of a twist in pixels, [3]: horizontal and vertical displacement of the image centre, and roll.
 
     Args:
         lens: camera parameters fx, fy, cx, cy, width, height.
@@ -201,7 +202,7 @@ def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
 def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
     """Returns the [6] increment of a twist.
 
-    A prior keeps the total twist small if the image constrains it weakly.
+    A prior keeps the total twist small if the image constrains it only weakly.
 
     Args:
         one: normal equations of the camera.

@@ -3,17 +3,17 @@
 Once per frame, after the update, renderings of some cameras are compared with their images. The rotation that would
 align them is recorded as the camera's offset from its calibration. A single frame is unreliable, because moving objects
 are tracked with a delay. A camera counts as moved if offsets from earlier frames explain its current residual, and if
-the offset is at least ``LEAST`` pixels. Its pose is then corrected by half of the difference per frame. The poses of
-all other cameras stay bit-identical.
+the offset is at least ``LEAST`` pixels. Its pose is then corrected by half of the difference in each frame. The
+poses of all other cameras stay bit-identical.
 
 Later frames use these poses for their training views: masks move with their camera, and probe views and new Gaussians
-use the current pose. Views requested by users are rendered with the given camera, so "as camera 7" refers to its
+use the current pose. Views requested by users are rendered with the given camera, so a view from camera 7 uses its
 calibrated pose.
 
-Cameras are excluded earlier (``robust.outliers``). A misaligned camera is still excluded, but its offset is measured.
-It is accepted again once its pose is found, and stays excluded if the correction exceeds the limit. Camera gains are
-medians over pixels, so small shifts hardly affect them. ``shadows`` may update colours in such frames, but it uses all
-cameras.
+``robust.outliers`` excludes cameras that do not fit, including misaligned ones, before this effect measures their
+offsets. A misaligned camera is accepted again once its pose is found, and stays excluded if the correction exceeds the
+limit. Camera gains are medians over pixels, so small shifts hardly affect them. ``shadows`` may update colours in
+frames with misaligned cameras, but it uses all cameras.
 """
 
 from __future__ import annotations
@@ -58,15 +58,16 @@ difference."""
 ENOUGH = 0.5
 """Minimum share of the rig's cameras that a frame must contain to be used."""
 LEAST = 0.25
-"""Minimum offset of a suspect camera, in pixels. Fixed cameras reach 0.15 on captures, and 0.4 on shaken cloth."""
+"""Minimum offset of a suspect camera, in pixels. Fixed cameras reach 0.15 on the captures, and 0.4 on a shaken
+cloth."""
 TIMES = 4.0
-"""Minimum ratio of a suspect camera's offset to the median offset. If many cameras seem to be off, the tracking
-lags."""
-# Measurements on which the effect's threshold is based: at half size, captures with fixed cameras have shares of at
+"""Minimum ratio of a suspect camera's offset to the median offset. If many cameras seem to be off, the
+tracking lags behind the motion."""
+# The effect's threshold is based on these measurements: at half size, captures with fixed cameras have shares of at
 # most 0.14 on cloth played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
 SHARE = 0.5
-"""Share of the difference by which poses and recorded offsets are updated per frame. A drift is tracked with a lag of
-one frame's change, and a frame in which the tracking lags causes only half of the error."""
+"""Share of the difference by which poses and recorded offsets are updated per frame. A drift is followed with a
+lag of one frame's change. A frame in which the scene tracking lags causes only half of the error."""
 STANDING = 6
 """Number of fixed cameras that are rendered while the effect is on (different cameras in each frame). They show which
 part of a twist is scene motion."""
@@ -74,10 +75,10 @@ LARGEST, TURN = 0.02, radians(1)
 """Maximum pose correction, as a share of the image width and as an angle in radians. A camera that is off by more has
 been moved and stays excluded."""
 COVERED = 0.1
-"""Minimum alpha at which a pixel has a depth."""
+"""Minimum alpha for a pixel to have a depth."""
 SMALLEST = 1e-3
-"""Regularization of the 3×3 equations of a rotation in pixels. It acts as a weak prior, because a plain wall shows no
-rotation.
+"""Regularization of the 3×3 equations of a rotation in pixels. It acts as a weak prior for images that do not
+show the rotation, such as those of a plain wall.
 """
 
 
@@ -125,7 +126,7 @@ class Poses:
         return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in blank.items()})
 
     def arrays(self) -> Arrays:
-        """Returns the arrays for the next frame, without the twists if no camera has moved."""
+        """Returns the arrays for the next frame, omitting the twists if no camera has moved."""
         arrays: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "observations")}
         return {**arrays, "twists": self.twists} if self.twists.any() else arrays
 
@@ -199,14 +200,14 @@ def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
 
 
 def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
-    """Returns the [C, 6] twists without the motion that most cameras share, which is scene motion.
+    """Returns the [C, 6] twists without the motion that most cameras share, which is attributed to the scene.
 
     The shared twist is the median of each component, in world axes, over the accepted cameras. With a mean, a camera
     that is off by 3 pixels would move the other cameras, and the world with them.
 
     Args:
         twists: [C, 6] twists of all cameras.
-        rig: rig as calibrated or with current poses; both give the same result.
+        rig: rig with calibrated or current poses, which lead to the same result.
         believed: [C] mask of the accepted cameras; the twists of all others are unchanged.
     """
     worlds = [
@@ -254,7 +255,7 @@ class PoseDrift(Effect):
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Returns the largest share of a suspect camera's residual that its offsets from earlier frames explain."""
+        """Returns the share of the residual explained by earlier offsets: the maximum over all suspect cameras."""
         arrays = seen.result.carried.get(NAME)
         if arrays is None or not _says(seen):
             return None
@@ -267,7 +268,7 @@ class PoseDrift(Effect):
         return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is misaligned by {size:.1f} pixels")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Does nothing, because the update gets the poses through its views."""
+        """Does nothing, because the update receives the poses through its views."""
 
 
 def _says(seen: FrameObservation) -> bool:

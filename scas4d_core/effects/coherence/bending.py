@@ -1,8 +1,8 @@
 """Bending: in objects that bend everywhere, such as cloth, neighbours rotate independently.
 
 The loss term ``rotation`` is a sum of norms of differences, so it removes rotation differences below a threshold. This
-finds rigid parts, but in swinging cloth it removes nearly all rotation differences. In bending scenes the term is
-therefore switched off. Rigidity, which couples positions to these rotations, fades to zero during an update.
+helps to find rigid parts, but in swinging cloth nearly all rotation differences are removed. In bending scenes, the
+term is therefore switched off. Rigidity, which couples positions to these rotations, fades to zero during an update.
 
 The evidence uses only positions, so it is comparable with and without these terms. It measures patches that each
 contain about a hundredth of the moving Gaussians. The evidence is the median rotation of a patch relative to the
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 SAMPLE = 4000
-"""Approximate number of sampled Gaussians, which gives patches a similar extent in all states. The actual number may
-be up to twice as large."""
+"""Approximate number of sampled Gaussians, which makes the extent of patches similar in all states. The actual number
+may be up to twice as large."""
 PATCH = 40
 """Number of Gaussians in a patch in addition to its centre; with fewer, the rotation is too noisy."""
 PATCHES = 400
-"""Approximate number of patches, over which the median is taken. The actual number may be up to twice as large."""
+"""Approximate number of patches over which the median is computed. The actual number may be up to twice as large."""
 AROUND = 19
 """Number of nearest patches that each patch is compared with; together they cover a twentieth of the object."""
 REST = 1e-3
 """Motion relative to the extent of the moving Gaussians. If 90% of them move less, a frame provides no evidence."""
 
-# Measurements on which the thresholds are based, in radians: on swinging `cloth`, at least 0.030 while the effect is
+# The thresholds are based on these measurements, in radians: on swinging `cloth`, at least 0.030 while the effect is
 # off (also when played backwards or with half of the cameras), and at least 0.037 while it is on. All other captures
 # have at most 0.004 while it is off, and 0.014 with rotation pinned off.
 

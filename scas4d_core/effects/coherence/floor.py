@@ -1,6 +1,6 @@
 """Floor term: keeps moving Gaussians above the floor (floor loss of Dynamic3DGaussians, for any plane).
 
-Kernel: ``engines.cpu.floor``; reference: ``losses.floor_loss``. The term exists only in scenes with a floor plane.
+Kernel: ``engines.cpu.floor``; reference: ``losses.floor_loss``. The term is used only in scenes with a floor plane.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class FreeColumns(Effect):
     """An effect that enables the parameters of the same name (``engines.freedom.Freedom``)."""
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a requirement if no effect could move anything without this one."""
+        """Returns a requirement if nothing could move without this effect."""
         if any(may_be_on(name, settings) for name in MOVES):
             return None
         return "no effect could move clusters or Gaussians", f"set at least one of {', '.join(MOVES)} to 'auto'"

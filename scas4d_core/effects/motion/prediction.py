@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CLUSTERS = ("cluster_rotation", "cluster_translation")
 OWN = ("own_position", "own_rotation")
-"""Effects whose parameters are extrapolated. Parameters of individual Gaussians are scaled by ``update.momentum``."""
+"""Effects that extrapolate the motion of individual Gaussians, scaled by ``update.momentum``."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Hull of new objects: voxels that several cameras see as new and that few cameras see through.
+"""Hull of new objects: voxels that several cameras see as new and few cameras see as free.
 
 The hull is carved from an octree, like the visual hull of frame 0. Each camera contributes a silhouette, which is
 ignored at pixels in which a moving object of the state may hide the new one.
@@ -32,7 +32,8 @@ COARSE = 32
 VOXEL_PIXELS = 1.5
 """Maximum edge of the smallest voxel, in pixels at the centre of the scene."""
 MAX_CELLS = 1 << 24
-"""Maximum number of grid cells for separating new objects. Voxels that need a larger grid are discarded."""
+"""Maximum number of cells in the grid that separates new objects. Voxels that would require a larger grid are
+discarded."""
 MAX_VOXELS = 1_000_000
 """Maximum number of voxels in a level; refinement stops before this limit is exceeded."""
 AT_ONCE = 1 << 16
@@ -171,7 +172,7 @@ def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
 
 
 def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Returns each point's median colour [P, 3] over the cameras that see it as new, and the camera count [P].
+    """Returns each point's median colour [P, 3] over the cameras that see it as new, and the number of cameras [P].
 
     The colour is NaN if no camera sees the point as new.
 

@@ -38,7 +38,7 @@ SHARE = 0.05
 WORTH = 0.01
 """Minimum share of the squared error that an object must explain for adding Gaussians while the effect is on."""
 SURPLUS = 0.5
-"""Minimum surplus of new over stale pixels, relative to the object's pixels. Otherwise, the object has only moved."""
+"""Minimum surplus of new over stale pixels, relative to the object's pixels; with less, the object has only moved."""
 BORDER, SUDDEN = 0.5, 0.2
 """New objects enter across the image border. The first value is the minimum share of cameras in which an object touches
 the border. The second is the minimum share of the error for an object that appears elsewhere. A limb that is tracked
@@ -48,8 +48,8 @@ TINY = 1e-12
 SETTLED = 4
 """Number of frames for which an added Gaussian is still refined outside the update."""
 DENIED = 0.5
-"""An added Gaussian is retired if more than this share of the cameras that have it in view see something else there.
-This is checked once, when the Gaussian is settled."""
+"""Maximum share of the cameras viewing an added Gaussian that may see something else in its place. If it is exceeded,
+the Gaussian is retired. The share is checked once, after ``SETTLED`` frames."""
 NONE = np.zeros(0, np.int64)
 NO_NEWBORNS: Arrays = {
     "rows": NONE,

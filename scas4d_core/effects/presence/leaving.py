@@ -1,6 +1,7 @@
 """Leaving objects: moving Gaussians are retired when they and their neighbourhood are outside all images.
 
-They keep their rows and ids. They are neither rendered nor moved until an object that they explain comes into view.
+Retired Gaussians keep their rows and ids. They are neither rendered nor moved until an object that they explain comes
+into view.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ if TYPE_CHECKING:
 
 NAME = "leaving"
 SHARE, IDLE_SHARE = 0.02, 0.002
-"""Share of moving Gaussians outside all images from which the effect is switched on, and share below which it may be
+"""Share of moving Gaussians outside all images at which the effect is switched on, and share below which it may be
 switched off."""
 FRAMES = 2
-"""Number of consecutive frames outside all images before a Gaussian is retired. Objects at the border come and go."""
+"""Number of consecutive frames outside all images before a Gaussian is retired. Objects at the border may reappear."""
 ABOUT = 0.1
-"""Distance, relative to the moving extent, within which a visible Gaussian keeps its neighbours from being retired. The
-visible half of an object still guides the other half."""
+"""Distance within which a visible Gaussian keeps its neighbours from being retired, relative to the extent of the
+moving Gaussians. The visible half of an object still guides the other half."""
 WIDTHS = 3.0
 """Extent of a Gaussian in standard deviations. The entire extent must be outside an image."""
 

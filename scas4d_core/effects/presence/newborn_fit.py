@@ -45,7 +45,7 @@ SHORTEST = 1e-6
 """Minimum length of an axis, in metres."""
 FIRST_OPACITY = 0.6
 """Initial opacity of an added Gaussian. Its surface is known, so the value is higher than the 0.1 used for the
-unreliable initial cloud.
+unreliable initial point cloud.
 """
 CONFIRMED = 2
 """Minimum number of cameras that must see the colour of a point."""
@@ -120,7 +120,7 @@ def refine_newborns(
     Args:
         state: state Θ_t.
         rows: rows of recently added Gaussians, whose hull and first update were coarse. Revived glossy Gaussians are
-            skipped, because the fit models colours but no gloss.
+            skipped, because the fit does not model gloss.
         views: training views of the frame.
         rig: cameras in the internal world.
         renderer: renderer with the background and limits of the scene.

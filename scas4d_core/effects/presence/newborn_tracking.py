@@ -1,6 +1,6 @@
-"""Tracking of objects that were added in the previous frame. Their motion is unknown and may exceed their width.
+"""Tracking of objects added in the previous frame, whose motion is unknown and may exceed their width.
 
-The object is removed from the state, and its hull is carved again from the images of the frame. The displacement
+Each object is removed from the state, and its hull is carved again from the images of the frame. The displacement
 between the two hulls initializes the translation of its clusters.
 """
 
@@ -24,8 +24,8 @@ Float = NDArray[np.float64]
 SAME = 2.5
 """Maximum ratio between the volumes of two hulls of the same object, which may enter gradually."""
 OWN = 0.5
-"""Minimum share of a cluster's Gaussians that must belong to an object. Only then does the cluster start with the
-displacement of the object."""
+"""Minimum share of a cluster's Gaussians that must belong to an object for the cluster to start with the object's
+displacement."""
 
 
 class NewbornTracking(UpdatePart):
@@ -62,7 +62,7 @@ class NewbornTracking(UpdatePart):
 def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
     """Returns an object's [3] displacement since it was added, in metres.
 
-    It is non-zero if an attempt starts from the end of another attempt.
+    The displacement is non-zero if an attempt starts from the end of another attempt.
     """
     rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):

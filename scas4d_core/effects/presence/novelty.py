@@ -1,6 +1,6 @@
 """Novelty maps: pixels with objects missing from the state, and pixels in which the state shows absent objects.
 
-With masks, a pixel is new if the mask has foreground and the rendered label has none. Without masks, a pixel is new if
+With masks, a pixel is new if it is foreground in the mask but not in the rendering. Without masks, a pixel is new if
 the image differs from the rendering of the static scene. Motion that was not tracked causes new and stale pixels in
 about equal numbers. Therefore, only a surplus of new over stale pixels indicates a new object.
 """
@@ -37,8 +37,8 @@ RIM = 3
 BARE = 0.5
 """Transmittance above which the state is empty at a pixel."""
 DIFFERENT, TIMES_USUAL = 0.1, 3.0
-"""Minimum channel difference, 0…1, averaged over a square of ``RIM`` pixels. Without masks, the second value is the
-minimum ratio of this difference to its median over the image."""
+"""Minimum channel difference, 0…1, averaged over a square of ``RIM`` × ``RIM`` pixels. Without masks, the second value
+is the minimum ratio of this difference to its median over the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Novelty:
         stale: [H, W] mask of pixels in which the state shows something that the image does not show.
         covered: [H, W] mask of pixels in which the state shows a moving object, which may hide something new.
         bare: [H, W] mask of pixels in which the state is empty but the image shows static background.
-        behind: [H, W] mask of pixels in which image and state show no moving object, as far as can be measured.
+        behind: [H, W] mask of pixels in which image and state show no moving object, as far as can be determined.
         error: [H, W] squared difference between image and rendering, averaged over channels.
     """
 
@@ -130,7 +130,7 @@ def _coarse_novelties(seen: FrameObservation) -> list[CoarseNovelty]:
 
 
 def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
-    """Returns a coarse estimate from a view and its rendering. All four pixels of a 2 × 2 square must agree."""
+    """Returns a coarse estimate from a view and its rendering. All four pixels of a 2 × 2 block must agree."""
     every, shown = thinned
     target = view.target[:, ::every, ::every]
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
@@ -149,7 +149,7 @@ def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
 
 
 def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Returns the four [h − 1, w − 1] corner planes of all 2 × 2 squares."""
+    """Returns the four [h − 1, w − 1] corner planes of all 2 × 2 blocks."""
     return plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
 
 

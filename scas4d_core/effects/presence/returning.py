@@ -23,8 +23,8 @@ ALIKE = 1.5
 """Maximum ratio between the RMS sizes of a hull and of the retired Gaussians."""
 EXPLAINS = 0.8
 """Minimum share of the squared error at an object that the revived Gaussians must remove. In a synthetic room, the same
-ball removes 0.85 to 1 if it has hardly rotated, and a ball with another pattern 0.6. When in doubt, new Gaussians are
-added instead, because a wrong id would be permanent."""
+ball removes 0.85 to 1 if it has hardly rotated, and a ball with another pattern removes 0.6. When in doubt, new
+Gaussians are added instead, because a wrong id would be permanent."""
 APART = 0.25
 """Distance, relative to the hull's size, up to which retired Gaussians belong to the same object."""
 

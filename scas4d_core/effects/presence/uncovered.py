@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 NAME = "uncovered"
 MIN_CAMERAS, MIN_CAMERAS_WHILE_ON = 3, 1
 """Minimum number of screened cameras that must see a bare region before all cameras are checked, while the effect is
-off and while it is on. Continued motion keeps uncovering background, and at first only few cameras see a hole."""
+off and while it is on. Continued motion keeps uncovering background, and at first only a few cameras see a hole."""
 SMALLEST = 0.0004
 """Minimum share of bare pixels in an image for a camera to count (26 of 256 x 256, about five by five pixels)."""
 SHARE = 0.03
@@ -36,7 +36,7 @@ BUDGET = 0.05
 
 Found = tuple[UncoveredPoints, float]
 _points_cache: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
-"""Results for each state and minimum number of screened cameras, used both as evidence and for adding Gaussians."""
+"""Cached results for each state and minimum number of screened cameras, used as evidence and for adding Gaussians."""
 
 
 def _find_points(seen: FrameObservation, glanced: int) -> Found | None:

@@ -1,7 +1,7 @@
 """Points on uncovered surfaces: the surface around a bare region is extended across it.
 
 In an image, the inverse depth of a plane is linear in pixel coordinates. Such a plane is fitted to the static scene
-around the region. Its points are accepted if the cameras agree on their colour.
+around the region. Points on the plane are accepted if the cameras agree on their colour.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AROUND = 6
 FEWEST = 24
 """Minimum number of ring pixels for a fit."""
 OPAQUE = 0.1
-"""Maximum transmittance at which a pixel has a depth."""
+"""Maximum transmittance for a pixel to have a depth."""
 ROUNDS = 5
 """Number of iterations of reweighted least squares. Pixels of other surfaces around the region are outliers."""
 NEAR = 0.02

@@ -70,7 +70,7 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
     """
     try:
         views = collect_views(rig, images, {})
-    except InitialPointsError:  # fewer than two images, or a wrong size, which is rejected elsewhere
+    except InitialPointsError:  # fewer than two images, or a wrong size, rejected elsewhere
         return None
     matches = match_by_appearance(views)
     cameras, off = measure_residuals(matches)

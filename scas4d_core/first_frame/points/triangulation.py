@@ -1,5 +1,4 @@
-"""Triangulation of SIFT features that several calibrated cameras see, with pycolmap and known
-poses.
+"""Triangulation of SIFT features that several calibrated cameras see, using pycolmap.
 
 Because the poses are known, matches are searched only along epipolar lines. Compared with a search
 over the whole image, far fewer wrong candidates take part in the ratio test, and matches across

@@ -186,7 +186,7 @@ def count_contradictions(
 
 
 def _distance(mask: Bool) -> Float:
-    """Returns the distance [H, W] to the nearest silhouette pixel in pixels, or infinity if empty."""
+    """Returns the distance [H, W] in pixels to the silhouette, or infinity if the mask is empty."""
     if not mask.any():
         return np.full(mask.shape, np.inf)
     result: Float = distance_transform_edt(~mask)
@@ -213,10 +213,11 @@ def _inside_silhouettes(
     for view, distance in zip(views, distances, strict=True):
         camera = view.camera
         column, line, depth, inside = pixels_inside(camera, centres)
-        # Before the last level, a voxel is kept if any part of the voxel may be in the silhouette. The slack is
-        # half the diagonal of the voxel plus 1.5 pixels. On the last level, the centre of the voxel decides,
-        # with a slack of half a voxel plus half the diagonal of a pixel. Masks are sampled at pixel centres.
-        # If many masks had to agree exactly, rounding errors would carve into the hull.
+        # Before the last level, a voxel is kept if any part of the voxel may be in the silhouette.
+        # The slack is half the diagonal of the voxel plus 1.5 pixels. On the last level, the centre
+        # of the voxel decides, with a slack of half a voxel plus half the diagonal of a pixel.
+        # Masks are sampled at pixel centres. If many masks had to agree exactly, rounding errors
+        # would carve into the hull.
         half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
         slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
         judged = inside & (depth > half)

@@ -29,7 +29,7 @@ FEW = 10
 
 
 def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], seed: int) -> InitialPoints:
-    """Samples points along pixel rays, and keeps points whose colour is similar in all cameras.
+    """Samples points along pixel rays, and keeps points on whose colour the cameras agree best.
 
     The points need not lie on surfaces, because the fit of frame 0 moves, removes and adds
     Gaussians.

@@ -236,7 +236,7 @@ def shade_rows_backward(means, gloss, turns, colours, environment, centre, g_sho
             hx = (hx - nx * radial) / s + nx * g_s
             hy = (hy - ny * radial) / s + ny * g_s
             hz = (hz - nz * radial) / s + nz * g_s
-            tx, ty, tz = TWO * (hy * z - hz * y), TWO * (hz * x - hx * z), TWO * (hx * y - hy * x)  # inverse rotation
+            tx, ty, tz = TWO * (hy * z - hz * y), TWO * (hz * x - hx * z), TWO * (hx * y - hy * x)  # rotate back
             g_gloss[i, 0] = hx + w * tx + tz * -y + ty * z
             g_gloss[i, 1] = hy + w * ty + tx * -z + tz * x
             g_gloss[i, 2] = hz + w * tz + ty * -x + tx * y
