@@ -158,7 +158,7 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
 
     >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
-    >>> cloud_warnings({"method": "agreement + pairs", "points": 900, "coverage": 0.12})[0][:75]
+    >>> cloud_warnings({"method": "agreement + pairs", "points": 900, "coverage": 0.12})[0][:74]
     'frame 0 is partly a guess: the points that cameras agree on cover only 12%'
     """
     if cloud is None or cloud.get("coverage") is None:

@@ -211,7 +211,7 @@ def _description(loc: Iterable[int | str]) -> str:
         loc: location of the setting in a pydantic error.
 
     >>> _description(("scene", "image_scale", "float"))
-    'Factor by which images are resized before any other step.'
+    'Scale factor applied to all images before any other step.'
     """
     said = ""
     model: type[BaseModel] = Settings

@@ -30,7 +30,7 @@ class Evidence:
 
 @dataclass(eq=False)
 class FitTime:
-    """Time limit for fitting the Gaussians added in a frame, outside the update, and the time spent on it.
+    """Time limit for fitting the Gaussians added in a frame, outside the update, and the time spent on these fits.
 
     Attributes:
         end: ``perf_counter`` value at which fits must end, or None if there is no limit.

@@ -40,7 +40,7 @@ class OrderResult(NamedTuple):
 
 
 def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[OrderResult, int]:
-    """Runs an update in two or three view orders, and returns the best result and the number of orders.
+    """Runs an update in two or three view orders, and returns the best result and the number of orders run.
 
     An update that needs no iterations is not repeated.
 

@@ -35,13 +35,13 @@ DROPS_DB = (14.0, 9.0, 9.0)
 """Same as ``DROP_DB``, but for the first updates, when the usual value is known only from frame 0 or a longer
 update."""
 HALVED_DB = 3.0
-"""Additional tolerance per halving of the iterations. On the captures, 50 instead of 100 cost 1.7 dB, and 25 instead of
-50 cost 3.2."""
+"""Additional tolerance per halving of the iterations. On the captures, 50 iterations instead of 100 cost 1.7 dB, and
+25 instead of 50 cost 3.2 dB."""
 BEHIND_DB = 1.5
 """Drop above which updates after rejected or skipped frames are continued, because objects have moved on."""
 RESTS_DB = 3.0
-"""Drop up to which a scene without visible motion counts as static. If frame 0 was fitted to noise, the drop is 1 to 2
-dB."""
+"""Drop up to which a scene without visible motion counts as static. If frame 0 was fitted to noise, the drop is
+1 to 2 dB."""
 CATCH_UP = 3
 """Maximum number of consecutive frames after a rejected or skipped frame that count as lagging."""
 MAX_OUT = 0.5

@@ -161,7 +161,7 @@ class FrameSolver:
         return self._accepted(given, result)
 
     def _scene_is_static(self, given: UpdateInput) -> str | None:
-        """Returns the reason why the images require no update, or None."""
+        """Returns the reason why the images do not require an update, or None."""
         if given.same and len(given.same) == len(given.brightness):
             return "repeated images"
         if not given.may_be_static or given.past.updates > 0:  # only a scene without any update can still be at frame 0

@@ -44,9 +44,8 @@ class Chunk:
         size: size in bytes when the file was last checked.
         changed: modification time in ns when the file was last checked.
         times: time of each frame in seconds, keyed by frame index.
-        stamps: stamp of each frame, keyed by frame index. It consists of the frame's size in the file in bytes, and −1
-            minus the checksum of the state. The negative value distinguishes such a stamp from those of frame
-            files.
+        stamps: stamp of each frame, keyed by frame index. A stamp consists of the frame's size in the file in bytes,
+            and −1 minus the checksum of the state. The negative value distinguishes it from stamps of frame files.
         damage: description of the first damage in the file, or None. Frames after the damage are not listed.
         foreign: whether the file has an unsupported format.
     """

@@ -32,7 +32,7 @@ LAYER_ENDS = (0.5, 0.75, 1.0)
 results."""
 FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
 """Same as ``LAYER_ENDS``, but for the first update, which runs in several view orders. If one order misses a motion,
-another order finds it. These values gained 0.0 to 0.5 dB."""
+another may find it. These values gained 0.0 to 0.5 dB."""
 NEAR_FINEST = 4.0
 """Factor on the rates of the finest layer if the layers above it are frozen early."""
 NEAR_OWN = 2.0
@@ -165,8 +165,8 @@ class Rates:
     def for_cold_start(self, factor: float, several_orders: bool = False) -> Rates:
         """Returns the rates for an update without a previous motion.
 
-        Layers rotate and translate faster by ``factor``, because they have farther to go. They are frozen early only if
-        the update runs in several view orders.
+        The rates of the layers' rotations and translations are multiplied by ``factor``, because the layers have
+        farther to move. Layers are frozen early only if the update runs in several view orders.
         """
         layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
         return replace(

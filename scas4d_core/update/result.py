@@ -19,7 +19,7 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Function that takes the first PSNR of each camera in dB, and returns the cameras to exclude with the reasons."""
+"""Function that takes the first PSNR of each camera in dB, and returns the cameras to exclude, with the reasons."""
 
 
 class Stopwatch:
@@ -120,13 +120,13 @@ class CameraFit(TypedDict):
 
 
 def camera_fit(psnr: float, colour_shift: tuple[float, float, float] | None = None) -> CameraFit:
-    """Returns the fit of a camera that has no usual level for comparison, and therefore has full health."""
+    """Returns the fit of a camera that has no usual level to compare with, so its health is 1."""
     return {"psnr": psnr, "colour_shift": colour_shift, "health": 1.0}
 
 
 @dataclass(eq=False)
 class UpdateTrace:
-    """Record of one attempt, filled during the attempt.
+    """Record of one attempt, filled in while the attempt runs.
 
     Attributes:
         losses: weighted loss of each iteration.

@@ -79,8 +79,8 @@ class ViewPlan:
 def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
     """Returns ``count`` indices divided into disjoint random sets of ``NEIGHBOUR_SAMPLE``, one per iteration.
 
-    A remainder of less than a quarter of a set joins the previous set. Otherwise, a few Gaussians would get all the
-    weight.
+    A remainder of less than a quarter of a set is merged into the previous set. Otherwise, a few Gaussians would carry
+    all the weight.
     """
     order = rng.permutation(count)
     size = min(NEIGHBOUR_SAMPLE, max(count, 1))

@@ -57,6 +57,15 @@ def status(http, id):
     return http.get(f"/v1/scenes/{id}").json()
 
 
+def lasting_report(http, id, index):
+    """The report of a frame without its latency, which a service only knows of the frames that it has seen itself."""
+    return {**http.get(f"/v1/scenes/{id}/frames/{index}").json(), "latency": None}
+
+
+def lasting_reports(http, id):
+    return [{**report, "latency": None} for report in http.get(f"/v1/scenes/{id}/frames").json()["frames"]]
+
+
 def finished(http, id, index):
     reports = []
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CLUSTERS = ("cluster_rotation", "cluster_translation")
 OWN = ("own_position", "own_rotation")
-"""Effects that extrapolate the motion of individual Gaussians, scaled by ``update.momentum``."""
+"""Effects whose parameters are extrapolated for individual Gaussians, scaled by ``update.momentum``."""
 
 
 @dataclass(frozen=True)

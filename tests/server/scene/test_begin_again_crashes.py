@@ -9,7 +9,7 @@ import shutil
 import fakes
 import pytest
 from running import pictures, problem
-from sending import create, put_form, serving, settled, status, wait_for
+from sending import create, lasting_reports, put_form, serving, settled, status, wait_for
 
 from client.wire import ReconstructionRequest
 from scas4d_core.storage.history import History
@@ -166,7 +166,7 @@ def test_damage_of_the_journal_or_the_definition_costs_no_state(tmp_path):
             put_form(http, id, 4, pictures(34))
             sdk.wait(id, 4)
         before = {id: committed(tmp_path, id) for id in ids}
-        reports = {id: http.get(f"/v1/scenes/{id}/frames").json()["frames"] for id in ids}
+        reports = {id: lasting_reports(http, id) for id in ids}
     for id, how in zip(ids, hows, strict=True):
         damaged(DataFolder(tmp_path).scene(id), how)
     for turn in range(2):
@@ -177,7 +177,7 @@ def test_damage_of_the_journal_or_the_definition_costs_no_state(tmp_path):
                 assert (found["reconstruction"], found["first_frame"], found["state"]) == (1, 2, "ready"), how
                 assert found["settings"]["static"]["iterations"] == fakes.PICKED
                 assert committed(tmp_path, id) == before[id], how
-                now = http.get(f"/v1/scenes/{id}/frames").json()["frames"]
+                now = lasting_reports(http, id)
                 if how == "definition":
                     assert now == reports[id]
                 else:  # that frame 3 was set aside is lost: there is no state of it

@@ -49,12 +49,14 @@ def test_a_scene_has_the_budget_of_its_settings_until_another_is_put(sdk):
     assert found.effective.model_dump() == {
         "iterations": 70,
         "budget_ms": None,
+        "keep_up_fps": None,
         "stop_gain": 0.0,
         "skip_tolerance": 0.5,
     }
     put = sdk.set_budget(id, budget_ms=400, skip_tolerance=-1)
     assert put == sdk.budget(id)
-    assert put.effective.model_dump() == {"iterations": 70, "budget_ms": 400, "stop_gain": 0.0, "skip_tolerance": -1}
+    limits = {"iterations": 70, "budget_ms": 400, "keep_up_fps": None, "stop_gain": 0.0, "skip_tolerance": -1}
+    assert put.effective.model_dump() == limits
     assert sdk.scene(id).budget == put.requested
     assert sdk.set_budget(id).effective == found.effective  # nothing put: as it was made
     sdk.delete_scene(id)

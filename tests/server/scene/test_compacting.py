@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from running import make_rig, pictures
-from sending import create, finished, put_form, serving_with, status, view, wait_for
+from sending import create, finished, lasting_report, put_form, serving_with, status, view, wait_for
 
 from client.wire import RigModel, StateBounds
 from scas4d_core.compact import Bounds, CompactReader
@@ -47,7 +47,7 @@ def test_older_states_go_to_a_compact_file_and_are_asked_for_as_before(tmp_path)
         wait_for(lambda: exact(folder) == [0, *range(COUNT - EXACT, COUNT)])
         assert len(chunks(folder)) == 1
         assert {index: view(http, id, index).content for index in range(3)} == before
-        reports = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(COUNT)]
+        reports = [lasting_report(http, id, index) for index in range(COUNT)]
         assert [report["state"] for report in reports] == ["committed"] * COUNT
         assert http.get(f"/v1/scenes/{id}/tracks?ids=1").status_code == 200
         # Taken away: a file ends where the scene's own does, and has its bits.
@@ -67,7 +67,7 @@ def test_older_states_go_to_a_compact_file_and_are_asked_for_as_before(tmp_path)
     with serving_with(tmp_path) as (_, http, _sdk):  # after a start: all is there, and goes on
         assert status(http, id)["committed"] == COUNT
         assert {index: view(http, id, index).content for index in range(3)} == before
-        report = http.get(f"/v1/scenes/{id}/frames/2").json()
+        report = lasting_report(http, id, 2)
         assert report == reports[2]
         sent(http, id, [COUNT])
         wait_for(lambda: exact(folder) == [0, *range(COUNT - EXACT + 1, COUNT + 1)])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from blake3 import blake3
 from running import Running, fake_settings, make_rig, picture, pictures, problem
-from sending import create, serving, settled
+from sending import create, lasting_report, serving, settled
 from sending import put_form as put
 from waiting import HANG_S
 
@@ -42,12 +42,12 @@ def test_everything_is_found_again(tmp_path):
         receipts.append(put(http, id, 5).json())
         part = http.put(f"/v1/scenes/{id}/frames/6/cameras/c0", content=picture(6)).json()
         before = http.get(f"/v1/scenes/{id}").json()
-        reports = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
+        reports = [lasting_report(http, id, index) for index in range(7)]
     with serving(tmp_path) as (http, sdk):
         after = http.get(f"/v1/scenes/{id}").json()
         assert without(after, "error", "gaussians") == without(before, "error", "gaussians")
         assert after["damage"] == []
-        again = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
+        again = [lasting_report(http, id, index) for index in range(7)]
         assert again == reports
         assert put(http, id, 2, pictures(2)).json() == receipts[2]
         assert problem(put(http, id, 2, pictures(9)), 409)["expected"] == 6
