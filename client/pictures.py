@@ -17,7 +17,7 @@ Picture = NDArray[np.uint8]
 
 
 def eight_bit(colour: NDArray[np.floating]) -> Picture:
-    """Converts colours [H, W, 3] in 0…1 to 8-bit values 0…255; values outside the range are clipped."""
+    """Converts colours [H, W, 3] in [0, 1] to 8-bit values 0…255; values outside the range are clipped."""
     rounded: Picture = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
     return rounded
 

@@ -62,12 +62,12 @@ class State:
 
     @property
     def colours(self) -> NDArray[np.float32]:
-        """RGB colours [N, 3], nominally in 0…1, sRGB-encoded like the images; without specular reflections."""
+        """RGB colours [N, 3], nominally in [0, 1], sRGB-encoded like the images; without specular reflections."""
         return self.gaussians.colours
 
     @property
     def opacities(self) -> NDArray[np.float32]:
-        """Opacities [N] in 0…1; 0 for Gaussians that are not present."""
+        """Opacities [N] in [0, 1]; 0 for Gaussians that are not present."""
         return self.gaussians.opacities
 
     @property

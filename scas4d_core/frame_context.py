@@ -22,7 +22,7 @@ class FrameInput:
     Attributes:
         seconds: time since the last committed frame, in seconds.
         views: views of all cameras that have an image.
-        bright: mean brightness of each camera's image, 0…1.
+        bright: mean brightness of each camera's image, [0, 1].
         fingerprints: checksum of each camera's image (``robust.checks.fingerprints``).
         exposure: brightness of the frame relative to the usual brightness; 1 if the ratio is within
             the usual range.

@@ -36,8 +36,8 @@ class Gaussians:
         rotations: [N, 4] float32 unit quaternions (w, x, y, z) of the rotation of the material
             since frame 0, or since the Gaussian was added.
         opacities: [N] float32 opacities as rendered: 0 for retired Gaussians, otherwise in (0, 1).
-        colours: [N, 3] float32 RGB colours, nominally 0…1, without any gloss.
-        foreground: [N] float32 learnt labels in 0…1. A Gaussian moves if its label is above 0.5.
+        colours: [N, 3] float32 RGB colours, nominally [0, 1], without any gloss.
+        foreground: [N] float32 learnt labels in [0, 1]. A Gaussian moves if its label is above 0.5.
         ids: [N] int64 permanent ids, or −1 for Gaussians that have not been committed yet.
         retired: [N] bool, true for retired Gaussians; defaults to all false.
         own_opacities: [N] float32 opacities in (0, 1), also of retired Gaussians; defaults to
@@ -88,7 +88,7 @@ class Gaussians:
         Args:
             points: [N, 3] centres in metres, in the internal world.
             radius: standard deviation along each axis, in metres.
-            colours: [N, 3] RGB colours in 0…1, or one colour for all points.
+            colours: [N, 3] RGB colours in [0, 1], or one colour for all points.
         """
         means = np.array(points, np.float32).reshape(-1, 3)
         count = len(means)

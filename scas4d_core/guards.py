@@ -73,7 +73,7 @@ FEATURE_CEILING = _guard(
     "feature_ceiling", 1e9, INFINITY,
     unit="1", where="kernels/projection.py, engines/torch/rasterizer.py",
     reason="A Gaussian is also skipped if a feature exceeds this value: the fourth powers in SSIM would overflow. "
-    "Colours are nominally in 0…1.",
+    "Colours are nominally in [0, 1].",
     counted="included in not_finite",
 )  # fmt: skip
 FOOTPRINT_CEILING = _guard(

@@ -193,8 +193,8 @@ class PointColours:
     """Colours of points, combined over all cameras that see each point.
 
     Attributes:
-        colours: [P, 3] float32 median RGB over the cameras that see the point, 0…1.
-        spread: [P] median absolute deviation from ``colours`` over these cameras, 0…1. The channel
+        colours: [P, 3] float32 median RGB over the cameras that see the point, [0, 1].
+        spread: [P] median absolute deviation from ``colours`` over these cameras, [0, 1]. The channel
             with the largest deviation counts.
         count: [P] number of cameras that see each point.
     """

@@ -44,7 +44,7 @@ class SceneSettings(SettingsModel):
     image_scale: float = Field(1.0, gt=0, le=1, description="Scale factor applied to all images before any other step.")
     background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
         "auto",
-        description="Background colour as RGB values in 0…1. 'auto' uses the colour of a plain backdrop or, without "
+        description="Background colour as RGB values in [0, 1]. 'auto' uses the colour of a plain backdrop or, without "
         "one, the mean colour of frame 0.",
     )
     near: Positive | Literal["auto"] = Field(

@@ -33,7 +33,7 @@ def render(
         frame: index of a committed frame; None for the last one.
         kind: type of image: colour, depth, alpha or parts.
         format: transfer format: png, jpeg or webp.
-        background: RGB in 0…1; None for the scene's background.
+        background: RGB in [0, 1]; None for the scene's background.
         width: image width in pixels; the camera is scaled to match. None for the camera's own width.
         parts: number of parts; None to choose it automatically.
 
@@ -78,7 +78,7 @@ def render_arrays(
 ) -> Call[dict[str, NDArray[Any]]]:
     """Renders several image types of one view and returns the array of each, keyed by type.
 
-    Colours are in 0…1, and depth is measured along z in the rig's units. The other types are alpha and parts.
+    Colours are in [0, 1], and depth is measured along z in the rig's units. The other types are alpha and parts.
 
     >>> views = client.render_arrays(scene, "c0", kinds=["colour", "depth"])
     >>> views["colour"].shape, views["depth"].shape

@@ -64,7 +64,7 @@ def push(
         float | None,
         typer.Option(
             min=0.001,
-            help="Frame rate at which to send, as a live rig would; default: as fast as the service accepts frames.",
+            help="Rate at which to send frames, to simulate a live rig; default: as fast as the service accepts them.",
         ),
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop once the scene has this many frames.")] = None,

@@ -13,7 +13,7 @@ class Pace:
     Attributes:
         fps: frames per second; None to send as fast as the service accepts frames.
         jitter: maximum delay of a frame in seconds, uniformly distributed; models cables, encoders and switches.
-        drop: fraction of frames that the rig loses, in 0…1. Frame 0 is never lost.
+        drop: fraction of frames that the rig loses, in [0, 1]. Frame 0 is never lost.
         seed: random seed for the jitter and losses.
 
     >>> pace = Pace(fps=30, drop=0.5)

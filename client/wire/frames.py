@@ -69,13 +69,13 @@ class CameraFitModel(Model):
     psnr: float | None = Field(description="PSNR in dB.")
     colour_shift: tuple[float, float, float] | None = Field(
         default=None,
-        description="Mean RGB of the image minus that of the render, for values in 0…1; null if not measured.",
+        description="Mean RGB of the image minus that of the render, for values in [0, 1]; null if not measured.",
     )
     health: float | None = Field(
         default=None,
         description=(
-            "Score from 1 (fits as usual relative to the other cameras) to 0 (would be discarded); null if not "
-            "evaluated."
+            "Score from 1 (fits as well as usual compared with the other cameras) to 0 (would be discarded); null if "
+            "not evaluated."
         ),
     )
 
@@ -130,7 +130,7 @@ class EffectModel(Model):
     )
     share: float = Field(
         default=0.0,
-        description="Fraction (0…1) that the effect explains, or would explain, according to the latest evidence.",
+        description="Fraction ([0, 1]) that the effect explains, or would explain, according to the latest evidence.",
     )
     text: str = Field(default="", description="Human-readable summary of the latest evidence.")
     idle: int = Field(
@@ -152,7 +152,7 @@ class FirstCloudModel(Model):
     )
     points: int
     coverage: float | None = Field(
-        description="Fraction (0…1) of the images covered by points on which cameras agree; null for given points."
+        description="Fraction ([0, 1]) of the images covered by points on which cameras agree; null for given points."
     )
 
 

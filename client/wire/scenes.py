@@ -44,7 +44,7 @@ class StateBounds(Model):
         default=0.05, ge=0.002, le=1, description="Maximum error of the material rotation, in radians."
     )
     colour: float = Field(
-        default=0.012, ge=1e-6, le=1, description="Maximum error per colour channel, for colours in 0…1."
+        default=0.012, ge=1e-6, le=1, description="Maximum error per colour channel, for colours in [0, 1]."
     )
     gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Maximum error per gloss component.")
     opacity: float = Field(

@@ -6,7 +6,7 @@ In the following, t is the index of a frame and c is the index of a camera.
 ``train_meta.json`` and ``test_meta.json`` contain ``w``, ``h``, ``k[t][c]`` (3×3, pixels),
 ``w2c[t][c]`` (4×4, OpenCV axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are
 in ``seg/`` under the same paths, with the suffix ``.png``. ``init_pt_cld.npz`` contains ``data``
-[P, 7]: x y z, r g b (0…1), foreground (0…1).
+[P, 7]: x y z, r g b ([0, 1]), foreground ([0, 1]).
 
 This reader also accepts three extensions: ``fps`` in ``train_meta.json``, one value per camera for
 ``w`` and ``h``, and point clouds with six columns (without foreground).
@@ -260,7 +260,7 @@ def _read_points(path: Path) -> InitialPoints | None:
     shown = data[:, 3:]
     if shown.min() < -1e-3 or shown.max() > 1 + 1e-3:
         raise CaptureError(
-            f"{path}: colours and foreground must be in 0…1; got {shown.min():g}…{shown.max():g}; "
+            f"{path}: colours and foreground must be in [0, 1], but are in [{shown.min():g}, {shown.max():g}]; "
             "divide 8-bit values by 255"
         )
     shown = np.clip(shown, 0, 1).astype(np.float32)

@@ -42,8 +42,8 @@ class InitialPoints:
 
     Attributes:
         positions: [P, 3] float64 point positions, in the user's units and axes.
-        colours: [P, 3] float32 point colours in 0…1, sRGB values as in the images.
-        foreground: [P] float32 foreground label of each point in 0…1, or None if unknown.
+        colours: [P, 3] float32 point colours in [0, 1], sRGB values as in the images.
+        foreground: [P] float32 foreground label of each point in [0, 1], or None if unknown.
 
     >>> cloud = InitialPoints(np.zeros((5, 3)), np.full((5, 3), 0.5, np.float32))
     >>> len(cloud), cloud.foreground is None

@@ -20,9 +20,9 @@ class Bounds:
         position: error of the centre, as a fraction of the Gaussian's size.
         axes: error of each axis, as a fraction of the Gaussian's size.
         rotation: angular error of the material rotation, in radians.
-        colour: error of each colour channel, whose range is 0…1.
+        colour: error of each colour channel, whose range is [0, 1].
         gloss: error of each gloss component.
-        opacity: error of the opacity, whose range is 0…1.
+        opacity: error of the opacity, whose range is [0, 1].
 
     Raises:
         InputError: if a bound is not between 1e-6 (rotation: 0.002) and 1.

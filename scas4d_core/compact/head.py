@@ -24,7 +24,7 @@ class FileHeader:
     Attributes:
         world: transform from the user's world to the world of the states.
         bounds: error bounds of all states.
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
         rig: cameras in the user's world, or None if unknown.
         frames_per_second: nominal frame rate, or None if unknown; each frame has its own time.
         metadata: additional JSON values about the file.

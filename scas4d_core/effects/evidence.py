@@ -19,8 +19,8 @@ class Evidence:
     """Evidence for an effect, from the frames processed so far.
 
     Attributes:
-        share: strength of the evidence (0…1), compared with the effect's thresholds. For most effects, it is the share
-            of the error, pixels or Gaussians that the effect explains or would explain.
+        share: strength of the evidence ([0, 1]), compared with the effect's thresholds. For most effects, it is the
+            share of the error, pixels or Gaussians that the effect explains or would explain.
         text: human-readable explanation, such as "camera c2 is off by 0.8 pixels".
     """
 

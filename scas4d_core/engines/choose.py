@@ -106,7 +106,7 @@ def renderer_of(device: Device, background: tuple[float, float, float], limits: 
 
     Args:
         device: device to use; see ``resolve_device``.
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
         limits: rasterizer constants.
     """
     if device == "gpu":

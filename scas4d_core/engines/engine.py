@@ -188,7 +188,7 @@ class ViewRecord(NamedTuple):
     Attributes:
         view: index of the view.
         psnr: PSNR of the rendering, in dB.
-        colour_shift: [3] mean of the training image minus mean of the rendering, RGB in 0…1, with the camera's
+        colour_shift: [3] mean of the training image minus mean of the rendering, RGB in [0, 1], with the camera's
             exposure applied.
     """
 

@@ -18,11 +18,11 @@ Array = NDArray[np.float32]
 FOOT = np.float32(0.055)
 """Offset of the power segment of the sRGB curve; see the module docstring."""
 MIDDLE = np.float32(0.5)
-"""Pixel value, in 0…1, for which ``exposure_to_gain`` returns an equivalent gain."""
+"""Pixel value, in [0, 1], for which ``exposure_to_gain`` returns an equivalent gain."""
 LOOKED_AT = 4096
 """Approximate number of pixels sampled per image on a regular grid. More pixels would barely change the median."""
 DARK, SATURATED = 0.05, 0.985
-"""Range of pixel values in 0…1 used to measure a gain. Darker pixels are noisy and lie on the linear segment."""
+"""Range of pixel values in [0, 1] used to measure a gain. Darker pixels are noisy and lie on the linear segment."""
 PIXELS = 100
 """Minimum number of usable pixels per channel. With fewer, the camera's gain is not updated."""
 SHARE = 0.5

@@ -27,7 +27,7 @@ Array = NDArray[np.float32]
 MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
     slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 11), slice(11, 14), slice(14, 15)
 )  # fmt: skip
-"""Columns of the parameter table: mean in metres, quaternion, log scale, opacity logit, RGB in 0…1, label logit."""
+"""Columns of the parameter table: mean in metres, quaternion, log scale, opacity logit, RGB in [0, 1], label logit."""
 COLUMNS = 15
 
 

@@ -45,7 +45,7 @@ class UpdatePlan:
 
     Attributes:
         cameras: names of the rig's cameras, in rig order.
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
         limits: rasterizer constants.
         cluster_map: variant of equation (6); see ``engines.torch.deformation``.
         covariance: variant of equation (5); see ``engines.torch.deformation``.

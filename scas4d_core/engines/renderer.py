@@ -52,7 +52,7 @@ class Comparison(NamedTuple):
     Attributes:
         psnr: PSNR of the rendering, in dB.
         image_loss: weighted image loss, 0.8 L1 + 0.2 (1 − SSIM).
-        colour_shift: [3] mean of the training image minus mean of the rendering, RGB in 0…1, with exposure applied.
+        colour_shift: [3] mean of the training image minus mean of the rendering, RGB in [0, 1], with exposure applied.
     """
 
     psnr: float
@@ -127,7 +127,7 @@ class Renderer(Protocol):
             state: Gaussians to render.
             views: training views over which the mean is taken.
             learnt: [N] mask that is 1 for Gaussians whose colours are corrected, and 0 for all others.
-            most: magnitude to which residuals are clipped; RGB values are in 0…1.
+            most: magnitude to which residuals are clipped; RGB values are in [0, 1].
         """
 
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
@@ -152,7 +152,7 @@ class ResidualRenderer(Protocol):
             state: Gaussians to render.
             view: training view.
             learnt: [N] uint8 mask of the Gaussians whose sums are needed.
-            most: maximum magnitude of a residual, for RGB in 0…1. Larger residuals are clipped.
+            most: maximum magnitude of a residual, for RGB in [0, 1]. Larger residuals are clipped.
 
         Returns:
             [N, 3] weighted sums of the RGB residuals before exposure, and [N] sums of the weights, in pixels.

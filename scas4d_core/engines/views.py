@@ -54,7 +54,7 @@ class TrainingView:
     Attributes:
         name: name of the camera.
         camera: camera in kernel format.
-        target: [C, H, W] float32 image, RGB in 0…1, followed by the mask if the frame has one. C is 3 or 4.
+        target: [C, H, W] float32 image, RGB in [0, 1], followed by the mask if the frame has one. C is 3 or 4.
         exposure: [C, 2] gain and offset of each channel, which are 1 and 0 for the mask.
         source: [H, W, 3] uint8 image and [H, W] uint8 mask (or None) from which ``target`` was converted, if any.
     """
@@ -74,7 +74,7 @@ class TrainingView:
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:
-        """Mean RGB [3] of the image in 0…1, computed on first access."""
+        """Mean RGB [3] of the image in [0, 1], computed on first access."""
         return means(self.target[:3])
 
     @cached_property

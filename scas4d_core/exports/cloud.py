@@ -107,7 +107,7 @@ def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) 
 
 
 def linear_light(colours: NDArray[np.floating]) -> Float:
-    """Converts sRGB colours (IEC 61966-2-1) to linear light, after clipping them to 0…1.
+    """Converts sRGB colours (IEC 61966-2-1) to linear light, after clipping them to [0, 1].
 
     >>> linear_light(np.array([0.0, 0.5, 1.0])).round(4)
     array([0.   , 0.214, 1.   ])

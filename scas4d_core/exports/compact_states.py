@@ -27,7 +27,7 @@ class CompactSequence:
         rig: rig in the user's world, or None.
         labels: [N] part label of each Gaussian (negative for none), or None to store no parts.
         frames_per_second: nominal frame rate, or None.
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
 
     Raises:
         InputError: if the file cannot be written.

@@ -59,7 +59,7 @@ class Binary:
                 multiple of 4 bytes.
             vertices: whether the array is a vertex attribute.
             bounds: whether to write min and max, which glTF requires for positions and times.
-            normalized: whether integers represent values in 0…1.
+            normalized: whether integers represent values in [0, 1].
         """
         given = np.ascontiguousarray(array)
         accessor: dict[str, Any] = {

@@ -1,6 +1,6 @@
 """Writes a frame as ``.glb`` with KHR_gaussian_splatting, as ratified by Khronos (see its README in KhronosGroup/glTF).
 
-The extension stores a linear, nonnegative scale, a linear opacity in 0…1, and the rotation as a
+The extension stores a linear, nonnegative scale, a linear opacity in [0, 1], and the rotation as a
 unit quaternion (x, y, z, w), all in float32. Harmonics have the same signs and order as in 3DGS.
 Drafts of the extension stored the logarithm of the scale.
 

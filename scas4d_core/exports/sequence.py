@@ -84,7 +84,7 @@ def export_sequence(
         ids: ids of the Gaussians to write for ``tracks``, or None for all moving Gaussians.
         frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None,
             the rate of the time codes is derived from the first two frames.
-        background: background colour, RGB in 0…1; stored only by ``s4d``.
+        background: background colour, RGB in [0, 1]; stored only by ``s4d``.
         progress: function called after each frame.
 
     Returns:

@@ -88,7 +88,7 @@ class FirstFrame:
         masked: whether frame 0 has masks.
         exposures: maps each camera name to a [3, 2] array, the gain and offset of each colour channel.
         lengths: [N, 3] axis lengths of the Gaussians, in metres.
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
     """
 
     masked: bool
@@ -138,8 +138,8 @@ def fit_static_scene(
         factory: factory that creates the scene's views.
         views: views of frame 0. Their exposures are learnt in place.
         positions: [P, 3] point positions in metres, in the internal world.
-        colours: [P, 3] point colours in 0…1.
-        foreground: [P] foreground label of each point in 0…1, or None.
+        colours: [P, 3] point colours in [0, 1].
+        foreground: [P] foreground label of each point in [0, 1], or None.
         scene: settings of the scene.
         settings: fit settings for frame 0.
         progress: function called after each iteration.

@@ -25,7 +25,7 @@ Float = NDArray[np.float64]
 ENOUGH = 0.05
 """Minimum blending weight of a Gaussian in a view, in pixels, for its colour in that view to be used."""
 WHITE = 0.97
-"""Channel value, in 0…1, from which a colour is treated as saturated."""
+"""Channel value, in [0, 1], from which a colour is treated as saturated."""
 FLATTEST = 0.2
 """Minimum cosine between the normal of a Gaussian and the direction to the camera. Gaussians at smaller
 cosines extend beyond the outline of the object in the image."""

@@ -55,8 +55,8 @@ def initial_parameters(
 
     Args:
         positions: [P, 3] positions in metres, in the internal world.
-        colours: [P, 3] colours in 0…1.
-        foreground: [P] foreground label of each point in 0…1, or None.
+        colours: [P, 3] colours in [0, 1].
+        foreground: [P] foreground label of each point in [0, 1], or None.
         limit: maximum number of Gaussians. A larger cloud is subsampled at random.
         rng: random generator for the subsampling.
     """

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MOVING_SHARE = 0.01
 """Maximum distance of a static ground-truth point from its position in frame 0, as a fraction of the extent."""
 CHANGED = 0.1
-"""A pixel has changed if any channel, in 0…1, differs from frame 0 by more than this threshold."""
+"""A pixel has changed if any channel, in [0, 1], differs from frame 0 by more than this threshold."""
 STILL_LEVELS = 6
 """Maximum range of a still pixel's true values in each channel, in 8-bit levels. It allows for image noise."""
 MIN_STILL = 500

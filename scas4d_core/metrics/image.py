@@ -1,6 +1,7 @@
 """Metrics that compare images with ground truth: PSNR, SSIM, FLIP and LPIPS.
 
-Images are [H, W, 3] arrays, either floats in 0…1 or uint8 in 0…255. Floats are first clamped to 0…1, as on a display.
+Images are [H, W, 3] arrays, either floats in [0, 1] or uint8 in 0…255. Floats are first clamped to [0, 1], as on a
+display.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
     """Returns the structural similarity (Wang et al. 2004), averaged over pixels and channels.
 
     As in 3D Gaussian Splatting, SSIM uses an 11×11 Gaussian window with σ = 1.5 px, zero padding, C1 = 0.01²,
-    C2 = 0.03², biased variances and values in 0…1.
+    C2 = 0.03², biased variances and values in [0, 1].
 
     Args:
         image: [H, W, 3] rendered image.
@@ -197,7 +198,7 @@ def _unit(picture: NDArray[Any], name: str) -> NDArray[np.float64]:
     if picture.dtype == np.uint8:
         return picture / 255.0
     if picture.dtype.kind != "f":
-        raise ValueError(f"{name} must be uint8, or floats in 0…1; got dtype {picture.dtype}")
+        raise ValueError(f"{name} must be uint8, or floats in [0, 1]; got dtype {picture.dtype}")
     if not np.isfinite(picture).all():
         raise ValueError(f"{name} contains NaN or infinity")
     unit: NDArray[np.float64] = np.clip(picture.astype(np.float64), 0.0, 1.0)

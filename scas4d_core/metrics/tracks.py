@@ -239,7 +239,7 @@ def error_by_confidence(
 
 
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
-    """Returns the fraction of correct visibility predictions in 0…1, called occlusion accuracy in TAP-Vid.
+    """Returns the fraction of correct visibility predictions in [0, 1], called occlusion accuracy in TAP-Vid.
 
     The fraction is NaN if there is no frame other than the query frame.
 

@@ -61,7 +61,7 @@ class CommittedScene:
         Args:
             camera: camera in the user's world.
             index: index of a committed frame, or None for the newest.
-            background: RGB in 0…1, or None for the scene's background.
+            background: RGB in [0, 1], or None for the scene's background.
             labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest
                 frame can be used for any frame, because the labels of Gaussians added later are ignored.
 

@@ -50,8 +50,8 @@ def ray_depths(
         softening: uncertainty of the surface in metres, added in quadrature to every axis of each Gaussian.
 
     Returns:
-        The depth z [Q] along the camera's axis in metres, and the coverage [Q], which is the fraction of light in 0…1
-        that is absorbed along the ray. The depth is NaN if the ray hits nothing.
+        The depth z [Q] along the camera's axis in metres, and the coverage [Q], which is the fraction of light in [0,
+        1] that is absorbed along the ray. The depth is NaN if the ray hits nothing.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)

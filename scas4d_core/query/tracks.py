@@ -55,8 +55,8 @@ class Tracks:
     Attributes:
         positions: [T, Q, 3] float64 positions in the user's world and units. NaN for a pixel query without a surface,
             and in frames in which too few of the carriers are present (not yet added, or retired).
-        confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²). The numerator is the opacity of
-            the carriers at the query point, where m is the Mahalanobis distance. The disagreement s in that frame is
+        confidence: [T, Q] float64 in [0, 1]: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²). The numerator is the opacity
+            of the carriers at the query point, where m is the Mahalanobis distance. The disagreement s in that frame is
             the weighted mean distance of the carriers' positions from the track, and a is ``AGREEMENT`` times the
             extent. The confidence is 0 for a query without a surface, and if the position is NaN.
         ids: [Q] int64 id of the Gaussian with the largest weight; −1 for a pixel query without a surface.

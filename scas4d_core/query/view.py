@@ -30,7 +30,7 @@ class View:
     """A rendered view.
 
     Attributes:
-        colour: [H, W, 3] float32 RGB over the background, nominally in 0…1.
+        colour: [H, W, 3] float32 RGB over the background, nominally in [0, 1].
         alpha: [H, W] float32 opacity.
         depth: [H, W] float32 alpha-weighted mean z along the camera's axis, in user units; NaN if less than half of
             the pixel is covered.
@@ -97,7 +97,7 @@ class ViewRenderer:
         Args:
             gaussians: state of N Gaussians in the internal world.
             camera: camera in the user's world.
-            background: background colour, RGB in 0…1.
+            background: background colour, RGB in [0, 1].
             colours: [N, 3] float32 RGB to use instead of the state's colours, or None for the colours seen by this
                 camera.
             labels: [N] part label of each Gaussian, −1 for none; required for ``View.parts``.

@@ -36,7 +36,7 @@ FOLLOWS = 0.2
 ROW = 2
 """Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
-"""Lower bound of a mean channel value, 0…1, when computing relative differences."""
+"""Lower bound of a mean channel value, [0, 1], when computing relative differences."""
 FLAT = 0.5
 """Minimum mean difference of neighbouring pixels, in 8-bit levels, for measuring sharpness."""
 ROWS = 64
@@ -248,7 +248,7 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
 
     Args:
         shift: [3] colour shift of the camera; see ``CameraFit.colour_shift``.
-        mean: [3] mean colour of the camera's image, 0…1.
+        mean: [3] mean colour of the camera's image, [0, 1].
 
     >>> colours_of((0.05, 0.0, -0.02), (0.3, 0.2, 0.18)).round(3).tolist()
     [0.2, 0.0, -0.1]

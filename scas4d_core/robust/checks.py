@@ -49,14 +49,14 @@ UNUSABLE = 2.0
 BLIND = 0.05
 """Share of a camera's usual brightness, relative to the other cameras, below which its image is dark."""
 DARKEST = 1e-3
-"""Mean of an image, 0…1, below which its brightness is not meaningful."""
+"""Mean of an image, [0, 1], below which its brightness is not meaningful."""
 
 DARK = 0.05
-"""Channel value, 0…1, above which a pixel is used for measuring the brightness."""
+"""Channel value, [0, 1], above which a pixel is used for measuring the brightness."""
 PIXELS = 100
 """Minimum number of usable pixels of a camera, on a grid of every other row and column."""
 SATURATED = 0.99
-"""Channel value, 0…1, at which a pixel is saturated and only provides a lower bound on the brightness."""
+"""Channel value, [0, 1], at which a pixel is saturated and only provides a lower bound on the brightness."""
 
 EVERY = 4
 """Row and column stride of the pixels in a fingerprint. Two images of a camera are never identical by chance."""
@@ -68,7 +68,7 @@ def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
 
 
 def brightness_of(picture: NDArray[np.uint8]) -> float:
-    """Returns the mean of every fourth pixel of every fourth row of an image [H, W, 3], 0…1."""
+    """Returns the mean of every fourth pixel of every fourth row of an image [H, W, 3], [0, 1]."""
     return float(picture[::4, ::4].mean()) / 255
 
 
@@ -226,7 +226,7 @@ SHRUNK, STRETCHED = 0.1, 10.0
 """Bounds of an axis length relative to its length in frame 0. Over thousands of updates, small residuals add up and
 lengths would drift without limit (docs/stability.md, Long runs). An axis outside the bounds is clamped and counted."""
 BRIGHTEST = 8.0
-"""Maximum absolute value of a colour. Cameras record 0…1, and camera gains extend this range."""
+"""Maximum absolute value of a colour. Cameras record [0, 1], and camera gains extend this range."""
 FEW = 0.01
 """Maximum share of moving Gaussians that keep their previous state. With more, the update is implausible."""
 

@@ -60,7 +60,7 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
 
 
 def errors_of(ends: Sequence[OrderResult]) -> list[float]:
-    """Returns the RMS error (0…1) of each result, averaged over cameras that were not excluded in any order.
+    """Returns the RMS error ([0, 1]) of each result, averaged over cameras that were not excluded in any order.
 
     The error is infinite if a state is implausible, or no better than the previous state.
     """

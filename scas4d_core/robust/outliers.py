@@ -72,7 +72,7 @@ class Past:
     Attributes:
         camera_levels: usual PSNR of each camera when last rendered, minus the level of its frame, in dB; NaN if
             unknown.
-        brightness: usual mean of each camera's image, 0…1, at the exposure of frame 0; NaN if unknown.
+        brightness: usual mean of each camera's image, [0, 1], at the exposure of frame 0; NaN if unknown.
         frames_left_out: number of consecutive frames for which each camera has been excluded; 0 if it is used.
         level: usual PSNR at the end of an update, in dB (see ``level_of``), or NaN if unknown.
         updates: number of updates included in the usual values.
@@ -83,7 +83,7 @@ class Past:
         error: usual error at the end of an update, keyed by probe view.
         light: brightness ratio of the last frame; see ``checks.check_brightness``.
         light_frames: number of consecutive frames that were all brighter, or all darker, than usual.
-        last_brightness: mean of each camera's latest image, 0…1, in any lighting.
+        last_brightness: mean of each camera's latest image, [0, 1], in any lighting.
         brightness_ratio: brightness of the last frame relative to the frame before it.
         camera_figures: figures of each camera for alarms; see ``alarms.CameraFigures``.
         timing: figures of each camera for its timing; see ``timing.CameraTimingSums``.
@@ -283,7 +283,7 @@ def past_after_update(
         past: usual values before the update.
         psnr: PSNR of each camera in dB: when last rendered for used cameras, at the end of the update for excluded
             cameras.
-        bright: mean of each camera's image, 0…1.
+        bright: mean of each camera's image, [0, 1].
         exposure: brightness ratio of the frame.
         iterations: number of iterations of the update; 0 means as in the previous update.
         moved: whether this or an earlier update changed the state. Otherwise, the usual values of updates are unknown.

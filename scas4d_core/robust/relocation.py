@@ -20,7 +20,7 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 DIFFERENT = 0.1
-"""Channel difference, 0…1, above which a pixel shows the moving object and not the background."""
+"""Channel difference, [0, 1], above which a pixel shows the moving object and not the background."""
 SMALLEST_AREA = 0.25
 """Minimum ratio of the object's area in an image to its rendered area; the maximum is the inverse."""
 CAMERAS = 3

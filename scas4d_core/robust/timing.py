@@ -30,7 +30,7 @@ Measuring a camera requires two or three renderings."""
 HALF = 0.5
 """Fraction of a frame's motion by which moving Gaussians are extrapolated. Larger offsets are not expected."""
 STEEP = 0.02
-"""Minimum change of a pixel value (0…1) over half a frame that exceeds noise."""
+"""Minimum change of a pixel value ([0, 1]) over half a frame that exceeds noise."""
 BRIGHT = 0.98
 """Image value above which a pixel may be saturated."""
 FEW, MOST = 50, 1500

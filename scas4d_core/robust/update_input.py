@@ -30,7 +30,7 @@ class UpdateInput:
         step: time since the previous frame, in seconds.
         views: training views used for the update.
         suspects: views of excluded cameras.
-        brightness: mean of each camera's image, 0…1, keyed by camera name.
+        brightness: mean of each camera's image, [0, 1], keyed by camera name.
         seed: seed of the update.
         past: usual values of the scene and its cameras.
         lengths: [N, 3] axis lengths in frame 0, in metres.

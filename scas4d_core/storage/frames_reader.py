@@ -206,7 +206,7 @@ class FramesReader:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Background colour, RGB in 0…1, as estimated in frame 0, or black if its report contains none.
+        """Background colour, RGB in [0, 1], as estimated in frame 0, or black if its report contains none.
 
         Raises:
             HistoryError: if the file of frame 0 and its copy are damaged.

@@ -109,7 +109,7 @@ class CameraFit(TypedDict):
 
     Keys:
         psnr: PSNR in dB.
-        colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1, or None if not measured.
+        colour_shift: [3] mean of the image minus mean of the rendering, RGB in [0, 1], or None if not measured.
         health: 1 if the camera fits as usual relative to the other cameras, 0 at the exclusion limit
             (``outliers.health``).
     """
@@ -207,7 +207,7 @@ class UpdateResult:
         exposure: brightness ratio of the frame to the usual brightness.
         offsets: offset of each camera above (+) or below its usual level among the cameras, in dB; empty if nothing was
             rendered.
-        health: health of each camera in ``offsets``, 0…1.
+        health: health of each camera in ``offsets``, [0, 1].
         alarms: alarms of the frame, except those of excluded cameras (``robust/alarms.py``).
         timing: relative capture time of each camera (``robust/timing.py``).
         carried: arrays for the next update, keyed by effect name.

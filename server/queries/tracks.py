@@ -114,7 +114,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
             f"too many depth maps: {count_noun(len(cameras), 'camera')} over {count_noun(len(frames), 'frame')}",
             field="project" if request.project else "camera",
             value=len(cameras) * len(frames),
-            remedy=f"request at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
+            remedy=f"request fewer cameras or frames at once: cameras × frames must be at most {MOST_VIEWS}",
         )
     return query
 

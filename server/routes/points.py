@@ -51,10 +51,10 @@ async def put(
 ) -> PointsReceipt:
     """Accepts the point cloud that initializes frame 0; it must be uploaded before frame 0.
 
-    The body is an npz with `positions` [P, 3] in the rig's world frame and units, and `colours` [P, 3] in 0…1.
-    `foreground` [P] in 0…1 is optional. Alternatively, the npz contains `data` [P, 6 or 7] with these as columns, like
-    the `init_pt_cld.npz` of Dynamic3DGaussians. Uploading the same body again returns the same response. To restart a
-    reconstruction from new points, upload them with `reconstruction=n` before `PUT …/reconstructions/{n}`.
+    The body is an npz with `positions` [P, 3] in the rig's world frame and units, and `colours` [P, 3] in [0, 1].
+    `foreground` [P] in [0, 1] is optional. Alternatively, the npz contains `data` [P, 6 or 7] with these as columns,
+    like the `init_pt_cld.npz` of Dynamic3DGaussians. Uploading the same body again returns the same response. To
+    restart a reconstruction from new points, upload them with `reconstruction=n` before `PUT …/reconstructions/{n}`.
     """
     body = await request.body()
     sha256 = hashlib.sha256(body).hexdigest()

@@ -49,7 +49,7 @@ async def render_by_name(
     width: Annotated[int | None, Query(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the image in pixels.")] = None,
     quality: Annotated[int | None, Query(ge=1, le=100, description="Quality of JPEG and WebP images.")] = None,
     background: Annotated[
-        str | None, Query(max_length=64, description="Background colour as red,green,blue in 0…1, such as 1,1,1.")
+        str | None, Query(max_length=64, description="Background colour as red,green,blue in [0, 1], such as 1,1,1.")
     ] = None,
     parts: Annotated[
         int | None, Query(ge=1, le=254, description="Number of parts; chosen by the scene by default.")
@@ -93,7 +93,7 @@ def _colour(text: str) -> tuple[float, float, float]:
     if not all(0 <= value <= 1 for value in (red, green, blue)):
         raise Problem(
             422,
-            "background must be three numbers in 0…1",
+            "background must be three numbers in [0, 1]",
             field="background",
             value=text,
             remedy="use, for example, background=1,1,1",

@@ -36,7 +36,7 @@ export const readable = () => inOrder().filter((report) => report.state === "com
 /**
  * Covers the view with a message.
  *
- * @param words { title, words, detail, share, actions }: share of the work that is done, 0…1, null if unknown; actions [[label, run]]
+ * @param words { title, words, detail, share, actions }: share of the work that is done, [0, 1], null if unknown; actions [[label, run]]
  */
 export function curtain({ title, words = "", detail = "", share, actions = [] }) {
   const box = $("curtain");

@@ -167,7 +167,7 @@ class SimulatedProcess:
             self._on_message(message)
 
     def _pass(self, call: Callable[[], None], after: float) -> float:
-        """Schedules a call over the network, not before the time ``after``, and returns its time."""
+        """Schedules a network call no earlier than the time ``after``, and returns the scheduled time."""
         loop = self._cluster.loop
         due = max(after, loop.time() + self._cluster.random.uniform(*MESSAGE_S))
         loop.call_at(due, self._reach, call)

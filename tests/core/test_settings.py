@@ -138,7 +138,7 @@ def test_changes_go_over_the_preset_later_ones_over_earlier_ones() -> None:
         ({"update": {"clusters": [64, 8]}}, "update.clusters", [64, 8], "must be in ascending order"),
         ({"upd": {"seed": 1}}, "upd", {"seed": 1}, "no such setting"),
         ({"update": 4}, "update", 4, "UpdateSettings"),
-        ({"scene": {"background": 2}}, "scene.background", 2, "a valid tupleBackground colour as RGB values in 0…1"),
+        ({"scene": {"background": 2}}, "scene.background", 2, "a valid tupleBackground colour as RGB values in [0, 1]"),
         ({"scene": {"background": 2, "near": 0}}, "scene.background", 2, "(and 1 more)"),
     ],
 )

@@ -54,7 +54,7 @@ def moments(
 
 
 def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
-    """Returns the state at the fraction ``share`` (0…1) of the way between the states ``a`` and ``b`` of one scene.
+    """Returns the state at the fraction ``share`` ([0, 1]) of the way between the states ``a`` and ``b`` of one scene.
 
     Centres and colours are interpolated linearly. Covariance factors are interpolated in each Gaussian's rotating
     frame, so rotating Gaussians keep their size. Gaussians that are present in only one of the states keep their

@@ -40,7 +40,7 @@ class VideoOptions:
         tracks: number of tracks to draw.
         trail: track length in seconds of video.
         parts: whether to colour Gaussians by part.
-        background: RGB in 0…1; None for the scene's background.
+        background: RGB in [0, 1]; None for the scene's background.
     """
 
     path: str = "orbit"

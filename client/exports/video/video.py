@@ -83,7 +83,7 @@ def picture_size(text: str) -> tuple[int, int]:
 
 
 def background_colour(text: str) -> tuple[float, float, float]:
-    """Parses a colour name or hex code and returns RGB in 0…1.
+    """Parses a colour name or hex code and returns RGB in [0, 1].
 
     Raises:
         InputError: if the text is not a colour.

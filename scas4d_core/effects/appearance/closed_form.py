@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SUBSETS = 6
 """Number of steps per frame; the views are divided evenly among them."""
 MOST = 0.2
-"""Limit on the residual of a pixel, RGB in 0…1. Larger differences are not due to lighting. On `visit`, in which
+"""Limit on the residual of a pixel, RGB in [0, 1]. Larger differences are not due to lighting. On `visit`, in which
 a ball enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
 
 

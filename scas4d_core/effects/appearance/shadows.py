@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 NAME = "shadows"
 CHANGED = 0.02
-"""Difference of a mean colour, RGB in 0…1, above which a block of pixels looks different from frame 0."""
+"""Difference of a mean colour, RGB in [0, 1], above which a block of pixels looks different from frame 0."""
 HARDLY = 0.005
 """Maximum share of changed static blocks at which nothing is learnt from a frame. With a tenth of this value,
 `basketball` gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""

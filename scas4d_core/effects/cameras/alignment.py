@@ -21,12 +21,12 @@ LOOKED_AT = 4096
 MOST = 1000
 """Approximate maximum number of informative pixels that are used; more pixels hardly improve the estimate."""
 STEEP = 0.02
-"""Minimum gradient magnitude of an informative pixel, for values in 0…1; flatter pixels mostly show noise."""
+"""Minimum gradient magnitude of an informative pixel, for values in [0, 1]; flatter pixels mostly show noise."""
 CAUCHY = 2.4
 """Residual, as a multiple of the usual residual, at which the Cauchy weight is one half. With this value, the
 estimator is 95% efficient for Gaussian noise."""
 QUIETEST = 1 / 255
-"""Lower bound on the usual residual, for values in 0…1: the quantization step of 8-bit images."""
+"""Lower bound on the usual residual, for values in [0, 1]: the quantization step of 8-bit images."""
 FEW = 50
 """Minimum number of informative pixels for an estimate."""
 TURNED, SHIFTED = 4.0, 0.25
@@ -37,14 +37,14 @@ for rotations of 0.5°."""
 SMALLEST = 1e-9
 """Regularization of equations that may be singular, relative to their trace."""
 RESIDUAL_SCALE = 0.02
-"""Residual, in 0…1, at which ``FEW`` pixels with a gradient of 1 weigh as much as the prior."""
+"""Residual, in [0, 1], at which ``FEW`` pixels with a gradient of 1 weigh as much as the prior."""
 
 
 class AlignedPixels(NamedTuple):
     """An image and its rendering at selected pixels.
 
     Attributes:
-        target, shown: [3, P] RGB of the image and of the rendering in 0…1, with the camera's exposure applied.
+        target, shown: [3, P] RGB of the image and of the rendering in [0, 1], with the camera's exposure applied.
         slopes: [3, 2, P] gradients along x and y, per pixel; see ``align_pixels``.
         places: [2, P] pixel positions u, v.
         pixels: [P] flat pixel indices in the image.

@@ -107,7 +107,7 @@ class Poses:
         twists: [C, 6] float64 corrections of the calibration: translation (metres) and rotation, in camera axes.
         moved: [C, 3] corrections at the last measurement, in pixels; see ``alignment.pixel_offset``.
         offsets: [C, 3] exponential moving average of the measured offsets from the calibration, in pixels.
-        shares: [C] exponential moving average of the share of the residual (0…1) that earlier offsets explain.
+        shares: [C] exponential moving average of the share of the residual ([0, 1]) that earlier offsets explain.
         observations: [C] number of frames in which the camera was measured.
     """
 

@@ -24,7 +24,7 @@ from scas4d_core.posed_pictures import pixels_inside
 Array = NDArray[np.float32]
 
 CHANGE = 0.04
-"""Difference of a colour channel (0…1) above which a pixel has changed. Sensor and JPEG noise are smaller."""
+"""Difference of a colour channel ([0, 1]) above which a pixel has changed. Sensor and JPEG noise are smaller."""
 REACH_PIXELS = 5
 """Side of the square marked around a changed pixel. The inside of a plain surface can move without changing."""
 SEEN_PIXELS = 0.02

@@ -37,8 +37,8 @@ RIM = 3
 BARE = 0.5
 """Transmittance above which the state is empty at a pixel."""
 DIFFERENT, TIMES_USUAL = 0.1, 3.0
-"""Minimum channel difference, 0…1, averaged over a square of ``RIM`` × ``RIM`` pixels. Without masks, the second value
-is the minimum ratio of this difference to its median over the image."""
+"""Minimum channel difference, [0, 1], averaged over a square of ``RIM`` × ``RIM`` pixels. Without masks, the second
+value is the minimum ratio of this difference to its median over the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Novelty:
     Attributes:
         view: training view of the frame.
         camera: camera in the internal world.
-        image: [H, W, 3] image in 0…1, with the camera's exposure removed.
+        image: [H, W, 3] image in [0, 1], with the camera's exposure removed.
         new: [H, W] mask of pixels in which the image shows something missing from the state.
         stale: [H, W] mask of pixels in which the state shows something that the image does not show.
         covered: [H, W] mask of pixels in which the state shows a moving object, which may hide something new.

@@ -37,7 +37,8 @@ ROUNDS = 5
 NEAR = 0.02
 """Approximate relative deviation of an inlier from the plane, in inverse depth."""
 CAMERAS, SPREAD = 3, 0.08
-"""Minimum number of cameras that must see a point, and maximum mean absolute colour deviation (0…1) for agreement."""
+"""Minimum number of cameras that must see a point, and maximum mean absolute colour deviation ([0, 1]) for
+agreement."""
 APART = 1.3
 """Spacing of points, in pixels of the camera that sees them best."""
 
@@ -48,7 +49,7 @@ class UncoveredPoints:
 
     Attributes:
         points: [P, 3] positions in the internal world.
-        colours: [P, 3] RGB in 0…1.
+        colours: [P, 3] RGB in [0, 1].
         spacing: approximate distance between neighbouring points, in metres.
     """
 

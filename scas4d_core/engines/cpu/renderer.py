@@ -32,7 +32,7 @@ class CpuRenderer:
     """The CPU implementation of ``Renderer``, which also computes the image and mask losses of iterations.
 
     Args:
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
         image_weight, mask_weight: weights of the image and mask losses.
         mask_moves: whether the mask loss affects positions and shapes in addition to the labels. Masks have hard
             edges, so silhouettes fitted to masks differ from silhouettes fitted to images.
@@ -182,7 +182,7 @@ class CpuRenderer:
         return self.rasterizer.picture
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        """Returns the view's mean colour minus that of its last rendering with exposure applied, RGB in 0…1."""
+        """Returns the view's mean colour minus that of its last rendering with exposure applied, RGB in [0, 1]."""
         height, width = view.camera.height, view.camera.width
         rendered = means(self.rasterizer.planes[:3, :height, :width])
         shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]

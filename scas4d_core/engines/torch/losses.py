@@ -41,7 +41,7 @@ def _blurred(pictures: Tensor) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Returns the SSIM of two images [H, W, C] in 0…1 for every pixel and channel, with zero padding.
+    """Returns the SSIM of two images [H, W, C] in [0, 1] for every pixel and channel, with zero padding.
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> similarity = ssim_map(picture, picture)
@@ -64,7 +64,7 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
 
     Args:
         image: [H, W, C] rendered image. A mask is an image with one channel.
-        target: [H, W, C] target image, in 0…1.
+        target: [H, W, C] target image, in [0, 1].
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> abs(float(image_loss(picture, picture))) < 1e-12
@@ -75,7 +75,7 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Returns the peak signal-to-noise ratio of two images [H, W, C] in 0…1, in dB.
+    """Returns the peak signal-to-noise ratio of two images [H, W, C] in [0, 1], in dB.
 
     >>> truth = torch.zeros(8, 8, 3, dtype=torch.float64)
     >>> round(float(psnr(truth + 0.1, truth)), 6)

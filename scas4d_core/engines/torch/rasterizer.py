@@ -81,7 +81,7 @@ class Rendered(NamedTuple):
 
     Attributes:
         features: [H, W, C] rendered features, including the background.
-        alpha: [H, W] alpha in 0…1, one minus the remaining transmittance.
+        alpha: [H, W] alpha in [0, 1], one minus the remaining transmittance.
         means: [N, 2] projected means, in pixels. Adaptive density control uses their gradient.
         depths: [N] depths along z, in metres.
     """

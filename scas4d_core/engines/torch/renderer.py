@@ -27,7 +27,7 @@ class TorchRenderer:
     """The reference implementation of ``Renderer``.
 
     Args:
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
         limits: rasterizer constants.
     """
 

@@ -26,7 +26,7 @@ COLUMNS = 8
 """Number of columns in the log, which has one row per rendering."""
 IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
 """Columns of the log: weighted image and mask loss, sum of squared RGB differences, colour shift, and tile-list size.
-The colour shift (three columns, RGB in 0…1) is the mean of the training image minus the mean of the rendering, with
+The colour shift (three columns, RGB in [0, 1]) is the mean of the training image minus the mean of the rendering, with
 exposure applied. The size is the number of tile-list entries or, if this exceeds the capacity, the required capacity
 plus a margin."""
 

@@ -183,7 +183,7 @@ def expand_levels(
     Args:
         view: index of the view.
         channels: number of channels of the target.
-        levels: [views, 4, rows, columns] image in 0…255, and mask in 0…1.
+        levels: [views, 4, rows, columns] image in 0…255, and mask in [0, 1].
         targets: [views, 4, rows, columns] output.
     """
     channel, y, x = wp.tid()

@@ -144,7 +144,7 @@ class WarpRenderer:
     The most recently used states stay on the device (``DeviceCopies``), as do the images that an engine has loaded.
 
     Args:
-        background: background colour, RGB in 0…1.
+        background: background colour, RGB in [0, 1].
         limits: rasterizer constants.
         device: Warp device, such as "cpu" or "cuda:0".
         image_weight: weight of the image loss in ``compare``.

@@ -23,7 +23,7 @@ SPACING = 1.5
 """Spacing of neighbouring points, in pixels at the scene centre. The spacing is doubled on the
 background."""
 COLOUR_SPREAD = 0.12
-"""Maximum median deviation between the cameras' colours (0…1) of a point. The limit does not apply
+"""Maximum median deviation between the cameras' colours ([0, 1]) of a point. The limit does not apply
 to points that stereo or features confirm."""
 CROWD = 4
 """Minimum number of candidates within 1.5 cells of a stereo point, or in its cell. Many pixels see

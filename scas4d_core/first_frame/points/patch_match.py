@@ -21,7 +21,7 @@ REACH = 2
 STEP = 2
 """Spacing of the samples in pixels. The 25 samples cover a window that is 9 pixels wide."""
 TEXTURE = 0.012
-"""Minimum standard deviation of a patch (0…1) for a meaningful match. The value is three levels of
+"""Minimum standard deviation of a patch ([0, 1]) for a meaningful match. The value is three levels of
 an 8-bit image."""
 NO_MATCH = 2.0
 """Cost of a patch that cannot be compared. The cost of any other patch is 1 − NCC, between 0 and
@@ -248,7 +248,7 @@ def patch_match(
     """Computes the depth and normal of each pixel of an image.
 
     Args:
-        image: [H, W] float32 grayscale in 0…1.
+        image: [H, W] float32 grayscale in [0, 1].
         active: [H, W] bool, pixels to compute.
         prior: [H, W] float64 depth to try first, or 0 if there is none.
         inverse: [4] float64 inverse intrinsics (1/fx, −cx/fx, 1/fy, −cy/fy).

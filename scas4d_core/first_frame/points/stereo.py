@@ -193,7 +193,7 @@ def depth_maps(
 
 
 def _grey(view: PosedPicture) -> NDArray[np.float32]:
-    """Returns the luma of the image in 0…1, [H, W]."""
+    """Returns the luma of the image in [0, 1], [H, W]."""
     weights = np.array([0.299, 0.587, 0.114], np.float32)
     return np.ascontiguousarray(view.image.astype(np.float32) @ weights / np.float32(255))
 

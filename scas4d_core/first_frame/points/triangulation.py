@@ -68,7 +68,7 @@ def extract_features(
         limit: time limit of frame 0, or None for no limit. If time is short, the images are
             downscaled by a factor of two or four.
         most: maximum number of features per image. The largest features are kept.
-        contrast: minimum difference of Gaussians, for images in 0…1.
+        contrast: minimum difference of Gaussians, for images in [0, 1].
 
     Returns:
         Keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128] of each

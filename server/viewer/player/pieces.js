@@ -12,7 +12,7 @@ function decoded(text) {
 /**
  * Passes the files on, one after the other.
  *
- * @param take (bytes, number)  @param progress (share) 0…1
+ * @param take (bytes, number)  @param progress (share) [0, 1]
  */
 export async function takeFiles(take, progress) {
   const boxes = [...document.querySelectorAll("div.file")];

@@ -77,7 +77,7 @@ export class Painter {
   /**
    * Paints ellipses, farthest first.
    *
-   * @param background [red, green, blue] in 0…1
+   * @param background [red, green, blue] in [0, 1]
    */
   colours(ellipses, count, background) {
     const { gl } = this;

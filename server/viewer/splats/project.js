@@ -30,7 +30,7 @@ export class Projector {
   /**
    * Projects a moment of a scene into the first `count` entries of `ellipses`, farthest first.
    *
-   * @param moment { from, to, share }: states of the frames before and after it (`to` is null at a frame), and share 0…1 of the way
+   * @param moment { from, to, share }: states of the frames before and after it (`to` is null at a frame), and share [0, 1] of the way
    * @param camera camera in the internal world: rows, t, fx, fy, cx, cy, width, height, near in metres
    * @param look { colours [3 N] of the Gaussians, or null for their own; depth: whether z is in place of red; hidden [N] or null }
    */

@@ -47,7 +47,7 @@ export class Splats {
    * Draws a picture, now or after the current one; of several pending requests, only the last is drawn.
    *
    * @param request { place, camera, ahead }: place among the frames, camera in the service's format, and place to decode next; or
-   *   { index, next, share, camera }: index of a frame, index of the next one or null, and the share 0…1 of the way between them
+   *   { index, next, share, camera }: index of a frame, index of the next one or null, and the share [0, 1] of the way between them
    * @param asked returned with the picture
    */
   draw(request, asked = {}) {

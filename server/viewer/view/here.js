@@ -177,7 +177,7 @@ export class Here {
   /**
    * Draws a moment and calls `on.drawn` when it is finished.
    *
-   * @param asked { index, next, share, camera, mode, background, moving }: share 0…1 of the way from one frame to the next
+   * @param asked { index, next, share, camera, mode, background, moving }: share [0, 1] of the way from one frame to the next
    */
   draw(asked) {
     const look = JSON.stringify([asked.mode, asked.background]);

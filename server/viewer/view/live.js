@@ -80,7 +80,7 @@ export class LiveView {
     this.moved(true);
   }
 
-  /** @param background [red, green, blue] in 0…1, or null for the scene's own */
+  /** @param background [red, green, blue] in [0, 1], or null for the scene's own */
   setBackground(background) {
     this.background = background;
     this.moved(true);

@@ -115,5 +115,5 @@ def test_faults_are_named(metric):
         metric(noise(0), noise(0, (24, 30, 3)))
     with pytest.raises(ValueError, match="NaN"):
         metric(np.full((4, 4, 3), np.nan), np.zeros((4, 4, 3)))
-    with pytest.raises(ValueError, match="uint8, or floats in 0…1"):
+    with pytest.raises(ValueError, match=r"uint8, or floats in \[0, 1\]"):
         metric(np.zeros((4, 4, 3), np.int32), np.zeros((4, 4, 3)))

@@ -34,7 +34,7 @@ def camera(number: int) -> Camera:
 
 
 def seen_by(of: Camera, frame: int, fisheye: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W, 3] picture in 0…1 and [H, W] mask; of an equidistant fisheye with the same intrinsics where asked."""
+    """[H, W, 3] picture in [0, 1] and [H, W] mask; of an equidistant fisheye with the same intrinsics where asked."""
     uv = np.stack(np.meshgrid(np.arange(of.width) + 0.5, np.arange(of.height) + 0.5), -1)
     bent = (uv - of.intrinsics[:2, 2]) / of.intrinsics.diagonal()[:2]
     if fisheye:
