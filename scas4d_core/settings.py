@@ -164,8 +164,8 @@ class UpdateSettings(SettingsModel):
     )
     budget_ms: Annotated[float, Field(gt=0, le=3_600_000)] | None = Field(
         None,
-        description="Time budget per frame in milliseconds, including decoding and commit. It determines the number of "
-        "iterations and overrides `iterations`. None means no limit.",
+        description="Time budget per frame in milliseconds, until the new state is in memory. It determines the number "
+        "of iterations and overrides `iterations`. None means no limit.",
     )
     stop_gain: Share = Field(
         0.0,

@@ -30,7 +30,7 @@ class NewFrame:
     """A frame to send in a batch.
 
     Attributes:
-        index: frame index; with `numbering="next"`, only a label for the frame in answers.
+        index: frame index; ignored with `numbering="next"`.
         images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
         masks: PNG mask of each camera, keyed by camera name; empty for no masks.
         time: timestamp in seconds; index / frames_per_second if None.
@@ -105,7 +105,7 @@ def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "give
     """Sends a batch of frames in one request and returns one answer per frame, in order.
 
     A frame that is refused because of its content does not stop the batch; its answer contains the problem. With
-    `numbering="given"`, such a frame is declared missing if the batch continues with the next index.
+    `numbering="given"`, a frame refused with 413 or 422 is declared missing if the batch continues with the next index.
 
     Frames for which the queue had no room are sent again automatically. A batch should therefore be smaller than the
     scene's `ingest.queue_frames`; otherwise, its last frames are transferred several times.

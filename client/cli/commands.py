@@ -166,7 +166,7 @@ def budget(
         float | None,
         typer.Option(
             min=0.001,
-            help="Time budget per frame in ms, including decoding and commit; runs as many iterations as fit.",
+            help="Time budget per frame in ms, until the new state is in memory; runs as many iterations as fit.",
         ),
     ] = None,
     keep_up: Annotated[

@@ -28,7 +28,7 @@ class Budget(Model):
         le=LONGEST_MS,
         allow_inf_nan=False,
         description=(
-            "Milliseconds per frame, including decoding and commit. The update runs as many iterations "
+            "Milliseconds per frame, until the new state is in memory. The update runs as many iterations "
             "as fit, regardless of `iterations`."
         ),
     )

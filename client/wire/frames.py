@@ -58,7 +58,7 @@ class FrameLatency(Model):
     """Latency of a committed frame in seconds, from its acknowledgement to the publication of its commit."""
 
     queue: float = Field(description="From the acknowledgement until the update started.")
-    update: float = Field(description="From then until the new state was in memory.")
+    update: float = Field(description="From then until the new state was in memory, and the previous one on disk.")
     commit: float = Field(description="From then until the state was on disk and the commit was published.")
     total: float = Field(description="Sum of the others.")
 
@@ -290,7 +290,10 @@ class FrameReportModel(Model):
         default_factory=dict, description="Duration of each stage in seconds, keyed by stage name."
     )
     latency: FrameLatency | None = Field(
-        default=None, description="Latency of the frame; null after a restart of the service and for old frames."
+        default=None,
+        description=(
+            "Latency of the frame; null for old frames, and for frames received before the scene last started or woke."
+        ),
     )
     write_seconds: float | None = Field(
         default=None,

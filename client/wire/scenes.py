@@ -247,7 +247,10 @@ class SceneStatus(Model):
     queue_limit: int
     behind_seconds: float = Field(
         default=0.0,
-        description="Seconds since the oldest unfinished frame was received; 0 if there is none, or after a restart.",
+        description=(
+            "Seconds since the oldest unfinished frame was received; 0 if there is none, or if it was received before "
+            "the scene last started or woke."
+        ),
     )
     committed: int = Field(description="Number of committed frames, which can be rendered and tracked.")
     first_committed: int | None

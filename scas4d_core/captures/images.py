@@ -233,7 +233,8 @@ def describe_pictures(files: Mapping[str, Path]) -> list[str]:
         except Exception as fault:
             raise _unreadable(str(path), fault) from fault
         if deep:
-            remarks.append(f"camera {camera!r}: 16-bit images are rounded to 8 bits (value / 257)")
+            grey_or_colour = "rounded (value / 257)" if grey[camera] else "reduced to their high byte"
+            remarks.append(f"camera {camera!r}: 16-bit images are converted to 8 bits, {grey_or_colour}")
     return remarks + mixed_colours(grey)
 
 

@@ -175,7 +175,7 @@ class Subscriber:
             self._put_status(message.id)
         elif message.topic == Topic.FRAMES:
             if self.scene.committed:
-                newest = self.scene.frames[self.scene.committed[-1]].report
+                newest = self.scene.updates.with_latency(self.scene.frames[self.scene.committed[-1]].report)
                 self._put_report(message.id, FrameFinished(newest))
         else:
             live = LIVE[message.topic](message.id, self.scene, self._channel.queries, self.outbox)

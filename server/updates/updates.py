@@ -312,7 +312,7 @@ class Updates:
     def behind_seconds(self) -> float:
         """Seconds since the oldest unfinished frame was received."""
         return self.latencies.behind(
-            [*self._writing, *([] if self._index is None else [self._index]), *self._waiting()]
+            [*self._writing, *([] if self._index is None else [self._index]), *self._ledger.waiting()]
         )
 
     async def _make_room(self) -> None:

@@ -173,7 +173,7 @@ def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path)
     folder = write_rig(tmp_path / "mixed")
     done = scas4d("push", str(folder), "--url", service.url, "--test", "c8", COLUMNS="200")
     assert "2 of 2 frames committed" in done.stdout, done.stderr
-    assert "camera 'c2': 16-bit images are rounded to 8 bits" in done.stdout
+    assert "camera 'c2': 16-bit images are converted to 8 bits" in done.stdout
     with Client(service.url) as client:
         (status,) = client.scenes()
         assert status.cameras == [f"c{number}" for number in range(COUNT - 1)]
