@@ -15,12 +15,12 @@ import httpx
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from client.calls import Call
-from client.calls.frames import RETRIED, NewFrame, SendingBatch
+from client.batches import RETRIED_STATUSES, SendingBatch
+from client.calls import Call, NewFrame
 from client.errors import ServiceError, error_of
 from client.retries import Retries
 from client.sdk import Client
-from client.wire import CameraReceipt, FrameBatch, FrameReceipt, IngestAnswer, frame_chunks
+from client.wire import CameraReceipt, FrameReceipt, IngestAnswer, frame_chunks
 
 ANSWER_S = 130.0
 """Maximum time in seconds to wait for an acknowledgement."""
@@ -78,8 +78,7 @@ class IngestSocket:
         sending = SendingBatch(frames)
         while sending.left:
             chunks = [chunk for frame in sending.left for chunk in frame.chunks()]
-            answers = self._send(chunks, len(sending.left), refusals=True)
-            time.sleep(sending.record(FrameBatch(answers=answers)))
+            time.sleep(sending.record(self._send(chunks, len(sending.left), refusals=True)))
         return sending.answers
 
     def put_camera(
@@ -122,7 +121,7 @@ class IngestSocket:
                 wait = retries.after_connection_error(httpx.ReadError(str(error)))
             else:
                 first = answers[0]
-                if first.receipt is not None or (refusals and first.status not in RETRIED):
+                if first.receipt is not None or (refusals and first.status not in RETRIED_STATUSES):
                     return answers
                 wait = retries.after_response(_as_response(first))
             if wait is None:

@@ -16,8 +16,9 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import httpx
 
 from client import calls
-from client.calls import Call
-from client.calls.frames import NewFrame, Numbering, SendingBatch
+from client.batches import SendingBatch
+from client.calls import Call, NewFrame
+from client.calls.frames import Numbering
 from client.errors import ServiceError
 from client.retries import BUSY_S, OUTAGE_S, OnRetry, Retries
 from client.wire import FINISHED, FrameReportModel, IngestAnswer, SceneState, SceneStatus
@@ -211,7 +212,7 @@ class Client(_ClientBase):
         sending = SendingBatch(frames)
         while sending.left:
             batch = self.send(calls.put_frames(id, sending.left, numbering))
-            time.sleep(sending.record(batch))
+            time.sleep(sending.record(batch.answers))
         return sending.answers
 
     def watch(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> Iterator[SceneStatus]:
@@ -370,7 +371,7 @@ class AsyncClient(_ClientBase):
         sending = SendingBatch(frames)
         while sending.left:
             batch = await self.send(calls.put_frames(id, sending.left, numbering))
-            await asyncio.sleep(sending.record(batch))
+            await asyncio.sleep(sending.record(batch.answers))
         return sending.answers
 
     async def watch(

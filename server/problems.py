@@ -59,6 +59,11 @@ class Problem(HTTPException):
         )
 
 
+def internal_error(error: Exception) -> Problem:
+    """Returns the 500 problem for an unexpected error, which the caller must log."""
+    return Problem(500, f"internal error: {type(error).__name__}", remedy=SERVICE_FAULT)
+
+
 def rig_problem(error: RigError) -> Problem:
     """Returns the problem for an invalid rig or for settings that do not fit the rig."""
     return Problem(422, error.fault, field=error.field, value=error.value, remedy=error.remedy)

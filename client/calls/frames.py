@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -14,14 +14,11 @@ from client.wire import (
     FrameBatch,
     FrameReceipt,
     FrameReportModel,
-    IngestAnswer,
     MissingRequest,
     frame_chunks,
 )
 from client.wire.frames import FrameList
 
-RETRIED = (429, 502, 503, 504, 507)
-"""Status codes of frames that are sent again, as in `client.retries`."""
 Numbering = Literal["given", "next"]
 
 
@@ -44,31 +41,6 @@ class NewFrame:
     def chunks(self) -> list[bytes]:
         """Returns the frame as S4DF, without copying the files."""
         return frame_chunks(self.index, self.images, self.masks, self.time)
-
-
-class SendingBatch:
-    """Frames of a batch that are not answered yet, and the answers to the others.
-
-    Args:
-        frames: the frames, in order.
-
-    Attributes:
-        left: frames that must be sent (again).
-        answers: final answers to the frames before them.
-    """
-
-    def __init__(self, frames: Sequence[NewFrame]) -> None:
-        self.left = list(frames)
-        self.answers: list[IngestAnswer] = []
-
-    def record(self, batch: FrameBatch) -> float:
-        """Records the answers to `left` and returns the seconds to wait before the remaining frames are sent again."""
-        for answer in batch.answers:
-            if answer.status in RETRIED:
-                return float(answer.retry_after or 1)
-            self.answers.append(answer)
-            del self.left[0]
-        return 0.0
 
 
 def put_frame(
@@ -97,7 +69,7 @@ def put_frame(
     >>> client.wait(open_scene, n).state
     <FrameState.COMMITTED: 'committed'>
     """
-    arguments = _framed(index, images, masks or {}, time)
+    arguments = _framed(frame_chunks(index, images, masks, time))
     return Call("PUT", path(id, "frames", index), json_reader(FrameReceipt), arguments=arguments)
 
 
@@ -130,8 +102,7 @@ def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "give
     >>> client.frame(open_scene, n + 1).state
     <FrameState.MISSING: 'missing'>
     """
-    content = b"".join(chunk for frame in frames for chunk in frame.chunks())
-    arguments = {"content": content, "headers": {"Content-Type": FRAME_MEDIA_TYPE}, "params": {"numbering": numbering}}
+    arguments = {**_framed(chunk for frame in frames for chunk in frame.chunks()), "params": {"numbering": numbering}}
     return Call("POST", path(id, "frames"), json_reader(FrameBatch), arguments=arguments)
 
 
@@ -157,7 +128,8 @@ def put_camera(
     >>> client.put_camera(open_scene, n, "c1", pictures["c1"]).absent
     []
     """
-    arguments = _framed(index, {camera: image}, {} if mask is None else {camera: mask}, time, part=True)
+    masks = None if mask is None else {camera: mask}
+    arguments = _framed(frame_chunks(index, {camera: image}, masks, time, part=True))
     return Call("PUT", path(id, "frames", index, "cameras", camera), json_reader(CameraReceipt), arguments=arguments)
 
 
@@ -186,11 +158,9 @@ def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportMo
     return Call("POST", path(id, "frames", index, "missing"), json_reader(FrameReportModel), arguments=arguments)
 
 
-def _framed(
-    index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes], time: float | None, *, part: bool = False
-) -> dict[str, Any]:
-    content = b"".join(frame_chunks(index, images, masks, time, part=part))
-    return {"content": content, "headers": {"Content-Type": FRAME_MEDIA_TYPE}}
+def _framed(chunks: Iterable[bytes]) -> dict[str, Any]:
+    """Returns the request arguments that send S4DF."""
+    return {"content": b"".join(chunks), "headers": {"Content-Type": FRAME_MEDIA_TYPE}}
 
 
 def frame(id: str, index: int) -> Call[FrameReportModel]:

@@ -81,18 +81,13 @@ class ViewFactory:
     def coarser(self, view: TrainingView, scale: float) -> TrainingView:
         """Returns the view with its planes and camera scaled by ``scale``, using area averaging."""
         camera = self.posed[view.name].scaled(scale)
-        rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
-        exact = (rows * camera.height, columns * camera.width) == (view.camera.height, view.camera.width)
-        if exact and rows == columns == 2:  # same values as the mean below, twenty times as fast
+        if (2 * camera.width, 2 * camera.height) == (view.camera.width, view.camera.height):  # much faster
             pairs = view.target[:, :, 0::2] + view.target[:, :, 1::2]
-            quarters = (pairs[:, 0::2] + pairs[:, 1::2]) * np.float32(0.25)
-            return TrainingView(view.name, CameraArrays.of(camera), quarters, view.exposure)
-        target = np.moveaxis(view.target, 0, -1)
-        if exact:
-            small = target.reshape(camera.height, rows, camera.width, columns, -1).mean(axis=(1, 3))
+            planes = (pairs[:, 0::2] + pairs[:, 1::2]) * np.float32(0.25)
         else:
-            small = area_average(target.astype(np.float64), (camera.width, camera.height)).astype(np.float32)
-        planes: Array = np.ascontiguousarray(np.moveaxis(small, -1, 0))
+            target = np.moveaxis(view.target, 0, -1).astype(np.float64)
+            small = area_average(target, (camera.width, camera.height)).astype(np.float32)
+            planes = np.ascontiguousarray(np.moveaxis(small, -1, 0))
         return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure)
 
     def retouched(self, view: TrainingView, target: Array) -> TrainingView:

@@ -14,7 +14,7 @@ from starlette.routing import compile_path
 
 from client.wire import ProblemDetails
 from server.http import validation
-from server.problems import SERVICE_FAULT, Problem, openapi_document, problem_response
+from server.problems import Problem, internal_error, openapi_document, problem_response
 
 JSON = re.compile(r"application/([\w.-]+\+)?json")
 
@@ -58,7 +58,7 @@ def install_handlers(app: FastAPI) -> None:
 
     async def from_fault(request: Request, error: Exception) -> Response:
         log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
-        return problem_response(Problem(500, f"internal error: {type(error).__name__}", remedy=SERVICE_FAULT).document)
+        return problem_response(internal_error(error).document)
 
     app.openapi = lambda: openapi_document(app)  # type: ignore[method-assign]
     app.add_exception_handler(HTTPException, from_problem)

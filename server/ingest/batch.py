@@ -20,7 +20,7 @@ from client.wire import FrameHead, FrameReceipt, IngestAnswer
 from server.ingest.camera_files import FormFields, contents, form_frame, form_limits
 from server.ingest.open_frames import OpenFrames
 from server.ingest.receive import BodyReader, files_size, read_head, receive_files
-from server.problems import SERVICE_FAULT, Problem
+from server.problems import Problem, internal_error
 
 log = logging.getLogger("scas4d.server")
 
@@ -121,7 +121,7 @@ class Batch:
             self.refuse(head.index, problem)
         except Exception as error:
             log.exception("scene %s: receiving a frame of a batch failed", self._ingest.ledger.scene)
-            self.stopped = Problem(500, f"internal error: {type(error).__name__}", remedy=SERVICE_FAULT)
+            self.stopped = internal_error(error)
             self.answers.append(refusal(head.index, self.stopped))
         else:
             self.answers.append(IngestAnswer(index=head.index, status=202, receipt=receipt))

@@ -20,6 +20,7 @@ from server.ingest.receive import (
     check_length,
     drain,
     frame_receiver,
+    in_one_piece,
     read_files,
     read_head,
     receive_files,
@@ -126,7 +127,7 @@ async def receive_file(
     head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
     frames.check_head(head, camera)
     receiving = frame_receiver(ingest, head, time, keep=index >= ingest.ledger.next_frame)
-    await read_files(BodyReader(_one(data)), receiving, ends_body=True)
+    await read_files(BodyReader(in_one_piece(data)), receiving, ends_body=True)
     return await accept_or_remove(receiving, lambda received: frames.accept(head, camera, received))
 
 
@@ -170,10 +171,6 @@ def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: b
 def _file(field: str, size: int) -> FrameFile:
     kind = FileKind.MASK if field.startswith(MASK) else FileKind.IMAGE
     return FrameFile(camera=field.removeprefix(MASK), kind=kind, size=size)
-
-
-async def _one(data: bytearray) -> AsyncIterator[bytes]:
-    yield bytes(data)
 
 
 def _only_camera(head: FrameHead, camera: str | None) -> str:

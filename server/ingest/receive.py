@@ -190,6 +190,11 @@ class BodyReader:
         await drain(self._chunks)
 
 
+async def in_one_piece(data: bytes | bytearray) -> AsyncIterator[bytes]:
+    """Yields a body that has already been received."""
+    yield bytes(data)
+
+
 async def read_head(reader: BodyReader) -> FrameHead:
     """Reads the prefix and the header of a frame in the format of `client.wire.framing`.
 

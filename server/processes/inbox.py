@@ -28,12 +28,10 @@ class Inbox:
         self._messages: queue.Queue[Any] = queue.Queue()
         self._stopped = threading.Event()
         self.failed: BaseException | None = None
-        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Starts to receive."""
-        self._thread = threading.Thread(target=self._receive, daemon=True, name="inbox")
-        self._thread.start()
+        threading.Thread(target=self._receive, daemon=True, name="inbox").start()
 
     @property
     def waiting(self) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
@@ -25,8 +24,8 @@ from server.connections.websocket import limit_messages
 from server.ingest.batch import Numbering, receive_batch, refusal
 from server.ingest.camera_files import receive_camera
 from server.ingest.pictures import largest_frame
-from server.ingest.receive import files_size, framing_problem, receive_frame
-from server.problems import SERVICE_FAULT, Problem
+from server.ingest.receive import files_size, framing_problem, in_one_piece, receive_frame
+from server.problems import Problem, internal_error
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
@@ -138,7 +137,7 @@ def _is_one_frame(head: FrameHead, data: bytes) -> bool:
 async def _take(scene: Scene, numbering: Numbering, head: FrameHead | Problem, data: bytes) -> list[IngestAnswer]:
     if isinstance(head, Problem):
         return [refusal(None, head)]
-    body, size = _one(data), len(data)
+    body, size = in_one_piece(data), len(data)
     try:
         receipt: FrameReceipt | CameraReceipt
         if head.single_camera:
@@ -154,9 +153,4 @@ async def _take(scene: Scene, numbering: Numbering, head: FrameHead | Problem, d
         raise
     except Exception as error:
         log.exception("scene %s: receiving a frame over the WebSocket failed", scene.id)
-        detail = f"internal error: {type(error).__name__}"
-        return [refusal(head.index, Problem(500, detail, remedy=SERVICE_FAULT))]
-
-
-async def _one(data: bytes) -> AsyncIterator[bytes]:
-    yield data
+        return [refusal(head.index, internal_error(error))]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -130,7 +130,7 @@ class Updates:
     @property
     def at_work(self) -> bool:
         """Whether the worker is processing a frame."""
-        return (self._index is not None or bool(self._writing)) and self.worker.ready
+        return bool(self._unfinished) and self.worker.ready
 
     @property
     def has_work(self) -> bool:
@@ -140,7 +140,12 @@ class Updates:
         """
         mending = self._repair_queue.at_work is not None or self._repair_queue.current_repair is not None
         waits = bool(self._pauses or self._waiting()) or self._rule is not None or self.worker.starts_again
-        return self._index is not None or bool(self._writing) or waits or mending
+        return bool(self._unfinished) or waits or mending
+
+    @property
+    def _unfinished(self) -> list[int]:
+        """Frames that the worker is writing or updating, oldest first."""
+        return self._writing if self._index is None else [*self._writing, self._index]
 
     def _waiting(self) -> list[int]:
         ledger = self._ledger
@@ -168,8 +173,7 @@ class Updates:
             if self._repair_queue.waiting and (seconds := self._repair_queue.begin()) > 0:
                 self._begin_in(seconds)
             return
-        index = waiting[0]
-        message = self._frame_ready(index)
+        index, message = waiting[0], self._first_ready(waiting)
         ledger.set_state(index, FrameState.UPDATING)
         self._index, self._announced = index, None
         self.clock.begin(first=not ledger.committed)
@@ -178,12 +182,13 @@ class Updates:
         self._announce_next()
         self._publisher.publish_status()
 
-    def _frame_ready(self, index: int) -> FrameReady:
+    def _first_ready(self, waiting: Sequence[int]) -> FrameReady:
+        """Returns the message for the first of the waiting frames."""
+        index = waiting[0]
         entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        waiting = sum(other > index for other in self._waiting())
-        budget = with_time_limit(self._ledger.budget_of(index), waiting)
+        budget = with_time_limit(self._ledger.budget_of(index), len(waiting) - 1)
         return FrameReady(index, receipt.time, entry.files, receipt.identity, budget)
 
     def _announce_next(self) -> None:
@@ -191,7 +196,7 @@ class Updates:
         waiting = self._waiting() if self.worker.ready and not self._pauses else []
         if waiting and waiting[0] != self._announced:
             self._announced = waiting[0]
-            self.worker.send(DecodeAhead(self._frame_ready(waiting[0])))
+            self.worker.send(DecodeAhead(self._first_ready(waiting)))
 
     def _begin_in(self, seconds: float) -> None:
         if self._repair_timer is not None:
@@ -311,9 +316,7 @@ class Updates:
     @property
     def behind_seconds(self) -> float:
         """Seconds since the oldest unfinished frame was received."""
-        return self.latencies.behind(
-            [*self._writing, *([] if self._index is None else [self._index]), *self._ledger.waiting()]
-        )
+        return self.latencies.behind([*self._unfinished, *self._ledger.waiting()])
 
     async def _make_room(self) -> None:
         if self._ledger.open and self._room_made is not None:
@@ -396,7 +399,7 @@ class Updates:
         self._background.run(self._retry_or_fail(reason, own, delay))
 
     async def _retry_or_fail(self, reason: ProcessExit, own: bool, delay: float) -> None:
-        at_work = [*self._writing, *([] if self._index is None else [self._index])]
+        at_work = self._unfinished
         self._index, self._announced, self._writing = None, None, []
         queued = [index for index in at_work if self._ledger.frames[index].state == FrameState.UPDATING]
         for index in queued:

@@ -128,7 +128,7 @@ def measure(
     }
     latency = []
     for index in range(last, last + count):
-        _put(service, scene, index, frames, wait=False)
+        _put(service, scene, index, frames)
         sent = time.monotonic()
         while index not in commits:
             time.sleep(0.0005)
@@ -137,7 +137,7 @@ def measure(
     return LiveResult((count - 1) / (times[-1] - times[0]), sorted(latency), stages)
 
 
-def _put(service: Service, scene: str, index: int, frames: Sequence[Mapping[str, bytes]], wait: bool = True) -> None:
+def _put(service: Service, scene: str, index: int, frames: Sequence[Mapping[str, bytes]]) -> None:
     while True:
         answer = service.put(scene, index, frames[ping_pong(index, len(frames))], {})
         if answer.is_success:

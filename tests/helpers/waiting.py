@@ -10,6 +10,16 @@ HANG_S = 300.0
 """Whatever takes longer hangs: many times what anything here takes on a slow machine with other work."""
 
 
+class Hand:
+    """A clock that is set by hand."""
+
+    def __init__(self, at=0.0):
+        self.at = at
+
+    def __call__(self):
+        return self.at
+
+
 def wait_for(condition: Callable[[], object]) -> None:
     """Returns once a condition holds."""
     until = time.monotonic() + HANG_S

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from waiting import Hand
 
 from server.updates.latency import FRAMES_KEPT, Latencies
 
 
-class Clock:
-    """A clock that is set by hand."""
-
-    def __init__(self):
-        self.at = 0.0
-
-    def __call__(self):
-        return self.at
-
-
 @pytest.fixture
 def clock():
-    return Clock()
+    return Hand()
 
 
 @pytest.fixture

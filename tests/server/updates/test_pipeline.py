@@ -41,6 +41,14 @@ def send(http, id, index, red):
     assert answer.status_code == 202, answer.text
 
 
+def begun(http):
+    """A new scene whose frame 0 is committed."""
+    id = create(http)
+    send(http, id, 0, 0)
+    finished(http, id, 0)
+    return id
+
+
 def state_of(http, id, index):
     return http.get(f"/v1/scenes/{id}/frames/{index}").json()["state"]
 
@@ -51,9 +59,7 @@ def worker_pid(running, id):
 
 def test_the_next_frame_is_updated_before_the_last_one_is_written(served, go_on):
     _, http = served
-    id = create(http)
-    send(http, id, 0, 0)
-    finished(http, id, 0)
+    id = begun(http)
     for index, red in ((1, fakes.WRITES_LATE), (2, 7), (3, 8)):
         send(http, id, index, red)
     wait_for(lambda: state_of(http, id, 2) == "updating")
@@ -74,9 +80,7 @@ def test_the_next_frame_is_updated_before_the_last_one_is_written(served, go_on)
 
 def test_a_crash_while_a_state_is_written_repeats_both_frames(served, go_on):
     running, http = served
-    id, undisturbed = create(http), create(http)
-    send(http, id, 0, 0)
-    finished(http, id, 0)
+    id, undisturbed = begun(http), create(http)
     for index, red in ((1, fakes.WRITES_LATE), (2, 7), (3, 8)):
         send(http, id, index, red)
     wait_for(lambda: state_of(http, id, 2) == "updating")
@@ -97,9 +101,7 @@ def test_a_crash_while_a_state_is_written_repeats_both_frames(served, go_on):
 
 def test_a_state_that_cannot_be_written_fails_its_frame_and_no_other(served):
     _, http = served
-    id = create(http)
-    send(http, id, 0, 0)
-    finished(http, id, 0)
+    id = begun(http)
     for index, red in ((1, fakes.CANNOT_BE_WRITTEN), (2, 7), (3, 8)):
         send(http, id, index, red)
     assert finished(http, id, 1)["state"] == "failed"
@@ -109,9 +111,7 @@ def test_a_state_that_cannot_be_written_fails_its_frame_and_no_other(served):
 
 def test_frames_that_fail_are_reported_after_the_frame_before_them(served, go_on):
     _, http = served
-    id = create(http)
-    send(http, id, 0, 0)
-    finished(http, id, 0)
+    id = begun(http)
     send(http, id, 1, fakes.WRITES_LATE)
     send(http, id, 2, fakes.RAISES)
     wait_for(lambda: state_of(http, id, 2) == "updating")
@@ -123,9 +123,7 @@ def test_frames_that_fail_are_reported_after_the_frame_before_them(served, go_on
 
 def test_a_worker_that_is_stopped_finishes_its_write(served, go_on):
     _, http = served
-    id = create(http)
-    send(http, id, 0, 0)
-    finished(http, id, 0)
+    id = begun(http)
     send(http, id, 1, 5)
     finished(http, id, 1)
     assert http.post(f"/v1/scenes/{id}/sleep").status_code == 200

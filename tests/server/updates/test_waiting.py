@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 from running import make_rig
+from waiting import Hand
 
 from scas4d_core.presets import preset
 from server.messages import SceneSpec
@@ -16,19 +17,9 @@ from server.updates.worker_process import WorkerProcess
 from studies.simulation.clock import run_virtual
 
 
-class Hand:
-    """A clock that is set by hand."""
-
-    def __init__(self):
-        self.at = 100.0
-
-    def __call__(self):
-        return self.at
-
-
 @pytest.fixture
 def hand():
-    return Hand()
+    return Hand(100.0)
 
 
 @pytest.fixture
