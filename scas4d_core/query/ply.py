@@ -119,7 +119,8 @@ def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
         name: name of the file for error messages, or None to use the path.
 
     Raises:
-        PlyError: if the file is not a splat file, or a property is missing.
+        PlyError: if the file is not a splat file, a property is missing, or a row has a non-finite value or a
+            rotation of length 0.
 
     >>> read_ply("README.md")
     Traceback (most recent call last):
@@ -135,13 +136,23 @@ def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
         return np.stack([table[name] for name in names], axis=-1)
 
     rotations = columns("rot_0", "rot_1", "rot_2", "rot_3")
-    return Splats(
-        means=columns("x", "y", "z"),
-        scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
-        rotations=rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
-        opacities=1 / (1 + np.exp(-table["opacity"])),
-        colours=0.5 + SH_DEGREE_0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
-    )
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        read = Splats(
+            means=columns("x", "y", "z"),
+            scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
+            rotations=rotations / np.linalg.norm(rotations, axis=1, keepdims=True),
+            opacities=1 / (1 + np.exp(-table["opacity"])),
+            colours=0.5 + SH_DEGREE_0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        )
+    values = np.column_stack([read.means, read.scales, read.rotations, read.opacities, read.colours])
+    rows = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if rows.size:
+        raise PlyError(
+            f"{name or source} has {rows.size} Gaussians with non-finite values or rotations of length 0: "
+            f"rows {rows[:5].tolist()}{' …' if rows.size > 5 else ''}",
+            "export the file again, or remove these rows",
+        )
+    return read
 
 
 def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:

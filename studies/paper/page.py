@@ -153,12 +153,6 @@ def needed() -> list[Variant]:
     return list(dict.fromkeys(side.variant for experiment in EXPERIMENTS for side in experiment.sides))
 
 
-def _word(outcome: ClaimResult) -> str:
-    if outcome.agrees == "no":
-        return "does not agree"
-    return f"agrees in {outcome.agrees}"
-
-
 def _cell(own: float | None, paper: float | None, digits: int) -> str:
     mine = "–" if own is None else f"{own:.{digits}f}"
     return mine if paper is None else f"{mine} ({paper:g})" if digits != 2 else f"{mine} ({paper:.2f})"

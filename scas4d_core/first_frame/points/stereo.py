@@ -17,7 +17,7 @@ from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved, pixels
 WIDTH = 320
 """Maximum image width, in pixels. Wider images are halved repeatedly."""
 PACE_WIDTH = 80
-"""Maximum width of the image on which the pace is measured. The measurement takes a thirtieth of
+"""Maximum width of the image on which the pace is measured. The measurement takes a few percent of
 the work for one image."""
 PLANES_FIRST, PLANES_EACH = 3, 12
 """Number of planes tried per pixel, initially and in each round (``patch_match``)."""

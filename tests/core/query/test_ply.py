@@ -107,6 +107,19 @@ def test_bad_rows_are_named_and_nothing_is_written(tmp_path):
         read_ply(tmp_path / "not.ply")
 
 
+@pytest.mark.parametrize(
+    ("column", "value"), [("x", np.nan), ("scale_1", 1e5), ("opacity", np.nan), ("f_dc_2", np.inf), ("rot", 0)]
+)
+def test_files_with_unusable_rows_are_refused(tmp_path, column, value):
+    write_ply(tmp_path / "frame.ply", state(random_factors(6)), WORLD)
+    file = PlyData.read(str(tmp_path / "frame.ply"))
+    for name in ("rot_0", "rot_1", "rot_2", "rot_3") if column == "rot" else (column,):
+        file["vertex"][name][[1, 4]] = value
+    file.write(str(tmp_path / "bad.ply"))
+    with pytest.raises(PlyError, match=r"bad\.ply has 2 Gaussians with non-finite .* rows \[1, 4\]"):
+        read_ply(tmp_path / "bad.ply")
+
+
 def test_retired_ones_are_left_out(tmp_path):
     theta = state(random_factors(6))
     write_ply(tmp_path / "frame.ply", theta.retire([1, 4]), WORLD)
