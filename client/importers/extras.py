@@ -25,7 +25,7 @@ def load(module: str, *, needed: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as fault:
-        packages = {"cv2": "OpenCV (opencv-python-headless)", "av": "PyAV (av)"}
+        packages = {"cv2": "OpenCV (opencv-python-headless)", "av": "PyAV (av)", "yaml": "PyYAML (pyyaml)"}
         raise MissingExtraError(
             f"{needed} requires {packages.get(module, module)}, which cannot be imported ({fault}); {INSTALL}"
         ) from fault

@@ -6,24 +6,23 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from client.importers.calibration import Calibration
-from client.importers.formats.colmap import is_model, read_colmap
-from client.importers.formats.find import (
-    READ,
-    find_calibrations,
-    is_calibration,
-    read_calibration_file,
-    single_calibration,
+from client.importers.calibration import Calibration, listed
+from client.importers.folders import compare, find_source, picture_sources
+from client.importers.formats.find import read_calibration
+from client.importers.pictures import (
+    PictureFiles,
+    frame_folders,
+    frames_of_cameras,
+    frames_of_folders,
+    masks_of,
+    named_files,
 )
-from client.importers.formats.nerfstudio import FILE, read_transforms
-from client.importers.pictures import PictureFiles, folders_of, named_files
 from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fit_to_pictures
-from client.importers.videos import ENDS, Videos, find_videos
+from client.importers.videos import Videos
 from scas4d_core.captures import Capture, CaptureError, SizeMismatch, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
 from scas4d_core.rig_checks import pose_warnings
 
-COLMAP_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap", "calibration")
 PicturesFrom = Literal["images", "videos", "named"]
 
 
@@ -112,10 +111,11 @@ def open_source(
             )
         given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, size_mismatch=size_mismatch)
     else:
-        given = _imported(
-            folder, read_calibration(folder, calibration), pictures, fps, encoding, use_masks, size_mismatch
-        )
+        found = read_calibration(folder, calibration)
+        given = _imported(folder, found, pictures, fps, encoding, use_masks, size_mismatch)
         given = given if use_points else replace(given, points=None)
+        names = {label: name for name, label in found.labels.items()}
+        test = tuple(names.get(name, name) for name in test)
     suspicions = pose_warnings(given.full_rig, None if given.points is None else given.points.positions)
     given = replace(given, remarks=(*given.remarks, *suspicions))
     return given.with_held_out(test).scaled(image_scale)
@@ -130,10 +130,10 @@ def _imported(
     use_masks: bool,
     size_mismatch: SizeMismatch | None,
 ) -> Capture:
-    raw = _pictures(folder, found, pictures)
+    found, raw = _pictures(folder, found, pictures)
     found, resized = fit_to_pictures(found, raw, size_mismatch)
     masks = folder / "masks"
-    files = tuple(folders_of(masks, found, what="masks")) if use_masks and masks.is_dir() else ()
+    files = masks_of(masks, found) if use_masks and masks.is_dir() else {}
     if files and isinstance(raw, PictureFiles):
         raw.check_same_frames(files)
     elif files and len(files) != raw.frame_count:
@@ -141,7 +141,7 @@ def _imported(
             f"{masks} contains masks for {len(files)} of {raw.frame_count} frames; add one for every image, "
             "or use --no-masks"
         )
-    reader = ImportedPictures(found, raw, masks=files, encoding=encoding)
+    reader = ImportedPictures(found, raw, masks=list(files.values()), encoding=encoding)
     capture = Capture(
         folder.resolve().name,
         reader.rig,
@@ -149,93 +149,48 @@ def _imported(
         reader,
         fps=fps or raw.fps or found.fps or 30.0,
         points=found.points,
-        remarks=(*found.remarks, *resized, *uncalibrated_remark(folder, found), *reader.remarks),
+        remarks=(*found.remarks, *resized, *reader.remarks),
     )
     check_times(capture.name, [capture.time(index) for index in range(capture.frame_count)])
-    return capture
+    return capture.with_held_out(found.test)
 
 
-def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
-    """Reads the given calibration, or searches the folder for one.
+def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> tuple[Calibration, RawReader]:
+    """Returns a reader for the images, and the calibration without cameras that have none."""
+    several = min(len(views) for views in calibration.views.values()) > 1
+    source = None if wanted == "named" or (wanted is None and several) else find_source(folder, calibration, wanted)
+    if source is None:
+        return calibration, _named(folder, calibration, wanted)
+    on_disk = source.names_of(calibration)
+    if source.kind == "frames" and any(calibration.views.values()) and len(frame_folders(source.root, on_disk)) == 1:
+        return calibration, named_files(folder, calibration)  # the images that were used to calibrate
+    calibration = compare(source, calibration)
+    if source.kind == "frames":
+        return calibration, PictureFiles(calibration, frames_of_folders(source.root, on_disk))
+    files = {camera: source.entries[name] for camera, name in on_disk.items()}
+    if source.kind == "images":
+        folders = {camera: paths[0] for camera, paths in files.items()}
+        return calibration, PictureFiles(calibration, frames_of_cameras(source.root, folders))
+    for paths in files.values():
+        if len(paths) > 1:
+            raise CaptureError(
+                f"{source.root} contains {paths[0].name} and {paths[1].name} for the same camera; keep only one of them"
+            )
+    return calibration, Videos(calibration, {camera: paths[0] for camera, paths in files.items()})
 
-    The search order is transforms.json, a COLMAP model in one of the usual places, then a single file of another tool.
 
-    Raises:
-        CaptureError: if there is no calibration, there are several, or the calibration cannot be read.
-        MissingExtraError: if the format needs a package from the extra `importers`.
-    """
-    if given is not None:
-        if given.is_file() and given.suffix == ".json":
-            return read_transforms(given)
-        if given.is_dir() and is_model(given):
-            return read_colmap(given)
-        if is_calibration(given):
-            return read_calibration_file(given, folder)
-        raise CaptureError(f"{given} is neither a transforms.json, nor a COLMAP model folder, nor {READ}")
-    others = find_calibrations(folder)
-    if (folder / FILE).is_file():
-        return _with_unread_remark(others, folder, read_transforms(folder / FILE))
-    for name in COLMAP_FOLDERS:
-        if is_model(folder / name):
-            return _with_unread_remark(others, folder, read_colmap(folder / name))
-    if others:
-        return read_calibration_file(single_calibration(others, folder), folder)
+def _named(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> PictureFiles:
+    if wanted in (None, "named") and any(calibration.views.values()):
+        return named_files(folder, calibration)
+    there = [
+        f"{source.root.name}/ contains {listed(list(source.entries))}"
+        for source in picture_sources(folder)
+        if source.own and source.kind != "frames"
+    ]
+    lists = "" if any(calibration.views.values()) else f", and {calibration.source.name} lists no images"
     raise CaptureError(
-        f"{folder}: unknown capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), no "
-        f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}, nor, here or in calibration/, {READ}; "
-        "choose the calibration with --calibration"
+        f"{folder} contains no {wanted if wanted in ('images', 'videos') else 'images or videos'} of the cameras "
+        f"{listed([calibration.label(name) for name in calibration.names])}{lists}"
+        f"{''.join(f'; {text}' for text in there)}; put each camera's images in images/<camera>/ or its video in "
+        "videos/<camera>.mp4"
     )
-
-
-def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) -> Calibration:
-    """Returns the calibration with a remark that lists the other calibrations in the folder, which are not read."""
-    if not others:
-        return found
-    listed = ", ".join(str(path.relative_to(folder)) for path in others)
-    remark = (
-        f"using calibration {found.source.relative_to(folder)}, not {listed}; choose another with --calibration FILE"
-    )
-    return replace(found, remarks=(*found.remarks, remark))
-
-
-def uncalibrated_remark(folder: Path, calibration: Calibration) -> list[str]:
-    """Returns a remark that lists cameras with images or a video but no calibration; empty if there are none."""
-    images, videos = folder / "images", folder / "videos"
-    there = {path.name for path in images.iterdir() if path.is_dir()} if images.is_dir() else set[str]()
-    if not there and videos.is_dir():
-        there = {path.stem for path in videos.iterdir() if path.suffix.lower() in ENDS}
-    unknown = there.difference(calibration.names, calibration.left_out)
-    left = sorted(name for name in unknown if not name.startswith("."))
-    if not left or not there.intersection(calibration.names):  # otherwise these folders are not cameras
-        return []
-    return [f"skipped cameras that are not in {calibration.source.name}: {', '.join(left)}"]
-
-
-def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> RawReader:
-    images, videos = folder / "images", folder / "videos"
-    has_images = images.is_dir() and any(path.is_dir() for path in images.iterdir())
-    if wanted == "named" or (wanted is None and min(len(views) for views in calibration.views.values()) > 1):
-        return _named(folder, calibration)
-    if wanted is None and has_images and videos.is_dir():
-        raise CaptureError(
-            f"{folder} contains images/ and videos/; choose one with --pictures images or --pictures videos"
-        )
-    if wanted == "images" or (wanted is None and has_images):
-        if not images.is_dir():
-            raise CaptureError(f"{images}: no such folder; put each camera's images in images/<camera>/")
-        return PictureFiles(calibration, folders_of(images, calibration))
-    if wanted == "videos" or (wanted is None and videos.is_dir()):
-        if not videos.is_dir():
-            raise CaptureError(f"{videos}: no such folder; put each camera's video in videos/<camera>.mp4")
-        return Videos(calibration, find_videos(videos, calibration))
-    return _named(folder, calibration)
-
-
-def _named(folder: Path, calibration: Calibration) -> PictureFiles:
-    if not any(calibration.views.values()):
-        raise CaptureError(
-            f"{folder} contains neither images/ nor videos/, and {calibration.source.name} lists no images; put "
-            "each camera's images in images/<camera>/ or its video in videos/<camera>.mp4 (cameras: "
-            f"{', '.join(calibration.names)})"
-        )
-    return PictureFiles(calibration, *named_files(folder, calibration))

@@ -1,15 +1,16 @@
-"""Frames from image files: one folder per camera, or files listed in the calibration. Requires only numpy and Pillow.
+"""Frames from image files: in folders of cameras or frames, or listed in the calibration. Needs only numpy and Pillow.
 
 The frames in ``images/<camera>/<frame>.jpg`` are in natural order of their names. All images of a frame have the same
-name, but may have different extensions.
+name, but may have different extensions, and may start with the name of their camera (``<camera>_<frame>.jpg``).
 """
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from client.importers.calibration import Calibration, natural
+from client.importers.calibration import PICTURE_SUFFIXES, Calibration, listed, natural
 from client.importers.source import Picture
 from scas4d_core.captures import CaptureError, ImageError, decode_image
 from scas4d_core.captures.images import describe_pictures, picture_size
@@ -17,8 +18,10 @@ from scas4d_core.captures.images import describe_pictures, picture_size
 SENT = (".jpg", ".jpeg", ".png", ".webp")
 """Extensions that the service accepts without re-encoding."""
 READ = (*SENT, ".bmp")
-PICTURE_LIKE = (*READ, ".tif", ".tiff", ".exr", ".dng", ".raw", ".heic", ".gif", ".jp2", ".avif")
 SHOWN = 3
+
+Frames = Mapping[str, Mapping[str, Path]]
+"""Image files of each frame in order, keyed by the name of the frame and by camera name."""
 
 
 class PictureFiles:
@@ -26,8 +29,9 @@ class PictureFiles:
 
     Args:
         calibration: calibration of the cameras.
-        files: image files of each frame [T], keyed by camera name.
+        files: image files of each frame, keyed by the name of the frame and by camera name.
         times: time of each frame in seconds; empty if unknown.
+        remarks: messages for the user.
 
     Raises:
         CaptureError: if the first image of a camera cannot be read.
@@ -35,14 +39,17 @@ class PictureFiles:
 
     fps: float | None = None
 
-    def __init__(self, calibration: Calibration, files: Sequence[Mapping[str, Path]], times: Sequence[float] = ()):
-        self._files = files
+    def __init__(
+        self, calibration: Calibration, files: Frames, times: Sequence[float] = (), remarks: Sequence[str] = ()
+    ) -> None:
+        self._files = list(files.values())
+        self._names = list(files)
         self._times = times
         self.frame_count = len(files)
-        first = {camera: files[0][camera] for camera in calibration.names}
+        first = {camera: self._files[0][camera] for camera in calibration.names}
         try:
             self.sizes = {camera: picture_size(path) for camera, path in first.items()}
-            self.remarks = describe_pictures(first)
+            self.remarks = [*remarks, *describe_pictures(first)]
         except ImageError as fault:
             raise CaptureError(str(fault)) from fault
 
@@ -63,71 +70,124 @@ class PictureFiles:
         """Returns the decoded image [H, W, 3] of a camera and frame."""
         return decode_image(self._files[index][camera], size=self.sizes[camera])
 
-    def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
+    def check_same_frames(self, masks: Frames) -> None:
         """Checks that masks and images have the same frame names.
 
         Raises:
             CaptureError: if an image has no mask, or a mask has no image.
         """
-        for index in range(max(len(masks), len(self._files))):
-            picture = next(iter(self._files[index].values())) if index < len(self._files) else None
-            mask = next(iter(masks[index].values())) if index < len(masks) else None
-            if picture is None or mask is None or picture.stem != mask.stem:
+        given = list(masks)
+        for index in range(max(len(given), len(self._names))):
+            frame = self._names[index] if index < len(self._names) else None
+            mask = given[index] if index < len(given) else None
+            if frame is None or mask is None or frame != mask:
+                picture = None if frame is None else next(iter(self._files[index].values()))
                 raise CaptureError(
-                    f"frame {index}: its image is {picture}, but its mask is {mask}; name each mask like its image and "
+                    f"frame {index}: its image is {picture}, but its mask is "
+                    f"{None if mask is None else next(iter(masks[mask].values()))}; name each mask like its image and "
                     "add one for every image, or use --no-masks"
                 )
 
 
-def folders_of(root: Path, calibration: Calibration, *, what: str = "images") -> list[dict[str, Path]]:
-    """Returns the files in ``root/<camera>/`` for each frame [T], keyed by camera name.
+def frames_of_cameras(root: Path, folders: Mapping[str, Path], *, what: str = "images") -> dict[str, dict[str, Path]]:
+    """Returns the files in one folder per camera, keyed by the name of the frame and by camera name.
+
+    Args:
+        root: folder that contains the folders.
+        folders: folder of each camera, keyed by camera name.
+        what: kind of the files, for messages.
 
     Raises:
-        CaptureError: if a camera has no folder, or a frame is missing from some of the folders.
+        CaptureError: if a folder is empty, or a frame is missing from some of the folders.
     """
-    by_camera: dict[str, dict[str, Path]] = {}
-    for camera in calibration.names:
-        folder = root / camera
-        if not folder.is_dir():
-            there = sorted((path.name for path in root.iterdir() if path.is_dir()), key=natural)
-            raise CaptureError(
-                f"{folder}: no such folder, although {calibration.source} has a camera {camera!r}; {root.name}/ "
-                f"contains {_some(there) or 'no folders'}; name each folder after its camera"
-            )
-        by_camera[camera] = _pictures_in(folder)
-        if not by_camera[camera]:
-            raise CaptureError(f"{folder} contains no {what}; supported file types: {', '.join(READ)}")
+    by_camera = {camera: _pictures_in(folder) for camera, folder in folders.items()}
+    for camera, files in by_camera.items():
+        if not files:
+            raise CaptureError(f"{folders[camera]} contains no {what}; supported file types: {', '.join(READ)}")
     frames = sorted({frame for files in by_camera.values() for frame in files}, key=natural)
     for camera, files in by_camera.items():
         missing = [frame for frame in frames if frame not in files]
         if missing:
             others = next(name for name, paths in by_camera.items() if missing[0] in paths)
             raise CaptureError(
-                f"{root / camera} has no {what} for {len(missing)} of {len(frames)} frames ({_some(missing)}), but "
+                f"{folders[camera]} has no {what} for {len(missing)} of {len(frames)} frames ({_some(missing)}), but "
                 f"{others!r} has them; the files of a frame must have the same name in all camera folders"
             )
-    return [{camera: files[frame] for camera, files in by_camera.items()} for frame in frames]
+    return {frame: {camera: files[frame] for camera, files in by_camera.items()} for frame in frames}
+
+
+def frames_of_folders(root: Path, stems: Mapping[str, str]) -> dict[str, dict[str, Path]]:
+    """Returns the images in one folder per frame, ``root/<frame>/<camera>.jpg``.
+
+    Args:
+        root: folder that contains the folders of the frames.
+        stems: file name of each camera's images without extension, keyed by camera name.
+
+    Raises:
+        CaptureError: if an image is missing.
+    """
+    frames = frame_folders(root, stems)
+    for frame, files in frames.items():
+        missing = [name for camera, name in stems.items() if camera not in files]
+        if missing:
+            raise CaptureError(
+                f"{root / frame} has no image of {listed(missing)}; every frame needs an image of each camera"
+            )
+    return frames
+
+
+def frame_folders(root: Path, stems: Mapping[str, str]) -> dict[str, dict[str, Path]]:
+    """Returns the images of the given cameras in each folder that contains any, in natural order of the folders."""
+    frames = {}
+    for folder in sorted((path for path in root.iterdir() if path.is_dir()), key=lambda path: natural(path.name)):
+        files = {_normal(path.stem): path for path in _pictures_in(folder).values()}
+        there = {camera: files[name] for camera, name in stems.items() if name in files}
+        if there:
+            frames[folder.name] = there
+    return frames
+
+
+def masks_of(root: Path, calibration: Calibration) -> dict[str, dict[str, Path]]:
+    """Returns the masks in ``root/<camera>/``, keyed by the name of the frame and by camera name.
+
+    Raises:
+        CaptureError: if a camera has no folder, or a frame is missing from some of the folders.
+    """
+    there = {_normal(path.name): path for path in sorted(root.iterdir()) if path.is_dir()}
+    folders = {}
+    for camera in calibration.names:
+        folder = there.get(calibration.label(camera), there.get(camera))
+        if folder is None:
+            raise CaptureError(
+                f"{root / calibration.label(camera)}: no such folder; {root.name}/ contains "
+                f"{listed(sorted(there, key=natural)) or 'no folders'}; add masks of every camera, or use --no-masks"
+            )
+        folders[camera] = folder
+    return frames_of_cameras(root, folders, what="masks")
 
 
 def _pictures_in(folder: Path) -> dict[str, Path]:
     pictures: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         end = path.suffix.lower()
-        if path.name.startswith(".") or end not in PICTURE_LIKE:
+        if path.name.startswith(".") or end not in PICTURE_SUFFIXES:
             continue
         if end not in READ:
             raise CaptureError(f"{path}: {end} is not supported; use JPEG, PNG, WebP or BMP")
         if path.stem in pictures:
             raise CaptureError(f"{path} and {pictures[path.stem].name} are the same frame; keep only one of them")
         pictures[path.stem] = path
+    camera = f"{folder.name}_"
+    if all(name.startswith(camera) and name != camera for name in pictures):
+        return {name.removeprefix(camera): path for name, path in pictures.items()}
     return pictures
 
 
-def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
-    """Returns the files listed in the calibration for each frame [T], keyed by camera name, and the frame times.
+def named_files(folder: Path, calibration: Calibration) -> PictureFiles:
+    """Returns a reader for the files that the calibration lists.
 
-    Frame t consists of the t-th image of each camera. Times are in seconds. They are empty if any time is unknown, or
-    if there is only one frame.
+    Frame t consists of the t-th image of each camera. Times are in seconds. They are used only if all are known, and
+    if there are several frames. A remark lists images in the same folders that the calibration does not list.
 
     Raises:
         CaptureError: if a file is missing, cameras have different numbers of images, or the times within a frame
@@ -141,28 +201,71 @@ def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, 
                 f"{calibration.source}: camera {camera!r} has {count} images, but {most!r} has {counts[most]}; "
                 "provide one image per camera and frame"
             )
-    frames: list[dict[str, Path]] = []
+    frames: dict[str, dict[str, Path]] = {}
     times: list[float] = []
     for index in range(counts[most]):
         views = {camera: calibration.views[camera][index] for camera in calibration.names}
-        files = {camera: _below(folder, calibration.source, str(view.path)) for camera, view in views.items()}
-        frames.append(files)
+        files = {}
+        for camera, view in views.items():
+            file = find_picture(folder, calibration.source, str(view.path))
+            if file is None:
+                raise CaptureError(f"{folder / view.path}: no such file, although {calibration.source} lists it")
+            files[camera] = file
+        first = next(iter(files.values()))
+        frames[first.stem if first.stem not in frames else f"{index} {first}"] = files
         given = {camera: view.time for camera, view in views.items()}
         if len(set(given.values())) > 1:
-            listed = ", ".join(f"{camera}: {time}" for camera, time in list(given.items())[:SHOWN])
-            raise CaptureError(f"{calibration.source}: frame {index} has images with different times ({listed}, …)")
+            some = ", ".join(f"{camera}: {time}" for camera, time in list(given.items())[:SHOWN])
+            raise CaptureError(f"{calibration.source}: frame {index} has images with different times ({some}, …)")
         now = next(iter(given.values()))
         if now is not None:
             times.append(now)
-    return frames, times if len(times) == len(frames) and len(frames) > 1 else []
+    return PictureFiles(
+        calibration,
+        frames,
+        times if len(times) == len(frames) and len(frames) > 1 else [],
+        _unlisted(frames, calibration),
+    )
 
 
-def _below(folder: Path, source: Path, name: str) -> Path:
-    for root in (folder, folder / "images", source.parent, source.parent / "images"):
-        path = root / name
-        if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
-            return path
-    raise CaptureError(f"{folder / name}: no such file, although {source} lists it")
+def _unlisted(frames: Frames, calibration: Calibration) -> list[str]:
+    """Returns a remark on images that lie beside the listed ones, but are not listed."""
+    used = {path for files in frames.values() for path in files.values()}
+    there = {path for folder in {path.parent for path in used} for path in folder.iterdir()}
+    left = [path.name for path in there - used if path.suffix.lower() in READ and not path.name.startswith(".")]
+    if not left:
+        return []
+    return [f"skipped images that are not in {calibration.source.name}: {listed(sorted(left, key=natural))}"]
+
+
+def find_picture(folder: Path, source: Path, name: str) -> Path | None:
+    """Returns the image that a calibration lists, or None if the capture does not contain it.
+
+    The name may lack the extension. Of an absolute path, as on the machine that calibrated, the end is searched for.
+
+    Args:
+        folder: capture folder.
+        source: calibration file or folder, to which names may be relative.
+        name: path as in the calibration.
+    """
+    path = PurePosixPath(name)
+    ends = [name]
+    if path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts:
+        parts = [part for part in path.parts if part not in ("/", "..")]
+        ends += ["/".join(parts[start:]) for start in range(len(parts))]
+    here = source if source.is_dir() else source.parent
+    added = [""] if path.suffix.lower() in PICTURE_SUFFIXES else ["", *READ, *(end.upper() for end in READ)]
+    for end in ends:
+        for root in (folder, folder / "images", here, here / "images"):
+            for suffix in added:
+                file = root / f"{end}{suffix}"
+                if file.is_file() and file.resolve().is_relative_to(folder.resolve()):
+                    return file
+    return None
+
+
+def _normal(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
 
 
 def _some(names: Sequence[str]) -> str:

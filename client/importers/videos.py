@@ -190,27 +190,3 @@ class Videos:
     def decoded(self, index: int, camera: str) -> Picture:
         """Returns the decoded image [H, W, 3] of a camera and frame."""
         return self._videos[camera].frame(index)
-
-
-def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
-    """Returns the video of each camera, ``folder/<camera>.mp4`` or with another extension in `ENDS`, keyed by camera.
-
-    Raises:
-        CaptureError: if a camera has no video, or more than one.
-    """
-    there = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS)
-    videos = {}
-    for camera in calibration.names:
-        own = [path for path in there if path.stem == camera]
-        if not own:
-            listed = ", ".join(path.name for path in there[:3]) or "no videos"
-            raise CaptureError(
-                f"{folder}: no video for camera {camera!r} of {calibration.source} (found only {listed}); "
-                f"the file must be named {camera}.mp4"
-            )
-        if len(own) > 1:
-            raise CaptureError(
-                f"{folder} contains {own[0].name} and {own[1].name} for the same camera; keep only one of them"
-            )
-        videos[camera] = own[0]
-    return videos

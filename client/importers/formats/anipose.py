@@ -2,8 +2,9 @@
 
 Each camera has a table with `name`, `size` (width, height), `matrix` [3][3] and `distortions` [5] or [4]. The table
 also contains the world-to-camera `rotation` [3] (Rodrigues vector) and `translation` [3]. `fisheye = true` marks
-coefficients of `cv2.fisheye`. `[metadata]` does not describe the rig and is ignored. Anipose initializes the principal
-point to (width − 1)/2, which implies OpenCV's pixel coordinates.
+coefficients of `cv2.fisheye`. Cameras without a pose are left out, and a remark lists them. `[metadata]` does not
+describe the rig and is ignored. Anipose initializes the principal point to (width − 1)/2, which implies OpenCV's pixel
+coordinates.
 (github.com/lambdaloop/aniposelib, `aniposelib/cameras.py`; github.com/perfanalytics/pose2sim,
 `Pose2Sim/calibration.py`.)
 """
@@ -34,7 +35,7 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
     Raises:
         CaptureError: if a field is missing or invalid. The message names the file, camera, field and remedy.
     """
-    cameras = []
+    cameras, left_out = [], []
     for key, table in document.items():
         if key == "metadata":
             continue
@@ -45,6 +46,9 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
             raise CaptureError(f"{path}: [{key}]: name must be a string; got {name!r}")
         inner = INTRINSICS_FOLDER.fullmatch(str(name))
         where = f"{path}: [{key}]"
+        if table.get("rotation") is None and table.get("translation") is None:
+            left_out.append(inner[1] if inner else str(name))
+            continue
         cameras.append(
             opencv_camera(
                 where,
@@ -57,4 +61,4 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
                 fisheye=table.get("fisheye") is True,
             )
         )
-    return calibration_of_cameras(path, cameras)
+    return calibration_of_cameras(path, cameras, left_out, f"{path.name}: skipped cameras that have no pose")

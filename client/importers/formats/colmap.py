@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.calibration import CalibratedImage, Calibration, calibration
+from client.importers.calibration import CalibratedImage, Calibration, calibration, natural
 from client.importers.lens import MODELS, LensCamera, lens_camera
 from scas4d_core.captures import CaptureError, InitialPoints
+from scas4d_core.captures.files import read_text
 
 Float = NDArray[np.float64]
 
@@ -37,6 +38,8 @@ MODEL_IDS = {
     11: "RAD_TAN_THIN_PRISM_FISHEYE",
 }
 LONGEST_NAME = 4096
+FOLDERS = ("sparse", ".", "colmap/sparse", "colmap", "calibration")
+"""Places in a capture folder that are searched for models. `sparse` may contain several: `0`, `1`, …"""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,45 @@ class _Image:
 def is_model(folder: Path) -> bool:
     """Returns whether the folder contains a COLMAP model."""
     return any((folder / f"cameras{end}").is_file() for end in (".bin", ".txt"))
+
+
+def find_models(capture: Path) -> list[Path]:
+    """Returns the models in the first of the usual places that contains any, in natural order."""
+    for place in FOLDERS:
+        folder = capture / place
+        inner = sorted(folder.iterdir(), key=lambda path: natural(path.name)) if folder.is_dir() else []
+        models = [path for path in inner if folder.name == "sparse" and is_model(path)]
+        models += [folder] if is_model(folder) else []
+        if models:
+            return models
+    return []
+
+
+def read_largest(models: list[Path]) -> Calibration:
+    """Reads the model with the most images. If there are several models, a remark lists all of them.
+
+    COLMAP writes a model for each group of images that it cannot connect with the others.
+
+    Raises:
+        CaptureError: if a model cannot be read.
+    """
+    if len(models) == 1:
+        return read_colmap(models[0])
+    counts = {model: _image_count(model) for model in models}
+    largest = max(models, key=lambda model: counts[model])
+    sizes = ", ".join(f"{model.parent.name}/{model.name} with {count} images" for model, count in counts.items())
+    remark = (
+        f"found {len(models)} COLMAP models ({sizes}); using {largest.parent.name}/{largest.name}, which has the most "
+        "images; choose another with --calibration"
+    )
+    found = read_colmap(largest)
+    return replace(found, remarks=(remark, *found.remarks))
+
+
+def _image_count(folder: Path) -> int:
+    if (folder / "cameras.bin").is_file():
+        return int(_Bytes(folder / "images.bin").take("Q", "the number of images")[0])
+    return sum(1 for _ in _text_images(folder / "images.txt"))
 
 
 def read_colmap(folder: Path) -> Calibration:
@@ -136,13 +178,9 @@ def _cloud(rows: list[tuple[float, ...]]) -> InitialPoints | None:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    try:
-        with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, 1):
-                if not line.startswith("#"):
-                    yield number, line.strip()
-    except (OSError, UnicodeDecodeError) as fault:
-        raise CaptureError(f"{path} cannot be read as text: {fault}") from fault
+    for number, line in enumerate(read_text(path).split("\n"), 1):
+        if not line.startswith("#"):
+            yield number, line.strip()
 
 
 def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
@@ -174,15 +212,27 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    # Every second line lists the image's points and may be empty.
-    is_image = True
+    # An image may be followed by a line with its points, which may be empty. Some tools omit that line.
+    after_image = False
     for number, line in _lines(path):
-        if is_image and not line:
+        if not line or (after_image and _is_points(line)):
+            after_image = False
             continue
-        if is_image:
-            values = _fields(path, number, line, "ifffffffis", "id qw qx qy qz tx ty tz camera name")
-            yield _Image(values[9], values[8], tuple(values[1:5]), tuple(values[5:8]))
-        is_image = not is_image
+        values = _fields(path, number, line, "ifffffffis", "id qw qx qy qz tx ty tz camera name")
+        yield _Image(values[9], values[8], tuple(values[1:5]), tuple(values[5:8]))
+        after_image = True
+
+
+def _is_points(line: str) -> bool:
+    """Returns whether a line of `images.txt` consists of triples (x, y, id of the 3D point or -1)."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(
+            int(words[place]) >= -1 if place % 3 == 2 else np.isfinite(float(words[place]))
+            for place in range(len(words))
+        )
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:

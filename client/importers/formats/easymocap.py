@@ -1,4 +1,4 @@
-"""Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files. Requires OpenCV.
+"""Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files. Requires PyYAML.
 
 `names` lists the cameras. For each camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in
 some versions, `H_<name>` and `W_<name>`. If the size is missing, it is read from the images. `extri.yml` has the
@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from client.importers.calibration import NAMES, Calibration, calibration_of_cameras, can_be_named
-from client.importers.formats.file_storage import first_field, read_storage, size_of_pictures
+from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.folders import size_of_pictures
 from client.importers.formats.opencv_camera import numbers, opencv_camera, picture_size, rodrigues
+from client.importers.formats.opencv_storage import first_field, read_storage
 from client.importers.lens import LensCamera
 from scas4d_core.captures import CaptureError
 
@@ -39,7 +40,7 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
 
     Raises:
         CaptureError: if a file or field is missing or invalid. The message names it and the remedy.
-        MissingExtraError: if OpenCV is not installed.
+        MissingExtraError: if PyYAML is not installed.
     """
     for name in (INTRINSICS, EXTRINSICS):
         if not (folder / name).is_file():
@@ -48,7 +49,7 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
     names = intrinsics.get("names")
     if not isinstance(names, list) or not names:
         raise CaptureError(f"{folder / INTRINSICS}: missing `names`, the list of cameras")
-    texts = [name if isinstance(name, str) else f"{name:g}" for name in names if isinstance(name, str | float)]
+    texts = [name for name in names if isinstance(name, str)]
     posed = [name for name in texts if extrinsics.get(f"T_{name}") is not None]
     left_out = [name for name in texts if name not in posed and name != "none"]
     cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in posed]
@@ -60,8 +61,6 @@ def _camera(
     folder: Path, capture: Path, name: str, intrinsics: dict[str, Any], extrinsics: dict[str, Any]
 ) -> LensCamera:
     where = f"{folder / EXTRINSICS}: camera {name!r}"
-    if not can_be_named(name):
-        raise CaptureError(f"{where}: invalid name: {NAMES}; rename the camera and its images")
     rotation, vector = extrinsics.get(f"Rot_{name}"), extrinsics.get(f"R_{name}")
     if rotation is None:
         rotation = vector

@@ -26,6 +26,8 @@ COUNTS = (0, 4, 5, 8, 12, 14)
 SKEW = 1e-6
 """Maximum skew, relative to the focal length, that is treated as a rounding error."""
 LARGEST_SIDE = 1 << 16
+MOST = 16
+"""Number of values, or of rows of values, after which a list is cut, because no field has as many."""
 
 
 def opencv_camera(
@@ -38,6 +40,7 @@ def opencv_camera(
     translation: Any,
     size: tuple[int, int],
     fisheye: bool = False,
+    first_pixel: float = 0.0,
 ) -> LensCamera:
     """Creates and validates a camera from the values stored by a calibration tool.
 
@@ -50,6 +53,7 @@ def opencv_camera(
         translation: world-to-camera translation [3].
         size: (width, height) in pixels.
         fisheye: whether the coefficients are those of `cv2.fisheye`.
+        first_pixel: coordinate of the first pixel's centre, 0 or 0.5.
 
     Raises:
         CaptureError: if a field is invalid. The message names the field and the remedy.
@@ -74,7 +78,8 @@ def opencv_camera(
     pose = np.eye(4)
     pose[:3, :3] = _rotation(where, rotation)
     pose[:3, 3] = numbers(where, "translation", translation, (3,))
-    parameters = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2] + HALF, "cy": k[1, 2] + HALF, **coefficients}
+    shift = HALF - first_pixel
+    parameters = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2] + shift, "cy": k[1, 2] + shift, **coefficients}
     return lens_camera(name, model, parameters, pose, size, source=where)
 
 
@@ -115,14 +120,16 @@ def rodrigues(vector: Float) -> Float:
 
 
 def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
-    """Returns the numbers in a nested list as a flat float64 array.
+    """Returns the numbers in a list, or in a list of rows, as a flat float64 array. They may be written as strings.
 
     Raises:
         CaptureError: if a value is not a finite number, or the number of values is not in `counts`.
     """
     try:
-        values = np.array(given, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
+        rows = given.tolist() if isinstance(given, np.ndarray) else given
+        rows = [value for row in rows[:MOST] for value in (row[:MOST] if isinstance(row, list | tuple) else [row])]
+        values = np.array([np.nan if isinstance(value, bool) else float(value) for value in rows], np.float64)
+    except (TypeError, ValueError, KeyError):
         values = np.empty(0)
         counts = [count for count in counts if count] or counts
     if values.size not in counts or not np.isfinite(values).all():

@@ -21,13 +21,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from client.importers.calibration import Calibration, calibration_of_cameras
+from client.importers.formats.documents import read_xml
 from client.importers.formats.opencv_camera import opencv_camera, picture_size
 from client.importers.lens import LensCamera
 from scas4d_core.captures import CaptureError
@@ -36,7 +35,6 @@ Float = NDArray[np.float64]
 
 END = ".qca.txt"
 PARTS = ("transform", "intrinsic", "fov_video", "fov_video_max")
-LARGEST_FILE = 16 << 20
 FLIP = np.diag([1.0, -1.0, -1.0])
 """Converts OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
@@ -72,29 +70,11 @@ def _films(camera: _QualisysCamera) -> bool:
 
 
 def _cameras(path: Path) -> list[_QualisysCamera]:
-    """Returns the cameras of the file. Files with a DOCTYPE declaration are rejected, because QTM never writes one."""
-    cameras: list[_QualisysCamera] = []
-
-    def started(name: str, attributes: dict[str, str]) -> None:
-        if name == "camera":
-            cameras.append(_QualisysCamera(attributes))
-        elif cameras and name in PARTS:
-            cameras[-1].parts[name] = attributes
-
-    def declared(*_: Any) -> None:
-        raise CaptureError(f"{path} declares a document type, which QTM never does; export the calibration again")
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = started
-    parser.StartDoctypeDeclHandler = declared
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise CaptureError(f"{path} is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
-        parser.Parse(path.read_bytes(), True)
-    except (OSError, expat.ExpatError, LookupError) as fault:
-        raise CaptureError(
-            f"{path} cannot be read as XML ({fault}); export the calibration from QTM as text (*.qca.txt)"
-        ) from fault
+    """Returns the cameras of the file."""
+    cameras = [
+        _QualisysCamera(camera.attrib, {part.tag: part.attrib for part in camera.iter() if part.tag in PARTS})
+        for camera in read_xml(path).iter("camera")
+    ]
     if not cameras:
         raise CaptureError(f"{path} contains no cameras; export the calibration from QTM as text (*.qca.txt)")
     return cameras

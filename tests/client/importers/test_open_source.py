@@ -168,6 +168,11 @@ def resize(folder):
     Image.new("RGB", (WIDTH - 8, HEIGHT)).save(folder / "images/cam10/000000.png")
 
 
+def video(folder):
+    (folder / "videos").mkdir()
+    (folder / "videos" / "cam1.mp4").write_bytes(b"")
+
+
 def empty(folder):
     for path in (folder / "images/cam1").iterdir():
         path.unlink()
@@ -184,13 +189,13 @@ def empty(folder):
         (empty, r"images/cam1 contains no images; supported file types: .jpg"),
         (
             lambda f: (f / "images/cam10").rename(f / "images/ten"),
-            r"images/cam10: no such folder.* images/ contains cam1, cam2",
+            r"images contains no images of camera 'cam10' .* contains ten, .* name each folder after its camera",
         ),
         (lambda f: (f / "images/cam1/000000.tif").write_bytes(b""), r"000000.tif: .tif is not supported; use JPEG"),
         (lambda f: (f / "images/cam1/000000.jpg").write_bytes(b""), r"000000.png and 000000.jpg are the same frame"),
         (lambda f: (f / "images/cam1/000000.png").write_bytes(b"x"), r"cam1/000000.png cannot be read as an image"),
-        (lambda f: (f / "transforms.json").unlink(), r"unknown capture layout: no train_meta.json .*--calibration"),
-        (lambda f: (f / "videos").mkdir(), r"contains images/ and videos/; .*--pictures images"),
+        (lambda f: (f / "transforms.json").unlink(), r"unknown capture layout: .*: train_meta.json .*--calibration"),
+        (video, r"contains images \(images/\) and videos \(videos/\); .*--pictures images"),
         (lambda f: (f / "masks").mkdir(), r"masks/cam1: no such folder"),
         (lambda f: write_pictures(f / "masks", frames=("000000",)), r"frame 1: its image is .*, but its mask is None"),
         (
@@ -208,9 +213,9 @@ def test_what_a_folder_lacks_is_named(straight, damage, said):
 def test_choices_that_cannot_be_are_named(straight):
     with pytest.raises(CaptureError, match="no such folder"):
         open_source(straight / "nowhere")
-    with pytest.raises(CaptureError, match=r"videos: no such folder; put each camera's video in videos/<camera>.mp4"):
+    with pytest.raises(CaptureError, match=r"contains no videos of the cameras cam1, cam2, cam10; images/ contains"):
         open_source(straight, pictures="videos")
-    with pytest.raises(CaptureError, match=r"neither a transforms.json, nor a COLMAP model folder, nor cali"):
+    with pytest.raises(CaptureError, match=r"images contains no calibration in a known format"):
         open_source(straight, calibration=straight / "images")
     with pytest.raises(CaptureError, match="fps must be a positive number; got -1"):
         open_source(straight, fps=-1)

@@ -111,7 +111,7 @@ def test_entities_are_refused(tmp_path):
 def test_pictures_lie_in_folders_called_like_the_cameras(tmp_path):
     rig = lenses("PINHOLE")
     (tmp_path / "calibration.toml").write_text(anipose(rig))
-    with pytest.raises(CaptureError, match=r"neither images/ nor videos/, .*cameras: cam1, cam2, cam10"):
+    with pytest.raises(CaptureError, match=r"contains no images or videos of the cameras cam1, cam2, cam10"):
         open_source(tmp_path)
     with pytest.raises(CaptureError, match="lists no images"):
         open_source(tmp_path, pictures="named")
@@ -153,7 +153,6 @@ def change(text, old, new):
         ("matrix = [[", "matrix = [[0.0], [", "the camera matrix must be 9 finite numbers"),
         ("[0.0, 214.0, ", "[7.0, 214.0, ", r"is not \[\[fx, 0, cx\], .*; calibrate without skew"),
         ("matrix = [[210.0, 0.0,", "matrix = [[210.0, 1.0,", "calibrate without skew"),
-        ('name = "cam2"', 'name = "../cam2"', r"invalid camera name '../cam2': names must"),
         ('name = "cam2"', 'name = "cam1"', "two cameras are named 'cam1'"),
         ('name = "cam2"', "name = 1.5", r"\[cam_0\]: name must be a string; got 1.5"),
         ("[metadata]", "[metadata]\n[", "cannot be read as TOML"),
@@ -195,7 +194,7 @@ def test_what_qualisys_cannot_have_written_is_named(tmp_path, old, new, said):
 def test_files_of_other_kinds_are_refused(tmp_path):
     for name, text, said in (
         ("Calib.toml", "[project]\nname = 1\n", "contains no camera tables"),
-        ("rig.txt", "", "is neither a transforms.json"),
+        ("rig.txt", "", "is no calibration in a known format"),
         ("empty.qca.txt", "<calibration/>", "contains no cameras"),
     ):
         (tmp_path / name).write_text(text)

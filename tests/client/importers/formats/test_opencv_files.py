@@ -11,11 +11,11 @@ from lenses import HEIGHT, WIDTH
 from rigs import NAMES, easymocap, lenses, opencv_file, opencv_matrix, write_pictures
 
 from client.importers.extras import MissingExtraError
-from client.importers.formats.file_storage import read_storage
+from client.importers.formats.opencv_storage import read_storage
 from client.importers.open_source import open_source, read_calibration
 from scas4d_core.captures import CaptureError
 
-cv2 = pytest.importorskip("cv2")
+pytest.importorskip("yaml")
 
 
 def assert_same(calibration, rig, names=("cam1", "cam2", "cam10")):
@@ -83,7 +83,7 @@ def test_cameras_without_a_pose_are_left_out(tmp_path):
         ("intri.yml", "K_cam2:", "L_cam2:", "camera 'cam2': the camera matrix must be 9 finite numbers; got nothing"),
         ("extri.yml", "R_cam2:", "R_gone:", None),
         ("extri.yml", "data: [ ", "data: [ 1", "R_cam2 and Rot_cam2 are different rotations|finite numbers"),
-        ("extri.yml", "%YAML:1.0", "%YAML:1.0\n{[", "cannot be read as an OpenCV FileStorage file"),
+        ("extri.yml", "---\n", "---\n{[\n", "cannot be read as YAML"),
         ("intri.yml", f"W_cam2: {WIDTH}", "W_cam2: 0", "width and height in whole pixels"),
     ],
 )
@@ -113,10 +113,12 @@ def test_a_file_a_camera(tmp_path, model, size):
     assert_same(read_calibration(tmp_path, tmp_path / "calibration" / "cam2.yml"), rig)
 
 
-def test_files_that_opencv_wrote(tmp_path):
+@pytest.mark.parametrize("end", [".xml", ".yml", ".json"])
+def test_files_that_opencv_wrote(tmp_path, end):
+    cv2 = pytest.importorskip("cv2")
     rig = lenses()
     for name, lens in rig.items():
-        storage = cv2.FileStorage(str(tmp_path / f"{name}.xml"), cv2.FILE_STORAGE_WRITE)
+        storage = cv2.FileStorage(str(tmp_path / f"{name}{end}"), cv2.FILE_STORAGE_WRITE)
         storage.write("image_width", WIDTH)
         storage.write("image_height", HEIGHT)
         storage.write("K", opencv_matrix(lens))
@@ -127,33 +129,37 @@ def test_files_that_opencv_wrote(tmp_path):
     assert_same(read_calibration(tmp_path), rig)
 
 
-def test_opencv_is_asked_for_by_name(tmp_path, monkeypatch):
+def test_pyyaml_is_asked_for_by_name(tmp_path, monkeypatch):
     easymocap(lenses(), tmp_path, sizes=True)
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtraError, match=r"reading OpenCV's YAML and XML files requires OpenCV .*\[importers\]"):
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(MissingExtraError, match=r"reading YAML files requires PyYAML .*\[importers\]"):
         read_calibration(tmp_path)
 
 
-def test_a_camera_without_a_pose_is_refused(tmp_path):
+def test_cameras_without_a_pose_are_left_out_and_a_rig_without_poses_is_refused(tmp_path):
     (tmp_path / "cam1.yml").write_text(opencv_file(lenses()["cam1"], pose=False))
-    with pytest.raises(CaptureError, match=r"cam1.yml has no pose; add R and T, world to camera"):
+    with pytest.raises(CaptureError, match=r"cam1.yml has no pose, nor has any other file .* add R and T"):
         read_calibration(tmp_path)
+    (tmp_path / "cam2.yml").write_text(opencv_file(lenses()["cam2"]))
+    found = read_calibration(tmp_path)
+    assert found.names == ("cam2",)
+    assert found.remarks == ("skipped cameras whose file contains no pose (R and T): cam1",)
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("file", "text", "said"),
     [
-        "%YAML:1.0\n---\nx: " + "[ " * 40 + "1" + " ]" * 40,
-        "%YAML:1.0\n---\n" + "".join(f"{'   ' * level}a{level}:\n" for level in range(40)),
-        "%YAML:1.0\n---\nx:\n  " + "- " * 40 + "1\n",
-        "<?xml version='1.0'?><opencv_storage>" + "<a>" * 40 + "</a>" * 40 + "</opencv_storage>",
+        ("a.yml", "%YAML:1.0\n---\nx: " + "[ " * 5000 + "1" + " ]" * 5000, "cannot be read as YAML"),
+        ("a.yml", "x: &a [1, 2]\ny: [*a, *a]\n", "aliases .* are not supported"),
+        ("a.yml", "just a sentence", "contains no named fields"),
+        ("a.xml", "<!DOCTYPE a><opencv_storage/>", "declares a document type"),
+        ("a.json", "[1]", "must contain a JSON object"),
     ],
 )
-def test_files_nested_without_end_are_refused(tmp_path, text):
-    path = tmp_path / "cam1.yml"
-    path.write_text(text)
-    with pytest.raises(CaptureError, match="nested more than"):
-        read_storage(path)
+def test_documents_of_another_kind_are_refused(tmp_path, file, text, said):
+    (tmp_path / file).write_text(text)
+    with pytest.raises(CaptureError, match=said):
+        read_storage(tmp_path / file)
 
 
 def test_toml_nested_without_end_is_refused(tmp_path):
@@ -164,8 +170,10 @@ def test_toml_nested_without_end_is_refused(tmp_path):
 
 def test_a_camera_of_easymocap_looks_for_its_pictures_in_the_folder_alone(tmp_path):
     rig = lenses()
-    easymocap(rig, tmp_path, sizes=False)
-    for file in (tmp_path / "intri.yml", tmp_path / "extri.yml"):
+    inner = tmp_path / "capture"
+    easymocap(rig, inner, sizes=False)
+    write_pictures(tmp_path)
+    for file in (inner / "intri.yml", inner / "extri.yml"):
         file.write_text(re.sub(r'(["_])cam', r"\1../../cam", file.read_text()))
-    with pytest.raises(CaptureError, match="letters, digits"):
-        read_calibration(tmp_path)
+    with pytest.raises(CaptureError, match=r"camera '../../cam2' has no image size"):
+        read_calibration(inner)

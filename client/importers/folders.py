@@ -1,0 +1,220 @@
+"""Finds the images and videos of a capture's cameras, and compares them with the cameras of a calibration."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from client.importers.calibration import Calibration, listed, natural, stem
+from client.importers.extras import pyav
+from client.importers.pictures import READ
+from client.importers.videos import ENDS
+from scas4d_core.captures import CaptureError, ImageError
+from scas4d_core.captures.images import picture_size
+
+IMAGES = ("images", "hdImgs", "frames", ".")
+VIDEOS = ("videos", "hdVideos", ".")
+NOT_CAMERAS = {*IMAGES, *VIDEOS, "masks", "sparse", "dense", "colmap", "calibration", "ims", "seg"}
+"""Folders in a capture that are not cameras or frames."""
+PANOPTIC = ("hd_", "vga_", "kinect_")
+"""CMU Panoptic's videos are named after the type and the name of their camera."""
+
+Kind = Literal["images", "frames", "videos"]
+
+
+@dataclass(frozen=True, eq=False)
+class PictureSource:
+    """A folder with the images or videos of several cameras.
+
+    Attributes:
+        kind: `images` for ``root/<camera>/<frame>.jpg``, `frames` for ``root/<frame>/<camera>.jpg``, or `videos` for
+            ``root/<camera>.mp4``.
+        root: the folder.
+        entries: folder, first image, or videos of each camera, keyed by its name on disk.
+        own: whether the folder contains nothing but cameras, unlike the capture folder.
+    """
+
+    kind: Kind
+    root: Path
+    entries: Mapping[str, Sequence[Path]]
+    own: bool
+
+    def find(self, *names: str) -> str | None:
+        """Returns the name on disk of a camera with one of several names, or None."""
+        for name in map(_normal, names):
+            for prefix in ("", *PANOPTIC):
+                if prefix + name in self.entries:
+                    return prefix + name
+        return None
+
+    def names_of(self, calibration: Calibration) -> dict[str, str]:
+        """Returns the names on disk of the cameras that are here, keyed by camera name."""
+        found = {name: self.find(calibration.label(name), name) for name in calibration.names}
+        return {name: on_disk for name, on_disk in found.items() if on_disk is not None}
+
+
+def picture_sources(capture: Path) -> Iterator[PictureSource]:
+    """Finds the folders with images or videos in a capture: `images`, `hdImgs`, `videos`, …, or the capture itself."""
+    for place in IMAGES:
+        root, own = capture / place, place != "."
+        folders = {
+            _normal(path.name): path
+            for path in sorted(root.iterdir() if root.is_dir() else (), key=lambda path: natural(path.name))
+            if path.is_dir() and not path.name.startswith(".") and (own or path.name not in NOT_CAMERAS)
+        }
+        pictures = {name: pictures_in(path) for name, path in folders.items()}
+        if not own:
+            folders = {name: path for name, path in folders.items() if pictures[name]}
+        if folders:
+            yield PictureSource("images", root, {name: [path] for name, path in folders.items()}, own)
+        first = next((files for files in pictures.values() if files), [])
+        if first:
+            yield PictureSource("frames", root, {_normal(stem(_pure(path))): [path] for path in first}, own)
+    for place in VIDEOS:
+        root = capture / place
+        videos: dict[str, list[Path]] = {}
+        for path in sorted(root.iterdir() if root.is_dir() else ()):
+            if path.suffix.lower() in ENDS and path.is_file() and not path.name.startswith("."):
+                videos.setdefault(_normal(path.stem), []).append(path)
+        if videos:
+            yield PictureSource("videos", root, videos, own=True)
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Returns the images in a folder, in natural order."""
+    if not folder.is_dir():
+        return []
+    there = (path for path in folder.iterdir() if path.suffix.lower() in READ and not path.name.startswith("."))
+    return sorted(there, key=lambda path: natural(path.name))
+
+
+def find_source(capture: Path, calibration: Calibration, wanted: str | None) -> PictureSource | None:
+    """Returns the folder that contains the cameras of a calibration, or None if no folder contains any.
+
+    Args:
+        capture: capture folder.
+        calibration: the cameras.
+        wanted: `images` or `videos`; None for either.
+
+    Raises:
+        CaptureError: if there are both images and videos, and `wanted` is None.
+    """
+    found = [(source, len(source.names_of(calibration))) for source in picture_sources(capture)]
+    found = [(source, count) for source, count in found if count and (wanted is None or _is(source, wanted))]
+    if not found:
+        return None
+    best = max(found, key=lambda pair: pair[1])[0]
+    other = next((source for source, _ in found if (source.kind == "videos") != (best.kind == "videos")), None)
+    if other is not None:
+        images, videos = (other, best) if best.kind == "videos" else (best, other)
+        raise CaptureError(
+            f"{capture} contains images ({_below(images.root, capture)}) and videos ({_below(videos.root, capture)}); "
+            "choose one with --pictures images or --pictures videos"
+        )
+    return best
+
+
+def _is(source: PictureSource, wanted: str) -> bool:
+    return (source.kind == "videos") == (wanted == "videos")
+
+
+def _below(root: Path, capture: Path) -> str:
+    return f"{root.relative_to(capture)}/" if root != capture else "this folder"
+
+
+def compare(source: PictureSource, calibration: Calibration) -> Calibration:
+    """Leaves out cameras without images, and adds remarks on cameras that are only in the calibration or only here.
+
+    Raises:
+        CaptureError: if there are both, because then names probably differ.
+    """
+    names = source.names_of(calibration)
+    missing = [name for name in calibration.names if name not in names]
+    left_out = {source.find(label) for label in calibration.left_out}
+    unknown = [name for name in source.entries if name not in names.values() and name not in left_out]
+    what = "video" if source.kind == "videos" else "images"
+    if missing and unknown and source.own:
+        raise CaptureError(
+            f"{source.root} contains no {what} of camera {calibration.label(missing[0])!r} of {calibration.source}, "
+            f"but it contains {listed(unknown)}, which the calibration does not; name each "
+            f"{ {'images': 'folder', 'frames': 'image', 'videos': 'video'}[source.kind] } after its camera, or remove "
+            "what does not belong to the rig"
+        )
+    if missing:
+        calibration = calibration.without(missing, f"skipped cameras that have no {what} in {source.root.name}")
+    if unknown and source.own:
+        remark = f"skipped cameras that are not in {calibration.source.name}: {listed(sorted(unknown, key=natural))}"
+        return replace(calibration, remarks=(*calibration.remarks, remark))
+    return calibration
+
+
+def size_of_pictures(capture: Path, camera: str, where: str) -> tuple[int, int]:
+    """Returns (width, height) of the first image or the video of a camera.
+
+    Args:
+        capture: capture folder.
+        camera: camera name.
+        where: name of the file and of the camera that has no size, for error messages.
+
+    Raises:
+        CaptureError: if there is neither an image nor a video, or the file cannot be read.
+        MissingExtraError: if a video must be read and PyAV is not installed.
+    """
+    for source in picture_sources(capture):
+        name = source.find(camera)
+        if name is None:
+            continue
+        path = source.entries[name][0]
+        if source.kind == "videos":
+            return video_size(path)
+        files = pictures_in(path) if source.kind == "images" else [path]
+        if files:
+            return image_size(files[0])
+    for place in IMAGES:
+        for path in pictures_in(capture / place):
+            if _normal(path.stem) == _normal(camera):
+                return image_size(path)
+    raise CaptureError(
+        f"{where} has no image size, and {capture} contains no images or video of the camera to read it from; put them "
+        f"in images/{camera}/ or videos/{camera}.mp4, or add the size to the file"
+    )
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Returns (width, height) of an image file.
+
+    Raises:
+        CaptureError: if the file cannot be read.
+    """
+    try:
+        return picture_size(path)
+    except ImageError as fault:
+        raise CaptureError(str(fault)) from fault
+
+
+def video_size(path: Path) -> tuple[int, int]:
+    """Returns (width, height) of a video file.
+
+    Raises:
+        CaptureError: if the file cannot be read.
+        MissingExtraError: if PyAV is not installed.
+    """
+    av = pyav()
+    try:
+        with av.open(str(path)) as container:
+            context = container.streams.video[0].codec_context
+            return int(context.width), int(context.height)
+    except (av.FFmpegError, IndexError) as fault:
+        raise CaptureError(f"{path} cannot be read as video: {fault}") from fault
+
+
+def _normal(name: str) -> str:
+    """Returns a name with composed accents. macOS stores file names with separate accents."""
+    return unicodedata.normalize("NFC", name)
+
+
+def _pure(path: Path) -> PurePosixPath:
+    return PurePosixPath(path.as_posix())
