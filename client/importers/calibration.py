@@ -122,7 +122,8 @@ def calibration(
 ) -> Calibration:
     """Builds a calibration by grouping images by camera.
 
-    A camera is named after the folder of its images or, if all images are in one folder, after its image file. If
+    A camera is named after the folder of its images or, if all images are in one folder, after its image file, without
+    the number at its end if the images have different times. If
     cameras named after folders would move, and each folder has an image of every camera, each folder is a frame.
 
     Args:
@@ -140,7 +141,10 @@ def calibration(
     if not views:
         raise CaptureError(_no_camera(source, len(unposed)))
     folders = {_folder(path) for path in (*(view.path for view in views), *unposed)}
-    label_of: Callable[[PurePosixPath], str] = stem if len(folders) == 1 else _folder_name
+    times = {view.time for view in views}
+    label_of: Callable[[PurePosixPath], str] = _folder_name
+    if len(folders) == 1:
+        label_of = stem if len(times) == 1 or not all(_series(view.path) for view in views) else _series
     try:
         cameras, by_label = _grouped(source, views, label_of)
     except CaptureError:
@@ -167,6 +171,11 @@ def _folder(path: PurePosixPath) -> PurePosixPath:
 
 def _folder_name(path: PurePosixPath) -> str:
     return _folder(path).name
+
+
+def _series(path: PurePosixPath) -> str:
+    """Returns the file name without the number of the frame at its end."""
+    return re.sub(r"[_-]?\d+$", "", stem(path))
 
 
 def _by_label(

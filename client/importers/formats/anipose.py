@@ -25,8 +25,8 @@ INTRINSICS_FOLDER = re.compile(r"int_(.+)_img")
 
 
 def is_anipose(document: Mapping[str, Any]) -> bool:
-    """Returns whether any table in the file has a camera matrix and a pose."""
-    return any(isinstance(table, Mapping) and {"matrix", "rotation"} <= table.keys() for table in document.values())
+    """Returns whether any table in the file has a camera matrix."""
+    return any(isinstance(table, Mapping) and "matrix" in table for table in document.values())
 
 
 def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:

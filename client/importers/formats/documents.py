@@ -16,24 +16,26 @@ from scas4d_core.captures import CaptureError
 from scas4d_core.captures.files import read_json_value, read_text
 
 LARGEST_FILE = 16 << 20
+LARGEST_JSON = 1 << 30
+"""Reconstructions in JSON include points and their observations."""
 DIRECTIVE = re.compile(r"\A%YAML[: ]1\.\d\s*\n(---[ \t]*\n)?")
 """OpenCV writes `%YAML:1.0`, which is not a directive of YAML."""
 
 
-def check_size(path: Path) -> None:
+def check_size(path: Path, largest: int = LARGEST_FILE) -> None:
     """Raises a `CaptureError` if a file is missing, or too large for a calibration file."""
     try:
         size = path.stat().st_size
     except OSError as fault:
         raise CaptureError(f"{path} cannot be read: {fault.strerror}") from fault
-    if size > LARGEST_FILE:
-        raise CaptureError(f"{path} is larger than {LARGEST_FILE >> 20} MB; this is not a calibration file")
+    if size > largest:
+        raise CaptureError(f"{path} is larger than {largest >> 20} MB; this is not a calibration file")
 
 
 def json_value(path: Path) -> Any:
     """Returns the value of a JSON file, to find out its format; None if it is too large, or not JSON."""
     try:
-        check_size(path)
+        check_size(path, LARGEST_JSON)
         return read_json_value(path)
     except CaptureError:
         return None

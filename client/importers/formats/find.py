@@ -28,7 +28,7 @@ from client.importers.formats.qualisys import END as QUALISYS
 from client.importers.formats.qualisys import read_qualisys
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
-from scas4d_core.captures.files import read_text
+from scas4d_core.captures.files import read_json_value, read_text
 
 FOLDERS = (".", "calibration")
 """Subfolders of a capture that are searched for calibrations."""
@@ -81,9 +81,7 @@ def _read_toml(path: Path, _: Path) -> Calibration:
         return read_caliscope(path, document)
     if is_anipose(document):
         return read_anipose(path, document)
-    raise CaptureError(
-        f"{path} contains no camera tables with matrix and rotation, as in {CALISCOPE} or anipose's files"
-    )
+    raise CaptureError(f"{path} contains no camera tables with a matrix, as in {CALISCOPE} or anipose's files")
 
 
 def _of_file(read: Callable[[Path], Calibration]) -> Reader:
@@ -165,11 +163,16 @@ def _read_given(folder: Path, given: Path) -> Calibration:
 
 
 def _other_files(folder: Path) -> str:
-    """Returns what the folder contains instead of a known calibration, as a clause for a message."""
+    """Returns what the folder contains instead of a known calibration, or what is damaged, for a message."""
     names = [path for place in FOLDERS if (folder / place).is_dir() for path in sorted((folder / place).iterdir())]
     for path in names:
         if path.is_file() and path.suffix.lower() in UNREAD:
             return f": {path.relative_to(folder)} is {UNREAD[path.suffix.lower()]}"
+        if path.is_file() and path.suffix.lower() in (".xml", ".json", ".sfm"):
+            try:
+                read_xml(path) if path.suffix.lower() == ".xml" else read_json_value(path)
+            except CaptureError as fault:
+                return f": {fault}"
     files = [path.name for path in names if path.is_file() and not path.name.startswith(".")]
     return f": none of its files is a known calibration ({', '.join(files[:5])})" if files else ": it contains no files"
 

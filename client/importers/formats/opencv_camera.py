@@ -26,7 +26,7 @@ COUNTS = (0, 4, 5, 8, 12, 14)
 SKEW = 1e-6
 """Maximum skew, relative to the focal length, that is treated as a rounding error."""
 LARGEST_SIDE = 1 << 16
-MOST = 16
+MOST = 64
 """Number of values, or of rows of values, after which a list is cut, because no field has as many."""
 
 
