@@ -65,13 +65,11 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
             for path in sorted(root.iterdir() if root.is_dir() else (), key=lambda path: natural(path.name))
             if path.is_dir() and not path.name.startswith(".") and (own or path.name not in NOT_CAMERAS)
         }
-        pictures = {name: pictures_in(path) for name, path in folders.items()}
-        if not own:
-            folders = {name: path for name, path in folders.items() if pictures[name]}
-        if folders:
-            yield PictureSource("images", root, {name: [path] for name, path in folders.items()}, own)
-        first = next((files for files in pictures.values() if files), [])
-        if first:
+        pictured = [name for name, path in folders.items() if any(map(_is_picture, path.iterdir()))]
+        if folders if own else pictured:
+            yield PictureSource("images", root, {name: [folders[name]] for name in (folders if own else pictured)}, own)
+        if pictured:
+            first = pictures_in(folders[pictured[0]])
             yield PictureSource("frames", root, {_normal(stem(_pure(path))): [path] for path in first}, own)
     for place in VIDEOS:
         root = capture / place
@@ -87,8 +85,11 @@ def pictures_in(folder: Path) -> list[Path]:
     """Returns the images in a folder, in natural order."""
     if not folder.is_dir():
         return []
-    there = (path for path in folder.iterdir() if path.suffix.lower() in READ and not path.name.startswith("."))
-    return sorted(there, key=lambda path: natural(path.name))
+    return sorted(filter(_is_picture, folder.iterdir()), key=lambda path: natural(path.name))
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in READ and not path.name.startswith(".")
 
 
 def find_source(capture: Path, calibration: Calibration, wanted: str | None) -> PictureSource | None:

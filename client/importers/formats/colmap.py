@@ -118,7 +118,7 @@ def read_colmap(folder: Path) -> Calibration:
     cameras = _binary_cameras(files["cameras"]) if binary else _text_cameras(files["cameras"])
     images = list(_binary_images(files["images"]) if binary else _text_images(files["images"]))
     if not images:
-        raise CaptureError(f"{files['images']}: no images were registered; calibrate again with more overlap")
+        raise CaptureError(f"{files['images']} lists no images; if COLMAP registered none, calibrate with more overlap")
     points = None
     if files["points3D"].is_file():
         points = _cloud(list(_binary_points(files["points3D"]) if binary else _text_points(files["points3D"])))

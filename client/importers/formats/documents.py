@@ -16,6 +16,7 @@ from scas4d_core.captures import CaptureError
 from scas4d_core.captures.files import read_json_value, read_text
 
 LARGEST_FILE = 16 << 20
+START = 1 << 16
 LARGEST_JSON = 1 << 30
 """Reconstructions in JSON include points and their observations."""
 DIRECTIVE = re.compile(r"\A%YAML[: ]1\.\d\s*\n(---[ \t]*\n)?")
@@ -32,12 +33,19 @@ def check_size(path: Path, largest: int = LARGEST_FILE) -> None:
         raise CaptureError(f"{path} is larger than {largest >> 20} MB; this is not a calibration file")
 
 
-def json_value(path: Path) -> Any:
-    """Returns the value of a JSON file, to find out its format; None if it is too large, or not JSON."""
+def json_value(path: Path, *words: str) -> Any:
+    """Returns the value of a JSON file, to find out its format.
+
+    The result is None if the file is too large, is not JSON, or starts with none of the words. Captures may contain
+    thousands of other JSON files, so these are not parsed.
+    """
     try:
         check_size(path, LARGEST_JSON)
-        return read_json_value(path)
-    except CaptureError:
+        with path.open("rb") as file:
+            start = file.read(START)
+        encoded = (word.encode(code) for word in words for code in ("utf-8", "utf-16-le", "utf-16-be"))
+        return read_json_value(path) if not words or any(word in start for word in encoded) else None
+    except (CaptureError, OSError):
         return None
 
 

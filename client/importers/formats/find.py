@@ -60,7 +60,7 @@ def _is_toml(path: Path) -> bool:
 
 
 def _json_is(test: Callable[[Any], bool], *suffixes: str) -> Callable[[Path], bool]:
-    return lambda path: path.suffix.lower() in suffixes and test(json_value(path))
+    return lambda path: path.suffix.lower() in suffixes and test(json_value(path, '"cameras"', '"views"', '"shots"'))
 
 
 def _is_metashape_file(path: Path) -> bool:

@@ -56,7 +56,7 @@ def _is_camera(path: Path) -> bool:
         return False
     if path.suffix.lower() != ".json":
         return (XML_MATRIX if path.suffix.lower() == ".xml" else YAML_MATRIX).search(data) is not None
-    document = json_value(path)
+    document = json_value(path, *(f'"{name}"' for name in MATRIX))
     return isinstance(document, dict) and first_field(document, MATRIX) is not None
 
 

@@ -115,7 +115,7 @@ def test_parts_that_do_not_fit_each_other_are_named(tmp_path):
     shutil.rmtree(folder)
     model(lenses(), folder, "OPENCV", False)
     (folder / "images.txt").write_text("# nothing\n")
-    with pytest.raises(CaptureError, match=r"no images were registered"):
+    with pytest.raises(CaptureError, match=r"images.txt lists no images; if COLMAP registered none"):
         read_colmap(folder)
     (folder / "images.txt").write_text("1 2 0 0 0 0 0 0 1 cam1.jpg\n\n")
     with pytest.raises(CaptureError, match=r"cam1.jpg has an invalid pose .*unit quaternion"):
