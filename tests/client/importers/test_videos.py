@@ -10,7 +10,7 @@ from lenses import HEIGHT, WIDTH
 from rigs import NAMES, lenses, transforms, write
 
 from client.importers.open_source import open_source
-from client.importers.videos import Video
+from client.importers.video.reader import Video
 from scas4d_core.captures import CaptureError, decode_image
 
 av = pytest.importorskip("av")
@@ -72,8 +72,8 @@ def test_frames_come_exactly_in_any_order(tmp_path):
 def test_comparing_each_frame_with_frame_0_decodes_each_once(tmp_path):
     video = Video(film(tmp_path / "a.mp4", range(40)))
     met = []
-    own = video._pixels
-    video._pixels = lambda frame: met.append(frame.pts) or own(frame)
+    own = video._stream.rgb
+    video._stream.rgb = lambda frame: met.append(frame.pts) or own(frame)
     for index in range(40):
         assert (number(video.frame(index)), number(video.frame(0)), number(video.frame(index))) == (index, 0, index)
     # Frame 0 is decoded twice: it is kept once it was asked for again. Frame 1 is then found anew.
