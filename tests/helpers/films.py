@@ -6,8 +6,12 @@ from fractions import Fraction
 
 import numpy as np
 
+from client.importers.video.reader import Video
+
 SIZE = (64, 48)
 RATE = 25
+FRAMES = 20
+X265 = "log-level=none:pools=none:frame-threads=1:keyint=6"
 
 
 def barcode(index, size=SIZE):
@@ -30,7 +34,17 @@ def textured(index, size=SIZE):
 
 
 def encode(
-    path, codec, frames=range(20), *, pix_fmt="yuv420p", form=None, muxing=None, edit=None, draw=textured, **options
+    path,
+    codec,
+    frames=range(FRAMES),
+    *,
+    pix_fmt="yuv420p",
+    form=None,
+    muxing=None,
+    edit=None,
+    draw=textured,
+    fields=None,
+    **options,
 ):
     """Writes a video of numbered frames.
 
@@ -43,6 +57,7 @@ def encode(
         muxing: options of the muxer.
         edit: function from the list of packets to the list that is written; None for all of them.
         draw: function from a number to a picture.
+        fields: "tff" or "bff" to mark frames as interlaced, top or bottom field first.
         options: options of the encoder, or attributes of PyAV's codec context.
     """
     import av
@@ -63,8 +78,49 @@ def encode(
             else:
                 frame = av.VideoFrame.from_ndarray(picture, "rgb24").reformat(format=pix_fmt)
             frame.pts, frame.time_base = place, Fraction(1, RATE)
+            if fields:
+                frame = interlaced(frame, fields)
             packets += stream.encode(frame)
         packets += stream.encode()
         for packet in edit(packets) if edit else packets:
             container.mux(packet)
     return path
+
+
+def interlaced(frame, fields):
+    """The frame, marked as interlaced."""
+    import av
+
+    graph = av.filter.Graph()
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base)
+    mark, sink = graph.add("setfield", fields), graph.add("buffersink")
+    source.link_to(mark)
+    mark.link_to(sink)
+    graph.configure()
+    graph.push(frame)
+    return graph.pull()
+
+
+def in_order(path):
+    """The visible pictures, as PyAV decodes them from the start."""
+    import av
+
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def check(path, numbers):
+    """Checks the count and the pictures of a video: in order, backwards and at random."""
+    pictures = in_order(path)
+    assert [number(picture) for picture in pictures] == list(numbers)
+    video = Video(path)
+    assert len(video) == len(pictures)
+    count = len(pictures)
+    jumps = np.random.default_rng(0).integers(0, count, 2 * count).tolist()
+    for order in (range(count), range(count - 1, -1, -1), jumps, range(count // 2, count)):
+        for index in order:
+            assert np.array_equal(video.frame(index), pictures[index]), f"frame {index} of {list(order)}"
+    video.close()
+    fresh = Video(path)  # its first frame is reached by a seek
+    assert np.array_equal(fresh.frame(count - 2), pictures[count - 2])
+    fresh.close()

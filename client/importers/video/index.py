@@ -8,6 +8,7 @@ count the visible frames.
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import zipfile
 import zlib
@@ -79,7 +80,8 @@ def video_index(path: Path) -> VideoIndex:
         MissingExtraError: if PyAV is not installed.
     """
     cached = _cached_file(path)
-    with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile), np.load(cached) as stored:
+    with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        stored = np.load(io.BytesIO(cached.read_bytes()))
         return VideoIndex(**{field.name: _plain(stored[field.name]) for field in fields(VideoIndex)})
     index = _decoded_index(path)
     with suppress(OSError):  # without a cache, the index is made again next time
@@ -183,7 +185,7 @@ def _turn(frame: Any, path: Path) -> NDArray[np.int8]:
     turn = np.array([[a, c], [b, d]]) / FIXED_POINT
     if not np.array_equal(np.abs(turn), np.eye(2)) and not np.array_equal(np.abs(turn), np.eye(2)[::-1]):
         raise CaptureError(
-            f"{path}: its metadata turn the picture by {frame.rotation}°, or scale it; store the pixels as calibrated "
-            "and remove the display matrix"
+            f"{path}: its metadata turn the picture by another angle than a multiple of 90°, or scale it; store the "
+            "pixels as calibrated and remove the display matrix"
         )
     return turn.astype(np.int8)

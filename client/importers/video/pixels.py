@@ -40,6 +40,12 @@ def conversion_remarks(index: VideoIndex) -> list[str]:
             f"video with the transfer curve {UNUSUAL[index.transfer]}: its values are used as if they were sRGB; "
             "convert it if other cameras differ"
         )
+    if index.damaged.any():
+        first = int(np.argmax(index.damaged))
+        remarks.append(
+            f"{int(index.damaged.sum())} damaged frames, first frame {first} at {index.seconds[first]:.3f} s; reading "
+            "them is an error"
+        )
     if index.spaced:
         remarks.append(f"video without increasing timestamps: its frames are spaced evenly, {index.rate:g} per second")
     return remarks

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-from films import encode, number
+from films import FRAMES, X265, check, encode
 
-from client.importers.video.reader import Video
+pytest.importorskip("av")
 
-av = pytest.importorskip("av")
-
-FRAMES = 20
 FRAGMENTS = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
 CONTAINERS = {
     "mp4": {},
@@ -23,7 +19,6 @@ CONTAINERS = {
     "m2ts": {"muxing": {"mpegts_m2ts_mode": "1"}, "form": "mpegts"},
     "mpg": {"form": "vob"},
 }
-X265 = "log-level=none:pools=none:frame-threads=1:keyint=6"
 CODECS = {
     "h264 intra": ("libx264", {"g": 1}),
     "h264 closed": ("libx264", {"g": 6, "bf": 0}),
@@ -64,28 +59,6 @@ HELD = {  # containers of each codec family
     "av1": ("mp4", "webm", "mkv"),
 }
 MATRIX = [(codec, container) for codec in CODECS for container in HELD[codec.split()[0]]]
-
-
-def in_order(path):
-    """The visible pictures, as PyAV decodes them from the start."""
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
-def check(path, numbers):
-    pictures = in_order(path)
-    assert [number(picture) for picture in pictures] == list(numbers)
-    video = Video(path)
-    assert len(video) == len(pictures)
-    count = len(pictures)
-    jumps = np.random.default_rng(0).integers(0, count, 2 * count).tolist()
-    for order in (range(count), range(count - 1, -1, -1), jumps, range(count // 2, count)):
-        for index in order:
-            assert np.array_equal(video.frame(index), pictures[index]), f"frame {index} of {list(order)}"
-    video.close()
-    fresh = Video(path)  # its first frame is reached by a seek
-    assert np.array_equal(fresh.frame(count - 2), pictures[count - 2])
-    fresh.close()
 
 
 def test_the_matrix_is_large():

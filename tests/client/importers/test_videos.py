@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from films import barcode, number
 from lenses import HEIGHT, WIDTH
 from rigs import NAMES, lenses, transforms, write
 
@@ -16,19 +17,6 @@ from scas4d_core.captures import CaptureError, decode_image
 av = pytest.importorskip("av")
 
 FRAMES = 25
-
-
-def barcode(index, size=(WIDTH, HEIGHT)):
-    """A picture that says its number in eight broad bars: it survives any encoder."""
-    picture = np.zeros((size[1], size[0], 3), np.uint8)
-    for bit in range(8):
-        picture[:, size[0] * bit // 8 : size[0] * (bit + 1) // 8] = 230 * (index >> bit & 1) + 10
-    return picture
-
-
-def number(picture):
-    width = picture.shape[1]
-    return sum(int(picture[:, width * (2 * bit + 1) // 16].mean() > 128) << bit for bit in range(8))
 
 
 def film(path, frames=range(FRAMES), rate=25, size=(WIDTH, HEIGHT), skip=(), codec="libx264"):
