@@ -1,1 +1,1 @@
-"""Reading of video files frame by frame with PyAV, in any order, with an index of the visible frames."""
+"""Reads the frames of video files in any order."""

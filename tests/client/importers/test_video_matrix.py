@@ -53,7 +53,7 @@ HELD = {  # containers of each codec family
     "prores": ("mov", "mkv"),
     "raw": ("mov", "avi"),
     "palette": ("avi", "mov"),
-    "huffyuv": ("mkv", "avi"),
+    "huffyuv": ("avi",),
     "vp8": ("webm", "mkv"),
     "vp9": ("webm", "mkv", "mp4", "fragmented.mp4"),
     "av1": ("mp4", "webm", "mkv"),
