@@ -15,7 +15,10 @@ from client.importers.video.reader import Video
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.images import mixed_colours
 
-ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".mxf", ".wmv")
+ENDS = (
+    *(".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf", ".wmv", ".flv"),
+    *(".3gp", ".h264", ".hevc", ".mjpeg"),
+)
 RATE_TOLERANCE = 1e-3
 """Maximum relative difference between the frame rates of two cameras, roughly that between 29.97 and 30."""
 ALIKE = 0.05

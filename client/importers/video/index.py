@@ -49,7 +49,7 @@ class VideoIndex:
         grey: whether the pixel format is greyscale.
         spaced: whether `seconds` are computed from `rate`, because the timestamps do not increase.
         interlaced: whether any frame is interlaced.
-        transfer: transfer characteristics of the first frame, as numbered by ITU-T H.273.
+        transfer: transfer characteristics, as numbered by ITU-T H.273.
         turn: [2, 2] int8 matrix that the metadata apply to pixel positions (x, y); the identity if there is none.
     """
 
@@ -156,7 +156,7 @@ def _decoded_index(path: Path) -> VideoIndex:
             grey=first.format.name.startswith("gray"),
             spaced=spaced,
             interlaced=interlaced,
-            transfer=int(first.color_trc),
+            transfer=int(video.stream.codec_context.color_trc),
             turn=_turn(first, path),
         )
     finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import zlib
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ NEAR = 8
 """Maximum number of frames to skip by decoding them. For larger steps, seeking to a keyframe is usually faster."""
 SEEKS = 3
 """Keyframes to try, from the nearest backwards, before decoding from the start of the file."""
+PASSED_BYTES = 16 << 20
+"""Size of the decoded frames to keep that were skipped on the way to a frame, for reading backwards."""
 
 
 class Video:
@@ -53,8 +56,11 @@ class Video:
         self.remarks = conversion_remarks(index)
         self.turn = index.turn
         self._pixels = Pixels(path, index)
-        self._places = {int(stamp): place for place, stamp in enumerate(index.stamps)}
-        self._can_seek = len(self._places) == len(index) and NO_STAMP not in self._places
+        self._order = np.argsort(index.stamps)  # in AVI files with B-frames, timestamps are those of other frames
+        self._sorted = index.stamps[self._order]
+        self._can_seek = bool((np.diff(self._sorted) > 0).all()) and self._sorted[0] != NO_STAMP
+        self._most_passed = max(1, PASSED_BYTES // (3 * index.width * index.height))
+        self._passed: deque[tuple[int, Any]] = deque()
         self._lock = threading.Lock()
         self._start()
         self._last: tuple[int, Picture] | None = None
@@ -102,6 +108,11 @@ class Video:
     def _read(self, index: int) -> Picture:
         if self._index.damaged[index]:
             raise CaptureError(f"{self.path}: frame {index}, at {self.times[index]:.3f} s, is damaged")
+        for place, frame in self._passed:
+            if place == index:
+                picture = self._picture(index, frame, certain=False)
+                if picture is not None:
+                    return picture
         if self._continues_to(index):
             picture = self._advance(index)
             if picture is not None:
@@ -139,27 +150,39 @@ class Video:
         if not self._stream.seek(int(self._index.stamps[key])):
             return False
         self._from_start, self._next = False, key
-        self._decoding = (
-            (self._places[frame.pts], frame)
-            for frame in self._stream.frames()
-            if frame is not None and frame.pts in self._places
-        )
+        frames = (frame for frame in self._stream.frames() if frame is not None and frame.pts is not None)
+        self._decoding = ((self._place(frame.pts), frame) for frame in frames)
         return True
+
+    def _place(self, stamp: int) -> int:
+        """Returns the index of the frame with a timestamp, or −1 if there is none."""
+        place = min(int(np.searchsorted(self._sorted, stamp)), len(self) - 1)
+        return int(self._order[place]) if self._sorted[place] == stamp else -1
 
     def _advance(self, index: int) -> Picture | None:
         """Decodes up to a frame. Returns None if the frame does not come, or differs from that of the index."""
+        passed: deque[tuple[int, Any]] = deque(maxlen=self._most_passed)
         for place, frame in self._decoding:
             if place == index:
-                plain = self._stream.rgb(frame)
-                if not self._from_start and zlib.crc32(plain.data) != self._index.checksums[index]:
+                picture = self._picture(index, frame, certain=self._from_start)
+                if picture is None:
                     break
                 self._next = index + 1
-                converted = self._pixels.converted(frame)
-                return turned(plain if converted is frame else self._stream.rgb(converted), self.turn)
+                self._passed = passed or self._passed
+                return picture
             if place > index:
                 break
+            passed.append((place, frame))
         self._next = -1
         return None
+
+    def _picture(self, index: int, frame: Any, *, certain: bool) -> Picture | None:
+        """Returns the picture of a decoded frame, or None if it is not certain and differs from that of the index."""
+        plain = self._stream.rgb(frame)
+        if not certain and zlib.crc32(plain.data) != self._index.checksums[index]:
+            return None
+        converted = self._pixels.converted(frame)
+        return turned(plain if converted is frame else self._stream.rgb(converted), self.turn)
 
     def close(self) -> None:
         """Closes the file."""

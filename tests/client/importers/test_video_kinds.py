@@ -11,7 +11,8 @@ from rigs import transforms, write
 from client.importers.open_source import open_source
 from client.importers.video import index as video_index
 from client.importers.video.reader import Video
-from scas4d_core.captures import CaptureError
+from client.rig.sequence import Sequence, ping_pong
+from scas4d_core.captures import CaptureError, decode_image
 
 av = pytest.importorskip("av")
 
@@ -62,6 +63,16 @@ def test_a_cut_at_an_open_group_of_pictures(tmp_path):
 
     params = {"preset": "ultrafast", "x265-params": X265 + ":open-gop=1:bframes=3:b-adapt=0"}
     check(encode(tmp_path / "a.mp4", "libx265", edit=from_the_second_keyframe, **params), range(6, FRAMES))
+
+
+def test_push_from_the_middle_and_back_and_forth_over_open_groups_of_pictures(tmp_path):
+    params = {"preset": "ultrafast", "x265-params": X265 + ":open-gop=1:bframes=3:b-adapt=0"}
+    capture = open_source(rig(tmp_path, lambda path: encode(path, "libx265", **params)), encoding="png")
+    sequence = Sequence(capture, start=11, loop=True)
+    for index in range(20):
+        images = sequence.files(index).images
+        assert {number(decode_image(image)) for image in images.values()} == {11 + ping_pong(index, FRAMES - 11)}
+    sequence.close()
 
 
 def test_streams_without_timestamps_have_evenly_spaced_frames(tmp_path):

@@ -18,6 +18,9 @@ CONTAINERS = {
     "ts": {},
     "m2ts": {"muxing": {"mpegts_m2ts_mode": "1"}, "form": "mpegts"},
     "mpg": {"form": "vob"},
+    "flv": {},
+    "h264": {},
+    "mjpeg": {},
 }
 CODECS = {
     "h264 intra": ("libx264", {"g": 1}),
@@ -44,11 +47,11 @@ CODECS = {
     "av1": ("libsvtav1", {"g": 8, "preset": 12, "svtav1-params": "lp=1"}),
 }
 HELD = {  # containers of each codec family
-    "h264": ("mp4", "mov", "fragmented.mp4", "mkv", "avi", "ts", "m2ts"),
+    "h264": ("mp4", "mov", "fragmented.mp4", "mkv", "avi", "ts", "m2ts", "flv", "h264"),
     "hevc": ("mp4", "mov", "fragmented.mp4", "mkv", "ts", "m2ts"),
     "mpeg4": ("mp4", "mkv", "avi", "ts"),
     "mpeg2": ("mp4", "mkv", "avi", "ts", "mpg"),
-    "mjpeg": ("mov", "mkv", "avi"),
+    "mjpeg": ("mov", "mkv", "avi", "mjpeg"),
     "ffv1": ("mkv", "avi"),
     "prores": ("mov", "mkv"),
     "raw": ("mov", "avi"),

@@ -70,6 +70,17 @@ def test_comparing_each_frame_with_frame_0_decodes_each_once(tmp_path):
     video.close()
 
 
+def test_reading_backwards_decodes_each_frame_once(tmp_path):
+    video = Video(film(tmp_path / "a.mp4", range(40)))
+    decoded = []
+    own = video._stream.frames
+    video._stream.frames = lambda: (decoded.append(frame.pts) or frame for frame in own())
+    for index in reversed(range(40)):
+        assert number(video.frame(index)) == index
+    assert len(decoded) <= 40
+    video.close()
+
+
 def test_colours_come_back(tmp_path):
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w") as container:
