@@ -93,6 +93,13 @@ def test_joined_recordings_whose_times_begin_anew(tmp_path):
     assert (np.diff(Video(path).times) > 0).all()
 
 
+def test_a_codec_without_a_decoder_is_named(tmp_path):
+    path = encode(tmp_path / "a.mp4", "libx264")
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
+    with pytest.raises(CaptureError, match=r"a.mp4: FFmpeg has no decoder for its codec"):
+        Video(path)
+
+
 def test_odd_sizes(tmp_path):
     check(encode(tmp_path / "a.mkv", "ffv1", pix_fmt="yuv444p", draw=lambda index: barcode(index, (67, 49))), range(20))
 
