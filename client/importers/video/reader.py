@@ -132,8 +132,8 @@ class Video:
 
     def _continues_to(self, index: int) -> bool:
         """Returns whether decoding on is the best way to a frame: it is near, or no keyframe lies between."""
-        ahead = index - self._next
-        return self._next >= 0 <= ahead and (ahead <= NEAR or not self._index.keys[self._next + 1 : index + 1].any())
+        near = index - self._next <= NEAR or not self._index.keys[self._next + 1 : index + 1].any()
+        return 0 <= self._next <= index and near
 
     def _keys_before(self, index: int) -> NDArray[np.intp]:
         keys = np.flatnonzero(self._index.keys[: index + 1])[::-1]
