@@ -10,6 +10,8 @@ from films import barcode, number
 from lenses import HEIGHT, WIDTH
 from rigs import NAMES, lenses, transforms, write
 
+from client.importers import source
+from client.importers.extras import MissingExtraError
 from client.importers.open_source import open_source
 from client.importers.video.reader import Video
 from scas4d_core.captures import CaptureError, decode_image
@@ -95,6 +97,19 @@ def test_colours_come_back(tmp_path):
         for packet in [*stream.encode(frame), *stream.encode()]:
             container.mux(packet)
     assert np.abs(Video(path).frame(0).astype(int) - picture).max() <= 2
+
+
+def test_jpeg_files_are_the_same_without_opencv(monkeypatch):
+    picture = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
+    with_opencv = decode_image(source.encode(picture, "jpeg"))
+
+    def missing():
+        raise MissingExtraError("no OpenCV")
+
+    monkeypatch.setattr(source, "opencv", missing)
+    difference = with_opencv.astype(int) - decode_image(source.encode(picture, "jpeg"))
+    assert np.abs(difference).max() <= 2
+    assert np.abs(with_opencv.astype(int) - picture).mean() < 8  # colours in order, no chroma subsampling
 
 
 def test_a_rig_of_videos_is_a_source(rig_of_videos):
