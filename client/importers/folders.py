@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from client.importers.calibration import Calibration, listed, natural, stem
-from client.importers.extras import pyav
 from client.importers.pictures import READ
+from client.importers.video.reader import Video
 from client.importers.videos import ENDS
 from scas4d_core.captures import CaptureError, ImageError
 from scas4d_core.captures.images import picture_size
@@ -170,7 +171,8 @@ def size_of_pictures(capture: Path, camera: str, where: str) -> tuple[int, int]:
             continue
         path = source.entries[name][0]
         if source.kind == "videos":
-            return video_size(path)
+            with closing(Video(path)) as video:
+                return video.size
         files = pictures_in(path) if source.kind == "images" else [path]
         if files:
             return image_size(files[0])
@@ -194,22 +196,6 @@ def image_size(path: Path) -> tuple[int, int]:
         return picture_size(path)
     except ImageError as fault:
         raise CaptureError(str(fault)) from fault
-
-
-def video_size(path: Path) -> tuple[int, int]:
-    """Returns (width, height) of a video file.
-
-    Raises:
-        CaptureError: if the file cannot be read.
-        MissingExtraError: if PyAV is not installed.
-    """
-    av = pyav()
-    try:
-        with av.open(str(path)) as container:
-            context = container.streams.video[0].codec_context
-            return int(context.width), int(context.height)
-    except (av.FFmpegError, IndexError) as fault:
-        raise CaptureError(f"{path} cannot be read as video: {fault}") from fault
 
 
 def _normal(name: str) -> str:

@@ -12,6 +12,14 @@ from running import HEIGHT, WIDTH, Running, fake_settings, make_rig
 FRAMES = 4
 
 
+@pytest.fixture(autouse=True)
+def video_cache(tmp_path_factory, monkeypatch):
+    """Keeps indices of test videos out of the user's cache folder."""
+    folder = tmp_path_factory.mktemp("videos")
+    monkeypatch.setattr("client.importers.video.index.cache_folder", lambda: folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def service(tmp_path_factory):
     running = Running(fake_settings(tmp_path_factory.mktemp("data")))

@@ -6,29 +6,19 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from films import barcode, number
 from lenses import HEIGHT, WIDTH
 from rigs import NAMES, lenses, transforms, write
 
+from client.importers import source
+from client.importers.extras import MissingExtraError
 from client.importers.open_source import open_source
-from client.importers.videos import Video
+from client.importers.video.reader import Video
 from scas4d_core.captures import CaptureError, decode_image
 
 av = pytest.importorskip("av")
 
 FRAMES = 25
-
-
-def barcode(index, size=(WIDTH, HEIGHT)):
-    """A picture that says its number in eight broad bars: it survives any encoder."""
-    picture = np.zeros((size[1], size[0], 3), np.uint8)
-    for bit in range(8):
-        picture[:, size[0] * bit // 8 : size[0] * (bit + 1) // 8] = 230 * (index >> bit & 1) + 10
-    return picture
-
-
-def number(picture):
-    width = picture.shape[1]
-    return sum(int(picture[:, width * (2 * bit + 1) // 16].mean() > 128) << bit for bit in range(8))
 
 
 def film(path, frames=range(FRAMES), rate=25, size=(WIDTH, HEIGHT), skip=(), codec="libx264"):
@@ -72,13 +62,24 @@ def test_frames_come_exactly_in_any_order(tmp_path):
 def test_comparing_each_frame_with_frame_0_decodes_each_once(tmp_path):
     video = Video(film(tmp_path / "a.mp4", range(40)))
     met = []
-    own = video._pixels
-    video._pixels = lambda frame: met.append(frame.pts) or own(frame)
+    own = video._stream.rgb
+    video._stream.rgb = lambda frame: met.append(frame.pts) or own(frame)
     for index in range(40):
         assert (number(video.frame(index)), number(video.frame(0)), number(video.frame(index))) == (index, 0, index)
     # Frame 0 is decoded twice: it is kept once it was asked for again. Frame 1 is then found anew.
     assert len(met) <= 40 + 2
     assert video.frame(0) is video.frame(0)
+    video.close()
+
+
+def test_reading_backwards_decodes_each_frame_once(tmp_path):
+    video = Video(film(tmp_path / "a.mp4", range(40)))
+    decoded = []
+    own = video._stream.frames
+    video._stream.frames = lambda: (decoded.append(frame.pts) or frame for frame in own())
+    for index in reversed(range(40)):
+        assert number(video.frame(index)) == index
+    assert len(decoded) <= 40
     video.close()
 
 
@@ -96,6 +97,19 @@ def test_colours_come_back(tmp_path):
         for packet in [*stream.encode(frame), *stream.encode()]:
             container.mux(packet)
     assert np.abs(Video(path).frame(0).astype(int) - picture).max() <= 2
+
+
+def test_jpeg_files_are_the_same_without_opencv(monkeypatch):
+    picture = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
+    with_opencv = decode_image(source.encode(picture, "jpeg"))
+
+    def missing():
+        raise MissingExtraError("no OpenCV")
+
+    monkeypatch.setattr(source, "opencv", missing)
+    difference = with_opencv.astype(int) - decode_image(source.encode(picture, "jpeg"))
+    assert np.abs(difference).max() <= 2
+    assert np.abs(with_opencv.astype(int) - picture).mean() < 8  # colours in order, no chroma subsampling
 
 
 def test_a_rig_of_videos_is_a_source(rig_of_videos):

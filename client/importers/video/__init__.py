@@ -1,0 +1,1 @@
+"""Reads the frames of video files in any order."""
