@@ -129,6 +129,7 @@ class Scene:
             self._publisher,
             self._background,
             keep_frames=kept.keep_frames,
+            skips=self.rules.when_full == "skip",
             first=found.first,
         )
 

@@ -66,6 +66,7 @@ class Updates:
         publisher: publisher of the scene's events.
         background: the scene's background tasks.
         keep_frames: retention rule for images.
+        skips: whether a full queue skips frames. Updates then keep up with the frames once one has to wait.
         first: initial value of the attribute `first`.
 
     Attributes:
@@ -90,6 +91,7 @@ class Updates:
         background: Background,
         *,
         keep_frames: Retention,
+        skips: bool,
         first: Mapping[str, Any],
     ) -> None:
         self._log = scene_log
@@ -102,6 +104,9 @@ class Updates:
         self._publisher = publisher
         self._background = background
         self._keep_frames = keep_frames
+        self._skips = skips
+        self._keeps_up = False
+        """Whether updates must keep up with the frames, because a frame had to wait and waiting frames are skipped."""
         self._room_made: Callable[[], Awaitable[None]] | None = None
         self.clock = WorkClock()
         self.latencies = Latencies()
@@ -173,6 +178,7 @@ class Updates:
             if self._repair_queue.waiting and (seconds := self._repair_queue.begin()) > 0:
                 self._begin_in(seconds)
             return
+        self._keeps_up |= self._skips and len(waiting) > 1
         index, message = waiting[0], self._first_ready(waiting)
         ledger.set_state(index, FrameState.UPDATING)
         self._index, self._announced = index, None
@@ -188,7 +194,8 @@ class Updates:
         entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        budget = with_time_limit(self._ledger.budget_of(index), len(waiting) - 1)
+        interval = self.latencies.interval if self._keeps_up else None
+        budget = with_time_limit(self._ledger.budget_of(index), len(waiting) - 1, interval)
         return FrameReady(index, receipt.time, entry.files, receipt.identity, budget)
 
     def _announce_next(self) -> None:

@@ -21,6 +21,10 @@ def test_the_limit_follows_the_rate_and_the_queue():
     assert limits[4] == pytest.approx(limits[0] / 2)
     for other in (Budget(), Budget(iterations=30), Budget(budget_ms=70.0)):
         assert with_time_limit(other, 5) == other
+    assert with_time_limit(Budget(), 2, frame_seconds=1 / 25).budget_ms == limits[2]
+    assert with_time_limit(Budget(), 0, frame_seconds=0.0).budget_ms > 0
+    for own in (Budget(iterations=30), Budget(budget_ms=70.0)):
+        assert with_time_limit(own, 5, frame_seconds=0.1) == own
 
 
 @pytest.fixture
@@ -33,11 +37,8 @@ def served(tmp_path, monkeypatch):
     running.stop()
 
 
-def test_waiting_frames_get_less_time(served):
-    _, http, sdk, go_on = served
-    id = create(http)
-    found = sdk.set_budget(id, keep_up_fps=10.0)
-    assert (found.effective.keep_up_fps, found.effective.budget_ms) == (10, 90)
+def send_while_one_waits(http, id, go_on):
+    """Sends five frames, of which the second waits in the worker until the last one has arrived."""
     for index, red in enumerate((0, fakes.WAITS, 3, 4, 5)):
         answer = http.put(
             f"/v1/scenes/{id}/frames/{index}",
@@ -45,8 +46,18 @@ def test_waiting_frames_get_less_time(served):
             headers={"Content-Type": FRAME_MEDIA_TYPE},
         )
         assert answer.status_code == 202
+        if index == 0:
+            finished(http, id, 0)
     go_on.touch()
     finished(http, id, 4)
+
+
+def test_waiting_frames_get_less_time(served):
+    _, http, sdk, go_on = served
+    id = create(http)
+    found = sdk.set_budget(id, keep_up_fps=10.0)
+    assert (found.effective.keep_up_fps, found.effective.budget_ms) == (10, 90)
+    send_while_one_waits(http, id, go_on)
     budgets = [sdk.frame(id, index).budget for index in range(5)]
     limits = [budget.budget_ms for budget in budgets[2:]]
     assert limits == sorted(limits)  # the queue drains
@@ -54,6 +65,21 @@ def test_waiting_frames_get_less_time(served):
     assert limits[0] < 90
     assert {budget.keep_up_fps for budget in budgets[1:]} == {10}
     assert sdk.set_budget(id).effective.budget_ms is None
+
+
+def test_a_scene_that_skips_keeps_up_once_a_frame_waits(served):
+    _, http, sdk, go_on = served
+    refuses, skips, has_a_budget = create(http), create(http, when_full="skip"), create(http, when_full="skip")
+    sdk.set_budget(has_a_budget, iterations=7)
+    limits = {}
+    for id in (refuses, skips, has_a_budget):
+        go_on.unlink(missing_ok=True)
+        send_while_one_waits(http, id, go_on)
+        assert sdk.scene(id).skipped == 0
+        limits[id] = [sdk.frame(id, index).budget.budget_ms for index in range(1, 5)]
+    assert limits[refuses] == limits[has_a_budget] == [None] * 4
+    assert limits[skips][0] is None  # no frame had to wait yet
+    assert all(limit > 0 for limit in limits[skips][1:])  # including the last one, behind which none waits
 
 
 def test_two_time_limits_and_impossible_rates_are_refused(served):
