@@ -141,6 +141,8 @@ class Scene:
 
         if content.events:
             self._background.run(self.log.write(*content.events))
+        if kept.keep_frames.seconds is not None:
+            self._background.run(self.updates.retain())
         scrub = Scrub(
             definition,
             folder,
