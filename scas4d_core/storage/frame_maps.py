@@ -9,7 +9,7 @@ import operator
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterator, MutableMapping
-from typing import ClassVar, Generic, SupportsIndex, TypeVar
+from typing import Any, ClassVar, Generic, SupportsIndex, TypeVar
 
 from scas4d_core.storage.frame_arrays import Stamp
 
@@ -32,7 +32,7 @@ class FrameMap(MutableMapping[int, Value], Generic[Value]):
 
     def __init__(self) -> None:
         self._indices = array("q")
-        self._columns = [array(code) for code in self.codes]
+        self._columns: list[array[Any]] = [array(code, ()) for code in self.codes]
 
     def _row(self, place: int) -> Value:
         raise NotImplementedError
@@ -92,8 +92,8 @@ class FrameTimes(FrameMap[float]):
     def _numbers(self, value: float) -> tuple[float, ...]:
         return (value,)
 
-    def array(self) -> array[float]:
-        """Returns the times in the order of the frames; callers must not modify them."""
+    def column(self) -> array[float]:
+        """Returns the times in the order of the frames, without a copy; callers must not modify them."""
         return self._columns[0]
 
 

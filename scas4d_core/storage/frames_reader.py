@@ -164,7 +164,7 @@ class FramesReader:
     @property
     def times(self) -> NDArray[np.float64]:
         """[T] float64 times in seconds, in the order of ``indices``."""
-        return np.array(self._times.array(), dtype=np.float64)
+        return np.array(self._times.column(), dtype=np.float64)
 
     @property
     def files(self) -> FrameFiles | None:

@@ -147,7 +147,7 @@ def growth(rows: Sequence[Row], name: str = "memory") -> float:
     """Returns the ratio of the median memory in the last tenth of the rows to that in the first tenth."""
     tenth = max(1, len(rows) // 10)
     first, last = (statistics.median(getattr(row, name) for row in part) for part in (rows[:tenth], rows[-tenth:]))
-    return last / first
+    return float(last / first)
 
 
 def report(rig: Rig, rows: Sequence[Row]) -> str:

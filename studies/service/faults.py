@@ -68,15 +68,19 @@ class Kill:
 
 
 def planned_kills(frames: int, count: int, random_: random.Random) -> dict[int, list[Kill]]:
-    """Returns the kills at each frame: half of them after a stage of the pipeline, in order, then those at random."""
+    """Returns the kills at each frame: half of them after a stage of the pipeline, the others at random moments."""
     between = count // 2
     kinds = [(stage, victim) for stage in STAGES for victim in VICTIMS]
     staged = [Kill(victim, stage) for stage, victim in (kinds * (between // len(kinds) + 1))[:between]]
     planned: dict[int, list[Kill]] = {}
     for kill in [*staged, *(Kill(random_.choice(VICTIMS)) for _ in range(count - between))]:
         planned.setdefault(random_.randrange(kill.stage is not None, frames), []).append(kill)
-    order = [*STAGES, None]
-    return {index: sorted(kills, key=lambda kill: order.index(kill.stage)) for index, kills in planned.items()}
+    return planned
+
+
+def _in_order(kills: Sequence[Kill]) -> list[Kill]:
+    """Returns the kills at a frame in the order of their stages, then those at random moments."""
+    return sorted(kills, key=lambda kill: [*STAGES, None].index(kill.stage))
 
 
 def kills(
@@ -91,12 +95,15 @@ def kills(
         for index in range(len(study.frames)):
             thread = threading.Thread(target=sender.send, args=(index,))
             thread.start()
-            for kill in planned.get(index, ()):
+            for kill in _in_order(planned.get(index, ())):
                 hit = None
                 if kill.stage is None:
                     time.sleep(random_.uniform(0, 1.5 * update_s))
                 elif _wait_for_stage(service, scene, sender, index, kill.stage):
                     hit = kill.stage
+                elif index + 1 < len(study.frames):  # too late for this frame
+                    planned.setdefault(index + 1, []).append(kill)
+                    continue
                 if kill.victim == "service" or (hit and killed[index] >= KILLS_OF_A_WORKER_AT_A_FRAME):
                     done["service"] += 1
                     service.kill()
