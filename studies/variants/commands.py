@@ -79,7 +79,7 @@ def gaps(
     page: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Updates captures with skipped frames, and compares the result with updates of all frames.
+    """Updates captures with skipped frames, or with shorter updates, and compares both with updates of all frames.
 
     Example: scripts/bench gaps captures/robot captures/wheel --step 3
     """
