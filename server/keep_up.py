@@ -1,4 +1,4 @@
-"""Time limit of an update that must keep up with the frame rate of the cameras."""
+"""Limits of an update that must keep up with the frame rate of the cameras."""
 
 from __future__ import annotations
 
@@ -6,36 +6,50 @@ from client.wire import Budget
 
 SHARE = 0.9
 """Share of the frame interval that an update may take, so that slower frames do not delay the next ones."""
-LEAST_MS = 1.0
-"""Shortest time limit in milliseconds, for frames that arrive almost at once."""
 CATCH_UP = 4
 """Number of waiting frames at which an update may take only half of that time."""
 
+SHORTEST = 3
+"""Largest factor by which an update is shortened before frames are skipped. On `robot` at half size, a third of the
+iterations on every frame costs 1.5 dB, and all iterations on every third frame cost 6 dB (``scripts/bench gaps``)."""
 
-def with_time_limit(budget: Budget, waiting: int, frame_seconds: float | None = None) -> Budget:
-    """Returns the budget with the milliseconds that follow from the frame rate; unchanged if no rate applies.
+
+def with_time_limit(budget: Budget, waiting: int) -> Budget:
+    """Returns the budget with the milliseconds that follow from `keep_up_fps`; unchanged without `keep_up_fps`.
 
     The more frames are waiting, the less time each gets, so that the queue drains before frames must be skipped.
 
     Args:
-        budget: budget that applies to a frame. `keep_up_fps` takes precedence over `frame_seconds`.
+        budget: budget that applies to a frame.
         waiting: number of later frames that are waiting.
-        frame_seconds: measured interval between frames in seconds. It applies only to a budget without iterations and
-            time limit. None if updates need not keep up.
 
     Example:
         >>> with_time_limit(Budget(keep_up_fps=10), waiting=0).budget_ms
         90.0
         >>> with_time_limit(Budget(keep_up_fps=10), waiting=4).budget_ms
         45.0
-        >>> with_time_limit(Budget(), waiting=0, frame_seconds=0.1).budget_ms
-        90.0
     """
-    if budget.keep_up_fps is not None:
-        seconds = 1 / budget.keep_up_fps
-    elif frame_seconds is not None and budget.iterations is None and budget.budget_ms is None:
-        seconds = frame_seconds
-    else:
+    if budget.keep_up_fps is None:
         return budget
-    milliseconds = 1000 * seconds * SHARE / (1 + waiting / CATCH_UP)
-    return budget.model_copy(update={"budget_ms": max(LEAST_MS, round(milliseconds, 3))})
+    milliseconds = 1000 / budget.keep_up_fps * SHARE / (1 + waiting / CATCH_UP)
+    return budget.model_copy(update={"budget_ms": round(milliseconds, 3)})
+
+
+def with_fewer_iterations(budget: Budget, waiting: int, iterations: int) -> Budget:
+    """Returns the budget of a frame in a scene that skips frames when its queue is full.
+
+    While later frames are waiting, updates are shortened, so that the queue drains before frames must be skipped. A
+    budget with its own iterations or time limit is unchanged.
+
+    Args:
+        budget: budget that applies to a frame.
+        waiting: number of later frames that are waiting.
+        iterations: number of iterations in the scene's settings.
+
+    Example:
+        >>> [with_fewer_iterations(Budget(), waiting, 100).iterations for waiting in range(5)]
+        [None, 50, 33, 33, 33]
+    """
+    if waiting == 0 or any(limit is not None for limit in (budget.iterations, budget.budget_ms, budget.keep_up_fps)):
+        return budget
+    return budget.model_copy(update={"iterations": max(1, iterations // min(1 + waiting, SHORTEST))})

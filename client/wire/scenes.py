@@ -85,7 +85,10 @@ class IngestSettings(Model):
     )
     when_full: Literal["refuse", "skip"] = Field(
         default="refuse",
-        description="refuse: respond with 429 and Retry-After. skip: accept the new frame and skip the queued ones.",
+        description=(
+            "refuse: respond with 429 and Retry-After. skip: accept the new frame and skip the queued ones. To avoid "
+            "this, updates run as few as a third of the iterations while frames wait, unless the scene has a budget."
+        ),
     )
     minimum_cameras: int | None = Field(
         default=None,

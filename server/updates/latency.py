@@ -6,16 +6,12 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from itertools import islice
 
 from client.wire import FrameLatency
 from server import counters
 
 FRAMES_KEPT = 512
 """Number of newest frames whose times are kept in memory; a restart of the service forgets them."""
-
-INTERVALS = 32
-"""Number of newest frames over which the interval between frames is averaged, longer than most batches."""
 
 
 @dataclass
@@ -86,12 +82,6 @@ class Latencies:
             commit=times.committed - times.solved,
             total=times.committed - times.received,
         )
-
-    @property
-    def interval(self) -> float | None:
-        """Mean number of seconds between the newest frames, or None if fewer than two were received."""
-        newest = [times.received for times in islice(reversed(self._frames.values()), INTERVALS)]
-        return (newest[0] - newest[-1]) / (len(newest) - 1) if len(newest) > 1 else None
 
     def behind(self, unfinished: Iterable[int]) -> float:
         """Returns the seconds since the oldest of the given frames was received; 0 if there is none with a time."""

@@ -17,7 +17,7 @@ from client.wire import FrameReportModel, FrameState, IngestSettings, ProgressMo
 from server import counters
 from server.background import Background
 from server.hub import Publisher
-from server.keep_up import with_time_limit
+from server.keep_up import with_fewer_iterations, with_time_limit
 from server.messages import (
     ChangeRetention,
     DecodeAhead,
@@ -70,7 +70,7 @@ class Updates:
         publisher: publisher of the scene's events.
         background: the scene's background tasks.
         keep_frames: retention rule for images.
-        skips: whether a full queue skips frames. Updates then keep up with the frames once one has to wait.
+        skips: whether a full queue skips frames. Updates are then shortened while frames are waiting.
         first: initial value of the attribute `first`.
         now: clock that returns seconds since the epoch, for the age of images.
 
@@ -111,8 +111,6 @@ class Updates:
         self._background = background
         self._keep_frames = keep_frames
         self._skips = skips
-        self._keeps_up = False
-        """Whether updates must keep up with the frames, because a frame had to wait and waiting frames are skipped."""
         self._room_made: Callable[[], Awaitable[None]] | None = None
         self.clock = WorkClock()
         self.latencies = Latencies()
@@ -187,7 +185,6 @@ class Updates:
             if self._repair_queue.waiting and (seconds := self._repair_queue.begin()) > 0:
                 self._begin_in(seconds)
             return
-        self._keeps_up |= self._skips and len(waiting) > 1
         index, message = waiting[0], self._first_ready(waiting)
         ledger.set_state(index, FrameState.UPDATING)
         self._index, self._announced = index, None
@@ -203,8 +200,10 @@ class Updates:
         entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        interval = self.latencies.interval if self._keeps_up else None
-        budget = with_time_limit(self._ledger.budget_of(index), len(waiting) - 1, interval)
+        later = len(waiting) - 1
+        budget = with_time_limit(self._ledger.budget_of(index), later)
+        if self._skips:
+            budget = with_fewer_iterations(budget, later, self.worker.spec.settings.update.iterations)
         return FrameReady(index, receipt.time, entry.files, receipt.identity, budget)
 
     def _announce_next(self) -> None:

@@ -11,7 +11,7 @@ from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import FRAME_MEDIA_TYPE, Budget
-from server.keep_up import with_time_limit
+from server.keep_up import SHORTEST, with_fewer_iterations, with_time_limit
 
 
 def test_the_limit_follows_the_rate_and_the_queue():
@@ -21,10 +21,13 @@ def test_the_limit_follows_the_rate_and_the_queue():
     assert limits[4] == pytest.approx(limits[0] / 2)
     for other in (Budget(), Budget(iterations=30), Budget(budget_ms=70.0)):
         assert with_time_limit(other, 5) == other
-    assert with_time_limit(Budget(), 2, frame_seconds=1 / 25).budget_ms == limits[2]
-    assert with_time_limit(Budget(), 0, frame_seconds=0.0).budget_ms > 0
-    for own in (Budget(iterations=30), Budget(budget_ms=70.0)):
-        assert with_time_limit(own, 5, frame_seconds=0.1) == own
+
+
+def test_updates_are_shortened_to_a_third_and_only_while_frames_wait():
+    assert [with_fewer_iterations(Budget(), waiting, 90).iterations for waiting in (0, 1, 2, 9)] == [None, 45, 30, 30]
+    assert with_fewer_iterations(Budget(), 9, 2).iterations == 1
+    for own in (Budget(iterations=30), Budget(budget_ms=70.0), Budget(keep_up_fps=25.0)):
+        assert with_fewer_iterations(own, 5, 100) == own
 
 
 @pytest.fixture
@@ -67,19 +70,20 @@ def test_waiting_frames_get_less_time(served):
     assert sdk.set_budget(id).effective.budget_ms is None
 
 
-def test_a_scene_that_skips_keeps_up_once_a_frame_waits(served):
+def test_a_scene_that_skips_shortens_updates_while_frames_wait(served):
     _, http, sdk, go_on = served
     refuses, skips, has_a_budget = create(http), create(http, when_full="skip"), create(http, when_full="skip")
     sdk.set_budget(has_a_budget, iterations=7)
-    limits = {}
+    iterations = {}
     for id in (refuses, skips, has_a_budget):
         go_on.unlink(missing_ok=True)
         send_while_one_waits(http, id, go_on)
         assert sdk.scene(id).skipped == 0
-        limits[id] = [sdk.frame(id, index).budget.budget_ms for index in range(1, 5)]
-    assert limits[refuses] == limits[has_a_budget] == [None] * 4
-    assert limits[skips][0] is None  # no frame had to wait yet
-    assert all(limit > 0 for limit in limits[skips][1:])  # including the last one, behind which none waits
+        iterations[id] = [sdk.frame(id, index).budget.iterations for index in range(1, 5)]
+    usual = sdk.scene(skips).settings["update"]["iterations"]
+    assert iterations[refuses] == [None] * 4
+    assert iterations[has_a_budget] == [7] * 4
+    assert iterations[skips] == [None, usual // SHORTEST, usual // 2, None]  # two, one and no later frames wait
 
 
 def test_two_time_limits_and_impossible_rates_are_refused(served):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from waiting import Hand
 
-from server.updates.latency import FRAMES_KEPT, INTERVALS, Latencies
+from server.updates.latency import FRAMES_KEPT, Latencies
 
 
 @pytest.fixture
@@ -47,15 +47,3 @@ def test_a_long_take_needs_no_more_memory(latencies):
         latencies.receive(index)
     assert latencies.behind([0]) == 0
     assert len(latencies._frames) == FRAMES_KEPT
-
-
-def test_the_interval_is_averaged_over_the_newest_frames(latencies, clock):
-    assert latencies.interval is None
-    for index in range(4):
-        clock.at = index
-        latencies.receive(index)
-    assert latencies.interval == 1
-    for index in range(4, 4 + INTERVALS):
-        clock.at = 100 + index // 8  # in batches of eight
-        latencies.receive(index)
-    assert latencies.interval == pytest.approx(1 / 8, rel=0.05)
