@@ -11,7 +11,8 @@ CATCH_UP = 4
 
 SHORTEST = 3
 """Largest factor by which updates are shortened before frames are skipped. If frames arrive three times too fast,
-`robot` at half size loses 0.7 dB with shortened updates, and 5.4 dB with every third frame (``scripts/bench gaps``)."""
+`robot` at half size loses 0.7 dB with shortened updates, and 5.4 dB with every third frame. At full size, an update
+with a third of the iterations misses a fast motion (``scripts/bench gaps``)."""
 
 
 def with_time_limit(budget: Budget, waiting: int) -> Budget:
