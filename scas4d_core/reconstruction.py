@@ -364,6 +364,7 @@ class Reconstruction(CommittedScene):
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else observed.seconds,
             step=observed.seconds,
+            gap=frame.index - self.history.indices[-1],
             views=believed,
             suspects=[view for view in observed.views if past.is_left_out(view.name)],
             brightness=observed.bright,

@@ -13,7 +13,7 @@ from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
 from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import gpu_kernels, kernels, moving, startup
-from studies.live.commands import live
+from studies.live.commands import live, soak
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -28,16 +28,28 @@ from studies.rigs.commands import calibration, drift, rigs
 from studies.scale.commands import scale
 from studies.service.commands import crossing, faults, ingest, memory, sleeping, views
 from studies.simulation.commands import simulate
-from studies.variants.commands import variants
+from studies.variants.commands import gaps, variants
 
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, processors),
     "Rigs": (rigs, calibration, drift),
     "Quality of the output": (compact, opening, exports),
-    "Accuracy against time": (frontier, effort, paper, variants),
+    "Accuracy against time": (frontier, effort, paper, variants, gaps),
     "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
     "Hard cases": (stability, timing),
-    "The running service": (faults, ingest, live, views, memory, sleeping, crossing, cluster, head, simulate),
+    "The running service": (
+        faults,
+        ingest,
+        live,
+        soak,
+        views,
+        memory,
+        sleeping,
+        crossing,
+        cluster,
+        head,
+        simulate,
+    ),
 }
 """Maps each heading of `scripts/bench --help` to its commands."""
 

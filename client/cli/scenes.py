@@ -109,6 +109,12 @@ def keep(
         str | None,
         typer.Option(metavar="COUNT|all", help="Number of newest frames whose images to keep, or all."),
     ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1, help="Maximum age of images in minutes; without --frames, the only limit. Omit for no maximum."
+        ),
+    ] = None,
     states: Annotated[
         str | None,
         typer.Option(
@@ -129,6 +135,8 @@ def keep(
 ) -> None:
     """Changes how many images and committed states a scene keeps; takes effect immediately."""
     kept_frames, kept_states = _rule("--frames", frames), _rule("--states", states)
+    if minutes is not None:
+        kept_frames = (kept_frames or Retention()).model_copy(update={"seconds": 60 * minutes})
     with Client(url, token=token) as client:
         _told(client.edit_scene(scene, keep_frames=kept_frames, keep_states=kept_states, exact_states=exact))
 

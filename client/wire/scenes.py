@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from client.wire.base import MAX_CAMERAS, Labels, Model
 from client.wire.budgets import Budget
@@ -23,12 +23,31 @@ class Retention(Model):
     bytes: int | None = Field(
         default=None, ge=0, description="Maximum number of bytes to keep. Cannot be combined with `last`."
     )
+    seconds: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e9,
+        description=(
+            "Images only: maximum age in seconds since the frame was received. May be combined with `last` or `bytes`. "
+            "Checked after each commit and once a minute while the scene is awake."
+        ),
+    )
 
     @model_validator(mode="after")
     def _one_rule(self) -> Retention:
         if self.last is not None and self.bytes is not None:
             raise InputError("last and bytes cannot be combined", "set one of them, or neither to keep all frames")
         return self
+
+
+def _without_age(rule: Retention | None) -> Retention | None:
+    if rule is not None and rule.seconds is not None:
+        raise InputError("states have no maximum age", "set last or bytes; seconds applies to keep_frames")
+    return rule
+
+
+StateRetention = Annotated[Retention, AfterValidator(_without_age)]
+"""Retention rule for states, which has no maximum age."""
 
 
 class StateBounds(Model):
@@ -66,7 +85,10 @@ class IngestSettings(Model):
     )
     when_full: Literal["refuse", "skip"] = Field(
         default="refuse",
-        description="refuse: respond with 429 and Retry-After. skip: accept the new frame and skip the queued ones.",
+        description=(
+            "refuse: respond with 429 and Retry-After. skip: accept the new frame and skip the queued ones. To avoid "
+            "this, updates run as few as a third of the iterations while frames wait, unless the scene has a budget."
+        ),
     )
     minimum_cameras: int | None = Field(
         default=None,
@@ -86,7 +108,7 @@ class IngestSettings(Model):
         default=Retention(last=32),
         description=("Retention of images. Images of frames that are not yet committed are always kept."),
     )
-    keep_states: Retention = Field(
+    keep_states: StateRetention = Field(
         default=Retention(),
         description=(
             "Retention of committed states. The first and the two newest states are always kept. The "
@@ -141,7 +163,7 @@ class SceneEdit(Model):
         description="true to accept no more frames and sleep except when viewed. Refused while frames are queued.",
     )
     keep_frames: Retention | None = Field(default=None, description="As in `ingest`; takes effect immediately.")
-    keep_states: Retention | None = Field(
+    keep_states: StateRetention | None = Field(
         default=None, description="As in `ingest`; takes effect immediately and permanently deletes the other states."
     )
     exact_states: int | None = Field(
@@ -285,6 +307,9 @@ class SceneStatus(Model):
         description="Number of worker deaths since the scene woke up or its reconstruction started."
     )
     frames_kept: int = Field(description="Number of frames whose images are in the frame log.")
+    frames_deleted: int = Field(
+        default=0, description="Number of acknowledged frames whose images are no longer stored."
+    )
     frame_bytes: int = Field(description="Size of the frame log on disk, in bytes.")
     states_deleted: int = Field(description="Number of committed states that retention has deleted.")
     effects: dict[str, EffectStatus] = Field(

@@ -50,6 +50,8 @@ SEARCH = AttemptOptions("longer search", cold=True, iteration_factor=5.0)
 """Options of a search from the position that silhouettes suggest, or from the end of the update. If two of three frames
 of `robot` are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB with a factor of 2."""
 
+LONGEST_GAP = 3
+"""Largest factor on the iterations of an update after missing frames; the factor is the gap between the frames."""
 
 Solved = tuple[UpdateResult, Past]
 """The result of a frame, and the usual values after it."""
@@ -249,7 +251,9 @@ class FrameSolver:
         """Returns the options of an attempt at a frame, based on a template."""
         settings, past = self._settings, given.past
         iteration_factor = max(
-            template.iteration_factor, settings.cold_start_iterations if given.motion is None else 1.0
+            template.iteration_factor,
+            settings.cold_start_iterations if given.motion is None else 1.0,
+            min(given.gap, LONGEST_GAP),
         )
         most, end = round(iteration_factor * settings.iterations), None
         if given.end is not None:

@@ -28,6 +28,7 @@ class UpdateInput:
         motion: latest motion, or None for a cold start.
         seconds: time since the last learnt frame, in seconds.
         step: time since the previous frame, in seconds.
+        gap: difference between the indices of this and the previous frame; 1 unless frames are missing.
         views: training views used for the update.
         suspects: views of excluded cameras.
         brightness: mean of each camera's image, [0, 1], keyed by camera name.
@@ -64,5 +65,6 @@ class UpdateInput:
     left_out: Mapping[str, str] = field(default_factory=dict)
     unusable: str | None = None
     carried: Mapping[str, Arrays] = field(default_factory=dict)
+    gap: int = 1
     end: float | None = None
     iteration_seconds: float | None = None

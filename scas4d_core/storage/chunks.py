@@ -12,11 +12,12 @@ import json
 import os
 import re
 import weakref
-from bisect import bisect_right, insort
+from array import array
+from bisect import bisect_left, bisect_right, insort
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,11 @@ class Chunk:
         path: path of the file.
         size: size in bytes when the file was last checked.
         changed: modification time in ns when the file was last checked.
-        times: time of each frame in seconds, keyed by frame index.
-        stamps: stamp of each frame, keyed by frame index. A stamp consists of the frame's size in the file in bytes,
-            and −1 minus the checksum of the state. The negative value distinguishes it from stamps of frame files.
+        frames: index of each frame, in increasing order.
+        times: time of each frame in seconds.
+        sizes: size of each frame in the file in bytes.
+        checksums: −1 minus the checksum of each state. The negative value distinguishes the stamp (size, checksum)
+            of a frame in a chunk from stamps of frame files.
         damage: description of the first damage in the file, or None. Frames after the damage are not listed.
         foreign: whether the file has an unsupported format.
     """
@@ -53,8 +56,10 @@ class Chunk:
     path: Path
     size: int
     changed: int
-    times: dict[int, float] = field(default_factory=dict)
-    stamps: dict[int, Stamp] = field(default_factory=dict)
+    frames: Sequence[int] = ()
+    times: Sequence[float] = ()
+    sizes: Sequence[int] = ()
+    checksums: Sequence[int] = ()
     damage: str | None = None
     foreign: bool = False
 
@@ -62,6 +67,11 @@ class Chunk:
     def first(self) -> int:
         """Index of the first frame, from the file name."""
         return chunk_of(self.path.name) or 0
+
+    def place(self, index: int) -> int | None:
+        """Returns the position of a frame in the sequences, or None if the chunk does not contain it."""
+        place = bisect_left(self.frames, index)
+        return place if place < len(self.frames) and self.frames[place] == index else None
 
 
 class Chunks:
@@ -111,25 +121,34 @@ class Chunks:
         return isinstance(index, int) and self.of(index) is not None
 
     def __iter__(self) -> Iterator[int]:
-        return (index for first in self._firsts for index in self.known[first].times)
+        return (index for first in self._firsts for index in self.known[first].frames)
 
     def of(self, index: int) -> Chunk | None:
         """Returns the chunk that contains a frame, as of the last refresh, or None."""
         place = bisect_right(self._firsts, index) - 1
         chunk = self.known[self._firsts[place]] if place >= 0 else None
-        return chunk if chunk is not None and index in chunk.times else None
+        return chunk if chunk is not None and chunk.place(index) is not None else None
 
     def stamp(self, index: int) -> Stamp | None:
         """Returns the stamp of a frame, or None if no chunk contains it."""
-        return None if (chunk := self.of(index)) is None else chunk.stamps[index]
+        if (chunk := self.of(index)) is None or (place := chunk.place(index)) is None:
+            return None
+        return chunk.sizes[place], chunk.checksums[place]
 
     def time(self, index: int) -> float | None:
         """Returns the time of a frame in seconds, or None if no chunk contains it."""
-        return None if (chunk := self.of(index)) is None else chunk.times[index]
+        if (chunk := self.of(index)) is None or (place := chunk.place(index)) is None:
+            return None
+        return chunk.times[place]
 
     def stamps(self) -> dict[int, Stamp]:
         """Returns the stamps of all frames, in increasing order."""
-        return {index: stamp for first in self._firsts for index, stamp in self.known[first].stamps.items()}
+        chunks = [self.known[first] for first in self._firsts]
+        return {
+            index: (size, checksum)
+            for chunk in chunks
+            for index, size, checksum in zip(chunk.frames, chunk.sizes, chunk.checksums, strict=True)
+        }
 
     @property
     def damaged(self) -> list[str]:
@@ -169,7 +188,7 @@ class Chunks:
         arrays: Arrays = {}
         asked = {*names, *optional}
         if "time" in asked:
-            arrays["time"] = np.asarray(chunk.times[index], np.float64)
+            arrays["time"] = np.asarray(self.time(index), np.float64)
         if asked <= {"time"}:
             return arrays
         reader = self._reader(chunk)
@@ -287,9 +306,17 @@ def _listed(path: Path, status: os.stat_result) -> Chunk:
     size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:
-            times = dict(zip(reader.frames, reader.times.tolist(), strict=True))
-            stamps = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
-            return Chunk(path, size, changed, times, stamps, reader.damage)
+            sizes = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
+            return Chunk(
+                path,
+                size,
+                changed,
+                array("q", reader.frames),
+                array("d", reader.times.tolist()),
+                array("q", [sizes[index][0] for index in reader.frames]),
+                array("q", [sizes[index][1] for index in reader.frames]),
+                reader.damage,
+            )
     except (FileError, OSError) as error:
         return Chunk(
             path, size, changed, damage=f"{path.name}: {message_of(error)}", foreign=isinstance(error, FormatError)

@@ -288,7 +288,7 @@ class FrameFiles:
     def chunk_of(self, index: int) -> list[int]:
         """Returns all frames of the chunk that contains a frame, or just the frame itself if it is not in a chunk."""
         chunk = self.chunks.of(index)
-        return [index] if chunk is None else list(chunk.times)
+        return [index] if chunk is None else list(chunk.frames)
 
     def remove_oldest(self, deleted: Collection[int], left: Container[int]) -> None:
         """Deletes the files of frames, and the chunks that contain no remaining frames.
@@ -300,7 +300,7 @@ class FrameFiles:
         firsts: set[int] = set()
         for index in deleted:
             self.path(index).unlink(missing_ok=True)
-            if (chunk := self.chunks.of(index)) is not None and not any(other in left for other in chunk.times):
+            if (chunk := self.chunks.of(index)) is not None and not any(other in left for other in chunk.frames):
                 firsts.add(chunk.first)
         for first in firsts:
             self.chunks.remove(first)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.births import NO_EVENTS, Int
 from scas4d_core.storage.faults import DamagedFrameError, HistoryError, OtherFormatError, UnreadableFrameError
-from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpack_effects
+from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, unpack_effects
 from scas4d_core.storage.frame_files import FrameFiles, frame_file
+from scas4d_core.storage.frame_maps import FrameStamps, FrameTimes
 
 FRAMES_KEPT = 4
 """Number of frames of an on-disk history that are cached in memory: the newest and the most recently read ones."""
@@ -38,8 +39,8 @@ class FramesReader:
         self.damaged: dict[int, str] = {}
         self._fixed: Arrays = {}
         self._background: tuple[float, float, float] | None = None
-        self._times: dict[int, float] = {}
-        self._stamps: dict[int, Stamp] = {}
+        self._times = FrameTimes()
+        self._stamps = FrameStamps()
         self._texts: dict[int, bytes] = {}
         """JSON reports of the frames in memory, keyed by frame."""
         self._scratch_reports: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
@@ -99,7 +100,6 @@ class FramesReader:
             self._forget(index)
         for index in looked_at - listed.keys():
             self.damaged.pop(index, None)
-        newest = self._newest()
         added = []
         for index in changed:
             try:
@@ -112,8 +112,6 @@ class FramesReader:
                 self.damaged.pop(index, None)
                 added.append(index)
             self._stamps[index] = listed[index]
-        if added and added[0] < newest:
-            self._times = dict(sorted(self._times.items()))
         if added and not self._fixed:
             self._fixed = self._files.read_fixed(FIXED)
         return added, gone
@@ -166,7 +164,7 @@ class FramesReader:
     @property
     def times(self) -> NDArray[np.float64]:
         """[T] float64 times in seconds, in the order of ``indices``."""
-        return np.array(list(self._times.values()), dtype=np.float64)
+        return np.array(self._times.column(), dtype=np.float64)
 
     @property
     def files(self) -> FrameFiles | None:

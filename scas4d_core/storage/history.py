@@ -395,7 +395,7 @@ class History(HistoryReader):
         self._forget(index)
         self._stamps[index] = self._files.write(index, frame_file_arrays(frame, time, text, log, pack_effects(effects)))
         self.damaged.pop(index, None)
-        self._times = dict(sorted([*self._times.items(), (index, float(time))]))
+        self._times[index] = float(time)
 
 
 def _owned(array: NDArray[Any]) -> NDArray[Any]:

@@ -173,7 +173,7 @@ class Scrub:
 
     async def _scrub_frames_of(self, files: FrameFiles, chunk: Chunk) -> None:
         """Reports the unreadable frames of a damaged chunk to the repair queue."""
-        for index in chunk.times:
+        for index in chunk.frames:
             fault = await asyncio.to_thread(files.chunks.fault, index)
             if fault is not None and index in self._ledger.committed and not files.path(index).exists():
                 self._repair_queue.report_damage({files.path(index).name: fault})

@@ -129,6 +129,7 @@ class Scene:
             self._publisher,
             self._background,
             keep_frames=kept.keep_frames,
+            skips=self.rules.when_full == "skip",
             first=found.first,
         )
 
@@ -140,6 +141,8 @@ class Scene:
 
         if content.events:
             self._background.run(self.log.write(*content.events))
+        if kept.keep_frames.seconds is not None:
+            self._background.run(self.updates.retain())
         scrub = Scrub(
             definition,
             folder,

@@ -125,6 +125,7 @@ class SceneFacts:
             skipped=counts[FrameState.SKIPPED],
             worker_deaths=self.worker_deaths,
             frames_kept=len(self.pictures),
+            frames_deleted=ledger.frames.pictures_deleted,
             frame_bytes=self.pictures.bytes,
             states_deleted=ledger.states_deleted,
             effects=effects_of(settings, newest or None),

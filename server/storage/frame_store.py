@@ -14,6 +14,7 @@ import fcntl
 import os
 import re
 import secrets
+from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -233,20 +234,15 @@ class FrameLogIndex:
 
     Attributes:
         bytes: total size of all records in bytes.
+        frames: indices of frames with records, in ascending order; callers must not modify the list.
     """
 
     def __init__(self, folder: Path, sizes: Mapping[str, int]) -> None:
         self.folder = folder
-        self._sizes: dict[str, int] = {}
-        self._records: Counter[int] = Counter()
-        self.bytes = 0
-        for name, size in sizes.items():
-            self.add(name, size)
-
-    @property
-    def frames(self) -> list[int]:
-        """Indices of frames with records, in ascending order."""
-        return sorted(self._records)
+        self._sizes = dict(sizes)
+        self._records = Counter(map(frame_of, sizes))
+        self.frames = sorted(self._records)
+        self.bytes = sum(sizes.values())
 
     def __len__(self) -> int:
         """Returns the number of frames with records."""
@@ -255,7 +251,10 @@ class FrameLogIndex:
     def add(self, name: str, size: int) -> None:
         """Adds a record that is already on disk."""
         self._sizes[name] = size
-        self._records[frame_of(name)] += 1
+        index = frame_of(name)
+        if index not in self._records:
+            insort(self.frames, index)
+        self._records[index] += 1
         self.bytes += size
 
     def discard(self, names: Iterable[str]) -> None:
@@ -266,8 +265,17 @@ class FrameLogIndex:
                 self._records[index] -= 1
                 if not self._records[index]:
                     del self._records[index]
+                    del self.frames[bisect_left(self.frames, index)]
                 self.bytes -= size
 
     def size(self, names: Iterable[str]) -> int:
         """Returns the total size of the given records in bytes."""
         return sum(self._sizes.get(name, 0) for name in names)
+
+    def received(self, names: Iterable[str]) -> float:
+        """Returns when the newest of the given records was written, in seconds since the epoch; 0 if none exists."""
+        newest = 0.0
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                newest = max(newest, (self.folder / name).stat().st_mtime)
+        return newest

@@ -45,6 +45,7 @@ class FrameTable:
     Attributes:
         counts: number of frames in each state.
         committed: indices of frames with a readable committed state, in ascending order.
+        received: number of acknowledged frames.
         first: index of the first frame of the reconstruction. Earlier frames have the state FAILED,
             unless they are missing or skipped.
     """
@@ -53,6 +54,7 @@ class FrameTable:
         self.scene = scene
         self.counts = dict.fromkeys(FrameState, 0)
         self.committed: array[int] = array("q")
+        self.received = 0
         self.first = 0
         self._states = bytearray()
         self._flags = bytearray()
@@ -93,6 +95,11 @@ class FrameTable:
         """Yields the frames that have records in the frame log, in ascending order."""
         return (FrameEntry(self, index) for index in sorted(self._files))
 
+    @property
+    def pictures_deleted(self) -> int:
+        """Number of acknowledged frames whose images are no longer stored."""
+        return self.received - len(self._files)
+
     def states(self) -> NDArray[np.uint8]:
         """Returns a copy of the frame states [N], as indices into `STATES`."""
         return np.frombuffer(bytearray(self._states), np.uint8)
@@ -122,6 +129,7 @@ class FrameTable:
             parts: uploads of the single cameras, or None if the frame was uploaded as a whole.
         """
         self._times[index] = time
+        self.received += not self._flags[index] & RECEIPT
         self._flags[index] |= TIME | RECEIPT
         self._identities[IDENTITY * index : IDENTITY * (index + 1)] = bytes.fromhex(identity)
         self._files[index] = files

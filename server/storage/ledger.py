@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import copy
 import json
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 from blake3 import blake3
@@ -40,6 +42,8 @@ from server.storage.frame_store import FrameLogIndex, remove
 from server.storage.frame_table import CODES, DELETED, FEW_STATES, RECEIPT, FrameTable
 from server.storage.journal import Journal
 
+MOST_DELETED = 1000
+"""Maximum number of frames whose images are deleted at once, so that other work is not delayed."""
 RETRY_S = 1.0
 """Delay in seconds before writing an event is retried if the disk is full."""
 NO_FIRST_FRAME = "the scene failed at an earlier frame"
@@ -341,25 +345,31 @@ class SceneLog:
         self.pictures.discard(names)
         await asyncio.to_thread(remove, self.pictures.folder, names)
 
-    def deletable(self, rule: Retention) -> list[int]:
-        """Returns the frames whose images can be deleted under the retention rule, in ascending order.
+    def deletable(self, rule: Retention, now: float) -> list[int]:
+        """Returns frames whose images can be deleted under the retention rule, oldest first, at most `MOST_DELETED`.
 
         The images of unfinished frames are kept. An interrupted scene may roll back to one of its
         `NEWEST_KEPT` newest commits. The images of all frames after the oldest of these commits are
         therefore kept too.
+
+        Args:
+            rule: retention rule for images.
+            now: current time in seconds since the epoch.
         """
         ledger, pictures = self.ledger, self.pictures
-        if len(ledger.committed) < NEWEST_KEPT or (rule.last is None and rule.bytes is None):
+        if len(ledger.committed) < NEWEST_KEPT or rule == Retention():
             return []
         last_safe = ledger.committed[-NEWEST_KEPT]
-        frames = [index for index in pictures.frames if index in ledger.frames]
+        count = bisect_left(pictures.frames, len(ledger.frames))  # later records belong to open frames
         gone: list[int] = []
         total = pictures.bytes
-        for place, index in enumerate(frames):
+        for place, index in enumerate(islice(pictures.frames, count)):
             entry = ledger.frames[index]
-            surplus = rule.last is not None and len(frames) - place > rule.last
+            if index > last_safe or len(gone) == MOST_DELETED:
+                break
+            surplus = rule.last is not None and count - place > rule.last
             excess = rule.bytes is not None and total > rule.bytes
-            if index > last_safe or not (surplus or excess):
+            if not (surplus or excess or (rule.seconds and pictures.received(entry.files) < now - rule.seconds)):
                 break
             if not entry.finished:
                 continue

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +17,7 @@ from client.wire import FrameReportModel, FrameState, IngestSettings, ProgressMo
 from server import counters
 from server.background import Background
 from server.hub import Publisher
-from server.keep_up import with_time_limit
+from server.keep_up import with_fewer_iterations, with_time_limit
 from server.messages import (
     ChangeRetention,
     DecodeAhead,
@@ -44,6 +45,9 @@ from server.updates.trouble import Trouble, last_trouble, trouble_in_report
 from server.updates.work_clock import WorkClock
 from server.updates.worker_process import WorkerProcess, give_up_event
 
+AGE_CHECK_S = 60.0
+"""Seconds between checks for images that are too old while no frame is committed."""
+
 log = logging.getLogger("scas4d.server")
 
 
@@ -66,7 +70,9 @@ class Updates:
         publisher: publisher of the scene's events.
         background: the scene's background tasks.
         keep_frames: retention rule for images.
+        skips: whether a full queue skips frames. Updates are then shortened while frames are waiting.
         first: initial value of the attribute `first`.
+        now: clock that returns seconds since the epoch, for the age of images.
 
     Attributes:
         clock: predictor of when the current update ends.
@@ -90,7 +96,9 @@ class Updates:
         background: Background,
         *,
         keep_frames: Retention,
+        skips: bool,
         first: Mapping[str, Any],
+        now: Callable[[], float] = time.time,
     ) -> None:
         self._log = scene_log
         self._ledger = scene_log.ledger
@@ -102,6 +110,7 @@ class Updates:
         self._publisher = publisher
         self._background = background
         self._keep_frames = keep_frames
+        self._skips = skips
         self._room_made: Callable[[], Awaitable[None]] | None = None
         self.clock = WorkClock()
         self.latencies = Latencies()
@@ -119,6 +128,9 @@ class Updates:
         self._rule: IngestSettings | None = None
         """Retention rules for states that the worker has not confirmed yet, or None."""
         self._rule_sent = False
+        self._age_timer: asyncio.TimerHandle | None = None
+        """Timer that calls `retain` again when images may have become too old."""
+        self._now = now
         self._repair_timer: asyncio.TimerHandle | None = None
         """Timer that calls `begin` again when a repair is waiting for disk space."""
         worker.listen(self._on_message, self._on_worker_end)
@@ -188,7 +200,10 @@ class Updates:
         entry = self._ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        budget = with_time_limit(self._ledger.budget_of(index), len(waiting) - 1)
+        later = len(waiting) - 1
+        budget = with_time_limit(self._ledger.budget_of(index), later)
+        if self._skips:
+            budget = with_fewer_iterations(budget, later, self.worker.spec.settings.update.iterations)
         return FrameReady(index, receipt.time, entry.files, receipt.identity, budget)
 
     def _announce_next(self) -> None:
@@ -365,15 +380,22 @@ class Updates:
 
     async def retain(self) -> None:
         """Deletes images according to the scene's retention rule, except those needed to recompute states."""
-        gone = [i for i in self._log.deletable(self._keep_frames) if i not in self._repair_queue.waiting]
-        if not gone:
-            return
-        names = [name for index in gone for name in self._ledger.frames[index].files]
-        event = PicturesDeleted(frames=tuple(gone))
-        self._ledger.apply(event)
-        self._publisher.publish_status()
-        await self._log.delete_pictures(names)
-        await self._log.write(event)
+        while gone := [i for i in self._deletable() if i not in self._repair_queue.waiting]:
+            names = [name for index in gone for name in self._ledger.frames[index].files]
+            event = PicturesDeleted(frames=tuple(gone))
+            self._ledger.apply(event)
+            self._publisher.publish_status()
+            await self._log.delete_pictures(names)
+            await self._log.write(event)
+
+    def _deletable(self) -> list[int]:
+        """Returns frames whose images can be deleted, and schedules the next check if the rule has a maximum age."""
+        if self._age_timer is not None:
+            self._age_timer.cancel()
+        if self._keep_frames.seconds is not None and not self._stopped:
+            loop = asyncio.get_running_loop()
+            self._age_timer = loop.call_later(AGE_CHECK_S, lambda: self._background.run(self.retain()))
+        return self._log.deletable(self._keep_frames, self._now())
 
     async def set_retention(self, rules: IngestSettings) -> None:
         """Applies new retention rules and deletes the images and states that exceed them."""
@@ -422,5 +444,6 @@ class Updates:
         self._stopped = True
         self.worker.close()
         self._repair_queue.stop()
-        if self._repair_timer is not None:
-            self._repair_timer.cancel()
+        for timer in (self._repair_timer, self._age_timer):
+            if timer is not None:
+                timer.cancel()

@@ -52,7 +52,8 @@ export class Manage {
     if (name !== page.status.name) edit.name = name;
     for (const [id, field] of [["manage-frames", "keep_frames"], ["manage-states", "keep_states"]]) {
       const given = $(id).value === "" ? null : Number($(id).value);
-      if (given !== (page.status.ingest[field]?.last ?? null)) edit[field] = given === null ? {} : { last: given };
+      const { last, seconds } = page.status.ingest[field] ?? {};
+      if (given !== (last ?? null)) edit[field] = { ...(given !== null && { last: given }), ...(seconds && { seconds }) };
     }
     if (Object.keys(edit).length) await this.edit(edit, "saved");
     else this.say("no changes");

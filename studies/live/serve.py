@@ -15,5 +15,5 @@ from studies.live.null_engine import install
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--port", type=int, required=True)
-    app = create_app(ServerSettings(), Placement(install))
+    app = create_app(ServerSettings.from_environment(), Placement(install))
     uvicorn.Server(uvicorn_config(app, port=parser.parse_args().port, log_level="error")).run()

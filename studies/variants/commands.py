@@ -1,4 +1,4 @@
-"""The command `scripts/bench variants`."""
+"""The commands `scripts/bench variants` and `gaps`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import Again, Captures, Page, write_page
+from studies.options import Again, Captures, Changes, Page, write_page
 
 
 @with_capture_options
@@ -66,4 +66,30 @@ def variants(
         again=again,
         options=options,
     )
+    write_page(page, text)
+
+
+@with_capture_options
+def gaps(
+    captures: Captures,
+    options: CaptureOptions,
+    step: Annotated[int, typer.Option(min=2, help="Update only every this many frames.")] = 3,
+    frames: Annotated[int | None, typer.Option(min=4, help="Maximum number of frames of each capture.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of frame 0 and the updates.")] = 0,
+    page: Page = None,
+    changes: Changes = None,
+) -> None:
+    """Updates captures with skipped frames, or with shorter updates, and compares both with updates of all frames.
+
+    Example: scripts/bench gaps captures/robot captures/wheel --step 3
+    """
+    from studies.captures import open_measured
+    from studies.quality.settings import settings_of
+    from studies.variants.gaps import run
+
+    settings = settings_of("scas4d", None, seed, changes or ())
+    scale = settings.scene.image_scale
+    jobs = [(options.open(path), open_measured(path, options, image_scale=scale), settings) for path in captures]
+    text = run(jobs, frames, step, typer.echo)
+    typer.echo(text)
     write_page(page, text)

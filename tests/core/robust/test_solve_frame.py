@@ -153,6 +153,13 @@ def test_an_unmet_frame_is_sought_longer_and_from_where_the_update_ended() -> No
     assert outcome.outcome is FrameOutcome.RELOCATED
 
 
+@pytest.mark.parametrize(("gap", "factor"), [(1, 1), (2, 2), (3, 3), (40, 3)])
+def test_after_missing_frames_an_update_is_longer_up_to_a_limit(gap: int, factor: int) -> None:
+    fake = Fake(met())
+    solve(fake, given(gap=gap))
+    assert fake.options[0].stopping.most == factor * SETTINGS.iterations
+
+
 def test_what_is_sought_from_where_an_update_ended_has_the_motion_of_both() -> None:
     fake = Fake(met(LEVEL - 3))
     outcome, _ = solve(fake, given(replace(PAST, rejected=1)))

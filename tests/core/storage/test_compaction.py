@@ -172,7 +172,7 @@ def test_a_full_disk_loses_nothing_and_is_tried_again(tmp_path: Path, true: Hist
         pass
     moving.close()
     same(history, true, {0, *true.indices[-EXACT:]})
-    held = [index for chunk in history.files.chunks.known.values() for index in chunk.times]
+    held = [index for chunk in history.files.chunks.known.values() for index in chunk.frames]
     assert held == [index for index in true.indices[1:-EXACT]]  # each once
 
 
@@ -233,7 +233,7 @@ def test_a_chunk_that_is_gone_takes_its_frames_and_no_others(tmp_path: Path, tru
     with pytest.raises(UnreadableFrameError):
         history.gaussians(5)
     again = History.open(tmp_path / "states")
-    assert again.indices == [index for index in true.indices if index not in chunk.times]
+    assert again.indices == [index for index in true.indices if index not in chunk.frames]
 
 
 def test_retention_deletes_chunks_whole(tmp_path: Path) -> None:
@@ -332,7 +332,7 @@ def test_the_sizes_of_frames_in_a_chunk_are_those_of_its_file(tmp_path: Path) ->
     history = filled(tmp_path / "states")
     compacted(history)
     for chunk in history.files.chunks.known.values():
-        taken = sum(size for size, _ in chunk.stamps.values())
+        taken = sum(chunk.sizes)
         assert 0 <= chunk.path.stat().st_size - taken < 2000  # the index
 
 

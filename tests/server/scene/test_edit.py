@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 from fakes import SLOW
 from running import pictures, problem
@@ -16,7 +18,11 @@ def test_it_holds_over_a_restart(tmp_path):
     with serving_with(tmp_path) as (_, http, _sdk):
         id = filled(http)
         assert edit(http, id, name="rehearsal").json()["name"] == "rehearsal"
-        assert edit(http, id, keep_frames={"last": 3}).json()["ingest"]["keep_frames"] == {"last": 3, "bytes": None}
+        assert edit(http, id, keep_frames={"last": 3}).json()["ingest"]["keep_frames"] == {
+            "last": 3,
+            "bytes": None,
+            "seconds": None,
+        }
         put_to_sleep(http, id)
         assert status(http, id)["name"] == "rehearsal"
     with serving_with(tmp_path) as (_, http, _sdk):
@@ -57,6 +63,21 @@ def test_pictures_beyond_the_rule_go_at_once(tmp_path):
         id = filled(http, 6)
         assert status(http, id)["frames_kept"] == 6
         assert edit(http, id, keep_frames={"last": 1}).json()["frames_kept"] < 6
+
+
+def test_pictures_that_are_too_old_go_and_are_counted(tmp_path):
+    with serving_with(tmp_path) as (running, http, _sdk):
+        id = filled(http, 6)
+        for file in running.app.state.scenes[id].spec.folder.frames.iterdir():
+            os.utime(file, (0, 0))
+        edit(http, id, keep_frames={"seconds": 3600})
+        # The newest two may have to be updated again.
+        wait_for(lambda: (status(http, id)["frames_kept"], status(http, id)["frames_deleted"]) == (1, 5))
+        put_form(http, id, 6)
+        assert finished(http, id, 6)["state"] == "committed"
+        wait_for(lambda: status(http, id)["frames_deleted"] == 6)
+        assert status(http, id)["committed"] == 7  # the take is kept
+        assert problem(edit(http, id, keep_states={"seconds": 3600}), 422)["remedy"]
 
 
 def test_an_archived_scene_takes_no_frames_until_that_is_taken_back(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import fakes
@@ -77,3 +78,12 @@ def test_a_lost_frame_and_another_state_are_noticed():
         "frames [2] are not committed",
         "states [1] are not bit-identical: got b, expected c",
     ]
+
+
+def test_half_of_the_kills_are_between_stages():
+    planned = faults.planned_kills(16, 40, random.Random(0))
+    kills = [kill for at in planned.values() for kill in at]
+    staged = [kill for kill in kills if kill.stage is not None]
+    assert (len(kills), len(staged)) == (40, 20)
+    assert set(staged) == {faults.Kill(victim, stage) for victim in faults.VICTIMS for stage in faults.STAGES}
+    assert all(kill.stage is None for kill in planned.get(0, ()))  # frame 0 takes minutes
