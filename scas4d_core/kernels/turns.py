@@ -1,8 +1,8 @@
 """Rotations of neighbourhoods of Gaussians between two states (Kabsch 1976), and shortest axes of Gaussians.
 
-The rotation of a neighbourhood is u₁v₁ᵀ + u₂v₂ᵀ + (u₁×u₂)(v₁×v₂)ᵀ, where uₖ and vₖ are the two leading singular vectors of the covariance H
-of the positions. It is a proper rotation, even if the neighbourhood is flat. v is an eigenvector of HᵀH, found with
-Jacobi rotations, and u is Hv, normalized.
+The rotation of a neighbourhood is u₁v₁ᵀ + u₂v₂ᵀ + (u₁×u₂)(v₁×v₂)ᵀ, where uₖ and vₖ are the two leading singular vectors
+of the covariance H of the positions. It is a proper rotation, even if the neighbourhood is flat. v is an eigenvector of
+HᵀH, found with Jacobi rotations, and u is Hv, normalized.
 """
 
 from __future__ import annotations

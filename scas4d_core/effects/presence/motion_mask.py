@@ -129,7 +129,7 @@ def _changed_between(before: TrainingView, now: TrainingView) -> Array:
         return changed_pixels(before.target[:3], now.target[:3])
     from scas4d_core.kernels.pictures import mark_changes  # deferred import, because it loads the kernels
 
-    earlier, later = (np.ascontiguousarray(view.source[0]) for view in (before, now))
+    earlier, later = np.ascontiguousarray(before.pixels), np.ascontiguousarray(now.pixels)
     changed = np.empty(later.shape[:2], np.float32)
     mark_changes(earlier, later, int(255 * CHANGE), REACH_PIXELS // 2, changed)
     return changed
