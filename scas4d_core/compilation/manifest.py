@@ -101,7 +101,7 @@ KERNELS = (
         "kernels.turns.shortest_axes f3 d2",
         "kernels.pictures.mark_changes y3 y3 i i f2",
         "kernels.states.find_implausible f2 f3 f2 f3 f2 f2 i1 f f f b1 f2",
-        "kernels.states.find_outside f2 f3 i1 d2 d2 d b1",
+        "kernels.states.find_outside f2 f3 i1 d3 d2 d b1",
         "kernels.states.extrapolate_rows f2 f2 b1 f f2",
         "kernels.states.rotate_rows d2 s1 d2 d2",
     ),
