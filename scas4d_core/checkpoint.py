@@ -16,7 +16,6 @@ changed.
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -77,9 +76,10 @@ class CarryOver:
     def snapshot(self) -> CarryOver:
         """Returns a copy that later updates do not change.
 
-        The views in ``seen`` are shared, because images never change.
+        Only the arrays of effects are copied, because everything else is replaced, never changed.
         """
-        return replace(copy.deepcopy(replace(self, seen=())), seen=self.seen)
+        effects = {name: {key: array.copy() for key, array in own.items()} for name, own in self.effects.items()}
+        return replace(self, effects=effects)
 
     def after(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from itertools import pairwise
 from math import isfinite, nan
@@ -148,16 +148,20 @@ class FrameReport:
 
     def record(self) -> dict[str, Any]:
         """Returns the report as JSON data, with None in place of non-finite numbers."""
-        record: dict[str, Any] = _finite(asdict(self))
+        record: dict[str, Any] = _json_data(self)
         return record
 
 
-def _finite(value: Any) -> Any:
-    """Returns the value with None in place of non-finite numbers, which JSON cannot represent."""
+def _json_data(value: Any) -> Any:
+    """Returns a value as JSON data, with None in place of non-finite numbers, which JSON cannot represent."""
+    if type(value) is float:  # most values are floats
+        return value if isfinite(value) else None
+    if is_dataclass(value):
+        return {item.name: _json_data(getattr(value, item.name)) for item in fields(value)}
     if isinstance(value, dict):
-        return {str(name): _finite(inner) for name, inner in value.items()}
+        return {str(name): _json_data(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
+        return [_json_data(inner) for inner in value]
     if isinstance(value, StrEnum):
         return value.value
     return None if isinstance(value, float) and not isfinite(value) else value

@@ -31,7 +31,7 @@ from PIL import Image, ImageCms
 
 from scas4d_core.frame_outcome import grey_warnings
 
-PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM")
 MASK_FORMATS = ("PNG", "BMP")
 EXIF_ORIENTATION = 0x0112
 

@@ -80,6 +80,7 @@ KERNELS = (
         "kernels.tiles.fill_tiles i1 i1 s2 w1 i2 s1 s1 w1",
         "kernels.tiles.tile_offsets s2 i1 i2",
         "kernels.tiles.share_pairs s1 i s1 i1",
+        "kernels.pictures.fill_planes y3 f3",
     ),
     *_of(
         KernelGroup.ENTANGLED,
@@ -96,6 +97,13 @@ KERNELS = (
         "kernels.tiles.compose_box f3 f3 w1 i i*4 f3 d1",
         "kernels.tiles.find_meeting f2 s2 i w1 b1",
         "kernels.tiles.write_blocks f3 w1 i i*4 f3",
+        "kernels.turns.turn_neighbourhoods f2 f2 i2 d3",
+        "kernels.turns.shortest_axes f3 d2",
+        "kernels.pictures.mark_changes y3 y3 i i f2",
+        "kernels.states.find_implausible f2 f3 f2 f3 f2 f2 i1 f f f b1 f2",
+        "kernels.states.find_outside f2 f3 i1 d3 d2 d b1",
+        "kernels.states.extrapolate_rows f2 f2 b1 f f2",
+        "kernels.states.rotate_rows d2 s1 d2 d2",
     ),
     *_of(
         KernelGroup.SEPARATE,

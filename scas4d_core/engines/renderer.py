@@ -183,8 +183,10 @@ def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians
         after: state Θ_t of the same Gaussians.
         share: fraction of the motion to add. A negative fraction moves the state back.
     """
-    rows = np.flatnonzero(after.moving)
-    arrays = {name: getattr(after, name).copy() for name in ("means", "factors")}
-    for name, array in arrays.items():
-        array[rows] += np.float32(share) * (getattr(after, name)[rows] - getattr(before, name)[rows])
-    return after.replace(**arrays)
+    from scas4d_core.kernels.states import extrapolate_rows  # deferred import, because it loads the kernels
+
+    means, factors = np.empty_like(after.means), np.empty_like(after.factors)
+    for old, new, result in ((before.means, after.means, means), (before.factors, after.factors, factors)):
+        flat = (array.reshape(len(result), -1) for array in (old, new))
+        extrapolate_rows(*flat, after.moving, np.float32(share), result.reshape(len(result), -1))
+    return after.replace(means=means, factors=factors)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log, nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,14 +115,16 @@ def alarms_of(
     changes = {name: value - watches[name].sharp for name, value in sharp.items()}
     common = float(np.nanmedian(list(changes.values()))) if not np.isnan(list(changes.values())).all() else 0.0
     few_same = len(same) <= MAX_OUT * count
-    moved = {name: colour - _known(watches[name].colours, colour) for name, colour in beside.items() if name in watches}
+    shifts = colour_changes(
+        {name: (watches[name].colours, colours) for name, colours in beside.items() if name in watches}
+    )
     spread = (
-        _upper_median(odd_channel_change(change) for change in moved.values()),
-        _upper_median(common_change(change) for change in moved.values()),
+        _upper_median(shift.odd_channel for shift in shifts.values()),
+        _upper_median(shift.common for shift in shifts.values()),
     )
     for name, before in watches.items():
         now, alarms = _check_camera(
-            name, before, past, offsets.get(name), beside.get(name), sharp[name], changes[name] - common,
+            name, before, past, offsets.get(name), shifts.get(name), sharp[name], changes[name] - common,
             few_same and name in same, spread,
         )  # fmt: skip
         watch[name] = now.row()
@@ -137,7 +140,7 @@ def _check_camera(
     before: CameraFigures,
     past: Past,
     offset: float | None,
-    colours: Numbers | None,
+    shift: ColourChange | None,
     sharp: float,
     sharper: float,
     same: bool,
@@ -150,7 +153,7 @@ def _check_camera(
         before: previous figures of the camera.
         past: usual values of all cameras.
         offset: offset of the camera from its usual fit, in dB, or None if it was not rendered.
-        colours: colours of the camera relative to the other cameras, or None if unknown.
+        shift: change of the camera's colours relative to the other cameras, or None if unknown.
         sharp: sharpness of the image.
         sharper: change from the usual sharpness, relative to the other cameras.
         same: whether the image is unchanged while those of other cameras have changed.
@@ -168,10 +171,8 @@ def _check_camera(
                 "camera has moved, is dirty or lags"
             )
             alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
-    if colours is not None:
-        usual = _known(before.colours, colours)
-        change = colours - usual
-        tint, gain = odd_channel_change(change), common_change(change)
+    if shift is not None:
+        change, tint, gain = shift.change, shift.odd_channel, shift.common
         tints, gains = np.maximum(TINT, SPREAD * spread[0]), np.maximum(GAIN, SPREAD * spread[1])
         now = replace(now, tint=before.tint + 1 if tint > tints[0] else 0)
         now = replace(now, gain=before.gain + 1 if abs(gain) > gains[0] else 0)
@@ -188,7 +189,7 @@ def _check_camera(
             )
             alarms.append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
         if not now.tint and not now.gain:
-            red, green, blue = (usual + FOLLOWS * change).tolist()
+            red, green, blue = (shift.usual + FOLLOWS * change).tolist()
             now = replace(now, colours=(red, green, blue))
     if not np.isnan(sharper):
         now = replace(now, blur=before.blur + 1 if abs(sharper) > SHARPNESS[0] else 0)
@@ -206,20 +207,35 @@ def _check_camera(
     return now, alarms
 
 
-def odd_channel_change(change: Numbers) -> float:
-    """Returns the largest change of one of three channels relative to their median."""
-    return float(np.abs(change - np.median(change)).max())
+class ColourChange(NamedTuple):
+    """Change of a camera's colours.
+
+    Attributes:
+        usual: [3] usual colours, or the current ones if the usual colours are unknown.
+        change: [3] current minus usual colours.
+        odd_channel: largest change of one channel relative to the median of the channels.
+        common: change that the channels share, which is their median change.
+    """
+
+    usual: Numbers
+    change: Numbers
+    odd_channel: float
+    common: float
 
 
-def common_change(change: Numbers) -> float:
-    """Returns the change that three channels share, which is their median change."""
-    return float(np.median(change))
-
-
-def _known(usual: tuple[float, float, float], now: Numbers) -> Numbers:
-    """Returns the [3] usual colours, or the current ones if the usual colours are unknown."""
-    known: Numbers = np.where(np.isnan(usual), now, usual)
-    return known
+def colour_changes(
+    colours: Mapping[str, tuple[tuple[float, float, float], Numbers]],
+) -> dict[str, ColourChange]:
+    """Returns the change of each camera's colours, given its usual (NaN if unknown) and its current colours."""
+    if not colours:
+        return {}
+    known, now = (np.array(values) for values in zip(*colours.values(), strict=True))
+    usual = np.where(np.isnan(known), now, known)
+    changes = now - usual
+    common = np.median(changes, axis=1)
+    odd = np.abs(changes - common[:, None]).max(axis=1)
+    rows = zip(usual, changes, odd.tolist(), common.tolist(), strict=True)
+    return {name: ColourChange(*row) for name, row in zip(colours, rows, strict=True)}
 
 
 def _upper_median(sizes: Iterable[float]) -> float:

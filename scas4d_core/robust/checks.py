@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
 from math import nan
 from zlib import crc32
 
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels.states import find_implausible
 from scas4d_core.robust.outliers import Past, unless_most
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
@@ -254,17 +254,12 @@ def check_plausible(
         state ``before``, and the reason.
     """
     after = result.gaussians
-    bad = np.zeros(len(after), np.bool_)
-    with np.errstate(over="ignore", invalid="ignore"):
-        colours = _over_columns(np.maximum, np.abs(after.colours))
-        bad |= ~(colours <= BRIGHTEST)  # comparisons with NaN are false
-        moved = _over_columns(np.add, np.square(after.means[rows] - before.means[rows]))
-        squares = np.square(after.factors[rows]).sum(axis=1)
-        lengths = _over_columns(np.maximum, squares)
-        turned = _over_columns(np.add, np.square(after.rotations[rows]))
-        fine = (moved <= (FARTHEST * radius) ** 2) & (lengths <= (LONGEST * radius) ** 2) & (np.abs(turned - 1) < 0.01)
-        fine &= _oriented(before.factors[rows], after.factors[rows])
-    bad[rows] |= ~fine
+    bad, squares = np.empty(len(after), np.bool_), np.empty((len(rows), 3), np.float32)
+    limits = (np.float32(limit) for limit in ((FARTHEST * radius) ** 2, (LONGEST * radius) ** 2, BRIGHTEST))
+    find_implausible(
+        before.means, before.factors, after.means, after.factors, after.rotations, after.colours, rows, *limits,
+        bad, squares,
+    )  # fmt: skip
     count = int(bad.sum())
     if count > max(1, FEW * len(rows)):
         fault = f"{count} of {len(rows)} Gaussians have non-finite values, or moved or grew too much"
@@ -276,11 +271,6 @@ def check_plausible(
         arrays = {name: np.where(_like(bad, now), then, now) for name, then, now in _pairs(before, after)}
         after = after.replace(**arrays)
     return replace(result, gaussians=after, frozen=count, bounded=bounded), None
-
-
-def _over_columns(function: np.ufunc, array: Array) -> Array:
-    """Returns the sums or maxima [M] over the few columns of an array [M, C], five times as fast as NumPy."""
-    return reduce(function, np.moveaxis(array, 1, 0))
 
 
 def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:
@@ -301,19 +291,6 @@ def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: A
     factors = after.factors.copy()
     factors[rows[which], :, axis] *= np.sqrt(bound / np.maximum(there, np.finfo(np.float32).tiny))[:, None]
     return after.replace(factors=factors), len(which)
-
-
-def _oriented(before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns the [M] mask of Gaussians for which the map between two factors [M, 3, 3] preserves orientation."""
-    same: NDArray[np.bool_] = ~(np.sign(_det(before)) * np.sign(_det(after)) < 0)
-    return same
-
-
-def _det(factors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns the [M] determinants of [M, 3, 3] factors; only their sign is used."""
-    a, b, c = factors[:, 0], factors[:, 1], factors[:, 2]
-    det: NDArray[np.float32] = (a * np.cross(b, c)).sum(axis=1)
-    return det
 
 
 def _pairs(before: Gaussians, after: Gaussians) -> list[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:

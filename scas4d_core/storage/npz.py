@@ -76,7 +76,9 @@ def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
         for name, given in arrays.items():
             array = np.asarray(given)
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+                values = array if array.flags.c_contiguous else array.copy()
+                np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(values))
+                member.write(values.reshape(-1).view(np.uint8).data)  # ``write_array`` would copy the values
             checksums[name] = _digest(array)
         archive.comment = _comment(checksums)
 

@@ -9,6 +9,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import area_average, resize_area
 from scas4d_core.engines.views import CameraArrays, TrainingView
+from scas4d_core.kernels.pictures import fill_planes
 
 Array = NDArray[np.float32]
 
@@ -66,7 +67,7 @@ class ViewFactory:
             image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
             channels = 3 if mask is None else 4
             target = np.empty((channels, camera.height, camera.width), np.float32)
-            np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
+            fill_planes(np.ascontiguousarray(image), target)
             if mask is not None:
                 target[3] = mask
             exposure = np.tile(np.array([1, 0], np.float32), (channels, 1))

@@ -1,7 +1,7 @@
 """Validation of a frame's image files without decoding pixels: names, sizes and file structure.
 
-The structure checks cover the segments of a JPEG up to its end marker, the chunks and checksums of a PNG, and the RIFF
-chunks of a WebP.
+The structure checks cover the segments of a JPEG up to its end marker, the chunks and checksums of a PNG, the RIFF
+chunks of a WebP, and the length of a PPM or PGM.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from scas4d_core.errors import InputError
 from server.problems import Problem, count_noun
 
 _SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL)
+_RAW_HEAD = re.compile(rb"P([56])[ \t\r\n]+(\d{1,6})[ \t\r\n]+(\d{1,6})[ \t\r\n]+(\d{1,6})[ \t\r\n]")
+"""Header of a binary PGM or PPM file, up to the first byte of its pixels: format, width, height and maximum value."""
 MASK = "mask."
 EXIF_ORIENTATION = 0x0112
 
@@ -172,7 +174,7 @@ class StructureError(InputError):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of an image, with its format ("jpeg", "png" or "webp") and its size in pixels."""
+    """Header of an image, with its format ("jpeg", "png", "webp" or "ppm") and its size in pixels."""
 
     format: str
     width: int
@@ -199,10 +201,12 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
         return _png(data)
     if start[:4] == b"RIFF" and start[8:] == b"WEBP":
         return _webp(data)
+    if start[:2] in (b"P5", b"P6"):
+        return _ppm(data)
     if not start:
         raise StructureError("the file is empty", "send the image as JPEG, PNG or WebP")
     raise StructureError(
-        f"not a JPEG, PNG or WebP file: it starts with {start[:8].hex(' ')}",
+        f"not a JPEG, PNG, WebP, PPM or PGM file: it starts with {start[:8].hex(' ')}",
         "encode the image in one of these formats",
     )
 
@@ -300,6 +304,24 @@ def _png(data: memoryview) -> ImageHeader:
     if not pixels:
         raise StructureError("the PNG file contains no pixels", "the file is damaged; send the original again")
     return header
+
+
+def _ppm(data: memoryview) -> ImageHeader:
+    head = _RAW_HEAD.match(data[:64])
+    if head is None:
+        raise StructureError(
+            "the PPM or PGM file has no valid header", "begin it with P6 or P5, width, height and 255, without comments"
+        )
+    form, width, height, most = (int(number) for number in head.groups())
+    if most != 255:
+        raise StructureError(f"the maximum value of the PPM or PGM file is {most}", "use 255", f"maximum value {most}")
+    size = head.end() + width * height * (3 if form == 6 else 1)
+    if len(data) != size:
+        raise StructureError(
+            f"the PPM or PGM file has {len(data)} bytes, but its header declares {size}",
+            "send one byte per channel and pixel, and nothing else",
+        )
+    return ImageHeader("ppm", width, height)
 
 
 def _webp(data: memoryview) -> ImageHeader:

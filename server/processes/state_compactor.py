@@ -15,7 +15,7 @@ from server.processes.compact_answers import compact_head
 from server.storage.disk import no_room
 
 BEHIND = 8
-"""Number of states due for compaction above which one is compacted even if a frame is waiting."""
+"""Number of states due for compaction above which one is compacted although there is other work."""
 
 log = logging.getLogger("scas4d.worker")
 
@@ -43,14 +43,14 @@ class StateCompactor:
         self._compaction = None
 
     def compact_while_idle(self, history: History, waits: Callable[[], bool]) -> None:
-        """Compacts due states until a message arrives.
+        """Compacts due states until there is other work.
 
-        If more than `BEHIND` states are due, one state is compacted even if a message is waiting.
+        If more than `BEHIND` states are due, one state is compacted in any case.
         If the disk is full, the next call tries again.
 
         Args:
             history: the scene's committed states.
-            waits: function that returns whether a message is waiting.
+            waits: function that returns whether a message is waiting or a commit is being written.
         """
         exact = self._rules.exact_states
         if self._failed or exact is None:

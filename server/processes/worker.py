@@ -170,7 +170,10 @@ class Worker:
             if idle:
                 self._commits.delete_files()
             if self.states is not None and len(self.states) > (self.spec.retention.exact_states or len(self.states)):
-                self._compacting.compact_while_idle(self.states, lambda: self.inbox.waiting)
+                # A commit that is being written has priority, because compaction also waits for the disk.
+                self._compacting.compact_while_idle(
+                    self.states, lambda: self.inbox.waiting or not self._commits.wait(0)
+                )
             try:
                 return self.inbox.next(None if idle else IDLE_CHECK_S)
             except TimeoutError:

@@ -86,7 +86,13 @@ PICTURE: dict[str, Any] = {
 }
 MOST_STATES = 120
 """Maximum number of frames in a requested compact file; they take a few seconds of reader time and a few megabytes."""
-SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"), b"RI": ("image/webp", ".webp")}
+SENT_AS = {
+    b"\xff\xd8": ("image/jpeg", ".jpg"),
+    b"\x89P": ("image/png", ".png"),
+    b"RI": ("image/webp", ".webp"),
+    b"P5": ("image/x-portable-graymap", ".pgm"),
+    b"P6": ("image/x-portable-pixmap", ".ppm"),
+}
 """Media type and file extension of an image file, keyed by its first two bytes."""
 FILE: dict[int | str, dict[str, Any]] = {
     200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "File as uploaded."}

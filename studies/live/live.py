@@ -35,6 +35,8 @@ DIFFERENT_FRAMES = 8
 """Number of different frames, which are played back and forth."""
 SETTINGS = {"static": {"iterations": 2000}, "update": {"skip_tolerance": -1}}
 """Settings of the scene: a short fit of frame 0, and no skipped updates, because the scene is still."""
+SHORTEST_WAIT_S = 0.005
+"""Minimum time between two attempts to send a frame. A sender that asks more often takes time from the service."""
 FIRST = 2
 """Number of frames before the measurement: the first frame and the first update, which are slower."""
 
@@ -144,7 +146,7 @@ def _put(service: Service, scene: str, index: int, frames: Sequence[Mapping[str,
             return
         if answer.status_code != 429:
             raise StudyError(answer.text)
-        time.sleep(0.002)
+        time.sleep(max(SHORTEST_WAIT_S, answer.json()["retry_after_seconds"]))
 
 
 def run(capture: Capture, rig: Rig, count: int, work: Path) -> LiveResult:

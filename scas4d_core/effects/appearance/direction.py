@@ -31,7 +31,7 @@ FEW = 4
 
 
 def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
+    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (``kernels.turns``).
 
     Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a surface,
     and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the same result.
@@ -40,14 +40,10 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
         before, after: [N, 3] positions of the Gaussians in the two states, in metres.
         near: [M, k] rows of the Gaussians in each neighbourhood.
     """
-    there, now = before[near].astype(np.float64), after[near].astype(np.float64)
-    there -= there.mean(axis=1, keepdims=True)
-    now -= now.mean(axis=1, keepdims=True)
-    spread = np.einsum("nki,nkj->nij", now, there)
-    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # non-finite neighbourhoods are not rotated
-    left, _, right = np.linalg.svd(spread)
-    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    turns: NDArray[np.float64] = left @ right
+    from scas4d_core.kernels.turns import turn_neighbourhoods  # deferred import, because it loads the kernels
+
+    turns = np.empty((len(near), 3, 3))
+    turn_neighbourhoods(before, after, near, turns)
     return turns
 
 

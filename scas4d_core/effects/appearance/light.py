@@ -45,9 +45,10 @@ def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Dou
         rows: [R] rows of the Gaussians.
         centre: [3] centre of the cameras, in metres.
     """
-    factors, means = state.factors[rows].astype(np.float64), state.means[rows].astype(np.float64)
-    axes = np.linalg.eigh(factors @ factors.transpose(0, 2, 1)).eigenvectors
-    normals = axes[:, :, 0]
+    from scas4d_core.kernels.turns import shortest_axes  # deferred import, because it loads the kernels
+
+    means, normals = state.means[rows].astype(np.float64), np.empty((len(rows), 3))
+    shortest_axes(state.factors[rows], normals)
     normals *= np.where((normals * (centre - means)).sum(axis=1) < 0, -1, 1)[:, None]
     return np.concatenate([np.ones((len(rows), 1)), normals, means - means.mean(axis=0)], axis=1)
 

@@ -87,19 +87,14 @@ def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels |
     _, height, width = target.shape
     step = every * max(1, round(float(np.sqrt(height * width / LOOKED_AT))) // every)
     inner, across = np.arange(step, height - 1, step), np.arange(step, width - 1, step)
-    rows, columns = inner[:, None], across[None, :]
+    above, rows, below = (slice(step + k, height - 1 + k, step) for k in (-1, 0, 1))
+    left, columns, right = (slice(step + k, width - 1 + k, step) for k in (-1, 0, 1))
     both = [target] if every > 1 else [target, shown]
-    twice = [
-        np.stack(
-            [
-                one[:, rows, columns + 1] - one[:, rows, columns - 1],
-                one[:, rows + 1, columns] - one[:, rows - 1, columns],
-            ],
-            axis=1,
-        )
-        for one in both
-    ]
-    slopes: Array = (np.sum(twice, axis=0) / (2 * len(both))).astype(np.float32)
+    slopes = np.zeros((3, 2, len(inner), len(across)), np.float32)
+    for one in both:
+        slopes[:, 0] += one[:, rows, right] - one[:, rows, left]
+        slopes[:, 1] += one[:, below, columns] - one[:, above, columns]
+    slopes /= np.float32(2 * len(both))
     row, column = np.nonzero(np.square(slopes).sum(axis=1).max(axis=0) > STEEP * STEEP)
     if len(row) < FEW:
         return None

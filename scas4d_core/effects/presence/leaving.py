@@ -43,19 +43,13 @@ def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
         state: state Θ_t.
         rig: cameras in the internal world, including excluded cameras, which may be accepted again.
     """
-    rows = np.flatnonzero(state.moving)
-    for camera in rig.cameras:  # usually the first cameras already show all moving Gaussians
-        if not len(rows):
-            break
-        uv, depth = camera.project(state.means[rows].astype(np.float64))
-        width = WIDTHS * np.sqrt(np.square(state.factors[rows]).sum(axis=1).max(axis=1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            border = camera.fx * width / depth
-            inside = (uv > -border[:, None]) & (uv < [camera.width, camera.height] + border[:, None])
-        rows = rows[~((depth > 0) & inside.all(axis=1))]
-    mask = np.zeros(len(state), np.bool_)
-    mask[rows] = True
-    return mask
+    from scas4d_core.kernels.states import find_outside  # deferred import, because it loads the kernels
+
+    poses = np.array([camera.world_to_camera[:3] for camera in rig.cameras])
+    lenses = np.array([(one.fx, one.fy, one.cx, one.cy, one.width, one.height) for one in rig.cameras], np.float64)
+    outside = np.zeros(len(state), np.bool_)
+    find_outside(state.means, state.factors, np.flatnonzero(state.moving), poses, lenses, WIDTHS, outside)
+    return outside
 
 
 @dataclass(frozen=True)

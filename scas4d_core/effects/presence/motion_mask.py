@@ -127,9 +127,12 @@ def _changed_between(before: TrainingView, now: TrainingView) -> Array:
     """Returns ``changed_pixels`` of two views; faster if both were created from 8-bit images."""
     if before.source is None or now.source is None:
         return changed_pixels(before.target[:3], now.target[:3])
-    earlier, later = before.source[0], now.source[0]
-    red, green, blue = np.moveaxis(np.maximum(earlier, later) - np.minimum(earlier, later) > int(255 * CHANGE), -1, 0)
-    return _with_surroundings(red | green | blue)
+    from scas4d_core.kernels.pictures import mark_changes  # deferred import, because it loads the kernels
+
+    earlier, later = np.ascontiguousarray(before.pixels), np.ascontiguousarray(now.pixels)
+    changed = np.empty(later.shape[:2], np.float32)
+    mark_changes(earlier, later, int(255 * CHANGE), REACH_PIXELS // 2, changed)
+    return changed
 
 
 def _with_surroundings(changed: NDArray[np.bool_]) -> Array:

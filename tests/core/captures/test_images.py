@@ -41,6 +41,12 @@ def test_an_rgb_picture_comes_as_it_is(tmp_path):
     assert picture_size(tmp_path / "a.png") == (8, 6)
 
 
+def test_a_raw_picture_comes_as_it_is():
+    np.testing.assert_array_equal(decode_image(encoded(Image.fromarray(rgb()), "PPM"), size=(8, 6)), rgb())
+    grey = decode_image(b"P5\n8 6\n255\n" + rgb()[..., 0].tobytes())
+    np.testing.assert_array_equal(grey, rgb()[..., :1].repeat(3, axis=2))
+
+
 def test_an_orientation_is_refused_and_upright_is_not():
     for orientation in range(2, 9):
         exif = Image.Exif()

@@ -38,6 +38,9 @@ BAD = {
     "animated PNG": (animated, "animated", "a single still image"),
     "animated WebP": (animated_webp, "animated", "a single still image"),
     "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "for which the camera was"),
+    "PPM with 16 bits": (lambda: b"P6 16 16 65535\n" + bytes(1536), "maximum value 65535", "use 255"),
+    "PPM with extra bytes": (lambda: picture(format="PPM") + b"\0", "bytes", "and nothing else"),
+    "PPM with a comment": (lambda: b"P6\n# rig\n" + picture(format="PPM")[3:], "bytes", "without comments"),
     "no picture": (lambda: b"GIF89a or so", "bytes", "encode the image"),
 }
 

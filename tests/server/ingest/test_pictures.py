@@ -14,6 +14,8 @@ FILES = {
     "webp": picture(40, format="WEBP"),
     "lossless webp": picture(40, format="WEBP", lossless=True),
     "webp with alpha": picture(40, format="WEBP", mode="RGBA", exact=True),
+    "ppm": picture(40, format="PPM"),
+    "pgm": picture(40, format="PPM", mode="L"),
 }
 
 

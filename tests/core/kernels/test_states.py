@@ -1,0 +1,68 @@
+"""Kernels on whole states against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scas4d_core.kernels.states import extrapolate_rows, find_implausible, find_outside, rotate_rows
+
+RNG = np.random.default_rng(0)
+
+
+def test_rotations_of_vectors_have_the_bits_of_the_formula() -> None:
+    r, which, vectors = RNG.normal(size=(5, 3)), RNG.integers(0, 5, 40).astype(np.int32), RNG.normal(size=(40, 3))
+    rotated = np.empty_like(vectors)
+    rotate_rows(r, which, vectors, rotated)
+    cross = np.cross(r[which], vectors)
+    scale = 1 + np.square(r[which]).sum(axis=1, keepdims=True)
+    np.testing.assert_array_equal(rotated, vectors + 2 * (cross + np.cross(r[which], cross)) / scale)
+
+
+def test_only_moving_rows_are_extrapolated() -> None:
+    before, after = RNG.normal(size=(2, 20, 9)).astype(np.float32)
+    moving = np.arange(20) % 2 == 0
+    result = np.empty_like(after)
+    extrapolate_rows(before, after, moving, np.float32(0.5), result)
+    expected = np.where(moving[:, None], after + np.float32(0.5) * (after - before), after)
+    np.testing.assert_array_equal(result, expected)
+
+
+@pytest.mark.parametrize(
+    ("array", "value"),
+    [("means", 9), ("means", np.nan), ("factors", np.inf), ("rotations", 2), ("colours", np.nan), ("colours", -9)],
+)
+def test_a_faulty_row_is_marked(array: str, value: float) -> None:
+    means, factors = np.zeros((4, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (4, 1, 1))
+    state = {"means": means.copy(), "factors": factors.copy(), "rotations": np.eye(4, dtype=np.float32)[[0] * 4]}
+    state |= {"colours": np.zeros((4, 3), np.float32)}
+    bad, squares = np.empty(4, np.bool_), np.empty((4, 3), np.float32)
+    limits = np.float32(1), np.float32(4), np.float32(8)
+    find_implausible(means, factors, *state.values(), np.arange(4), *limits, bad, squares)
+    assert not bad.any()
+    assert (squares == 1).all()
+    state[array][2] = value
+    find_implausible(means, factors, *state.values(), np.arange(4), *limits, bad, squares)
+    np.testing.assert_array_equal(bad, [False, False, True, False])
+
+
+def test_a_mirrored_factor_is_marked() -> None:
+    means, factors = np.zeros((2, 3), np.float32), np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
+    mirrored = factors.copy()
+    mirrored[1, 0] *= -1
+    rotations, bad = np.eye(4, dtype=np.float32)[[0, 0]], np.empty(2, np.bool_)
+    find_implausible(
+        means, factors, means, mirrored, rotations, means, np.arange(2), np.float32(1), np.float32(4), np.float32(8),
+        bad, np.empty((2, 3), np.float32),
+    )  # fmt: skip
+    np.testing.assert_array_equal(bad, [False, True])
+
+
+def test_gaussians_behind_or_beside_all_cameras_are_outside() -> None:
+    pose = np.eye(4)[None, :3]  # looks along z from the origin
+    lens = np.array([[100.0, 100, 50, 50, 100, 100]])
+    means = np.array([[0, 0, 2], [0, 0, -2], [2, 0, 2], [1.02, 0, 2], [5, 0, 2]], np.float32)
+    factors = np.tile(0.02 * np.eye(3, dtype=np.float32), (5, 1, 1))
+    outside = np.zeros(5, np.bool_)
+    find_outside(means, factors, np.arange(4), pose, lens, 3.0, outside)
+    np.testing.assert_array_equal(outside, [False, True, True, False, False])  # the last row was not asked for
