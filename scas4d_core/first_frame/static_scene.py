@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from scas4d_core.engines.fit import (
     FitScalars,
 )  # fmt: skip
 from scas4d_core.engines.limits import scene_limits
-from scas4d_core.engines.views import CameraArrays, TrainingView
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule
 from scas4d_core.first_frame.points.surroundings import Stage
 from scas4d_core.first_frame.static_result import StaticResult
@@ -29,7 +29,6 @@ from scas4d_core.fit.exposures import TRIAL, Exposures
 from scas4d_core.fit.gaussian_fit import BETA1, BETA2, FitStep, GaussianFit
 from scas4d_core.fit.initial_gaussians import budget, initial_parameters
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.guards import ALPHA_FLOOR
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.update.result import CameraFit, camera_fit
 from scas4d_core.update.schedule import view_order
@@ -51,12 +50,6 @@ DENSIFY_GRADIENT = 1e-6
 limits the number of densified Gaussians. Gaussians with the largest gradients are densified first."""
 PRUNE_OPACITY = 0.01
 """Opacity below which densification removes a Gaussian."""
-SHRINK = 0.9
-"""Factor by which the scales of Gaussians with large footprints are multiplied every ``DENSIFY_EVERY``
-iterations. The fit enlarges them again where the images require it. Without this pressure, stacks of
-large, nearly transparent Gaussians remain, and a few Gaussians cause most of the time of an iteration."""
-SHRINK_UNTIL = 0.85
-"""Fraction of the iterations after which no Gaussians are shrunk, so that they can converge."""
 MIN_VIEWS = 2
 """Number of training cameras that must see a Gaussian. A Gaussian that fewer cameras see is removed."""
 SEEN_PIXELS = 0.05
@@ -147,8 +140,6 @@ class StaticTrainer:
             self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)
         if now.ended >= DENSIFY_FROM and now.begun < until and now.passes(DENSIFY_EVERY):
             self.control_density(self._target(now.ended))
-        if now.ended >= DENSIFY_FROM and now.begun < SHRINK_UNTIL * settings.iterations and now.passes(DENSIFY_EVERY):
-            self.shrink_large()
         if now.reaches(until) or now.reaches((until + settings.iterations) // 2):
             self.remove_unseen()
         if now.ended > until and self._last == settings.iterations and self._has_converged():
@@ -227,16 +218,6 @@ class StaticTrainer:
         added, parents = np.concatenate([parameters[clone], *halves]), np.concatenate([clone, split, split])
         self.fit.replace_rows(np.flatnonzero(keep), added, parents)
 
-    def shrink_large(self) -> None:
-        """Shrinks the Gaussians whose footprint is larger than the average.
-
-        3DGS-MCMC (Kheradmand et al. 2024) also keeps Gaussians small, with an L1 loss on their scales.
-        """
-        parameters = self.fit.table.parameters.copy()
-        areas = footprints(parameters, [view.camera for view in self.views])
-        parameters[areas > areas.mean(), SCALE] += np.log(SHRINK)
-        self.fit.set_parameters(parameters)
-
     def remove_unseen(self) -> None:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
 
@@ -287,30 +268,6 @@ class StaticTrainer:
             planned=planned,
             ran_short_of_time=shortened,
         )
-
-
-def footprints(parameters: Array, cameras: Sequence[CameraArrays]) -> NDArray[np.float64]:
-    """Returns the approximate area [N] in pixels that each Gaussian covers, summed over cameras.
-
-    The area is that of an ellipse with the two longest axes of the Gaussian, up to the minimum alpha of the rasterizer.
-    Gaussians whose mean is outside of an image have no area in it.
-
-    Args:
-        parameters: [N, 15] parameters of the fit.
-        cameras: cameras of the views.
-    """
-    opacities = 1 / (1 + np.exp(-parameters[:, OPACITY.start].astype(np.float64)))
-    axes = np.exp(np.sort(parameters[:, SCALE].astype(np.float64), axis=1)[:, 1:].sum(axis=1))
-    areas = 2 * np.pi * axes * np.log(np.maximum(opacities / ALPHA_FLOOR, 1))
-    scales = np.zeros(len(parameters))
-    for camera in cameras:
-        x, y, z = camera.pose[:, :3] @ parameters[:, MEAN].T + camera.pose[:, 3:]
-        fx, fy, cx, cy = camera.lens[:4]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = fx * x / z + cx, fy * y / z + cy
-            inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-            scales += np.where(inside, fx * fy / z**2, 0)
-    return areas * scales
 
 
 def first_trainer(

@@ -161,10 +161,6 @@ class GaussianFit:
             if end(now, last):
                 return
 
-    def set_parameters(self, parameters: Array) -> None:
-        """Replaces the parameters [N, 15] of the current Gaussians. Their moments and statistics do not change."""
-        self._engine.load_table(replace(self.table, parameters=parameters))
-
     def set_gloss(self, gloss: FitGloss) -> None:
         """Replaces the gloss of the current Gaussians for the rest of the fit."""
         self._engine.load_table(replace(self.table, gloss=gloss))

@@ -20,9 +20,19 @@ from scas4d_core.kernels.blend import BLOCK, BLOCK_X, BLOCK_Y, BLOCKS, HALF_LOG2
 from scas4d_core.kernels.jit import HALF, ONE, TWO, kernel
 from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, LOG_OPACITY, MEAN_X, MEAN_Y, TILE
 
+Array = NDArray[np.float32]
 
-@kernel
-def count_pairs(splats, starts, items, covers, tiles_x, limits, counts):
+
+@kernel  # type: ignore[untyped-decorator]
+def count_pairs(
+    splats: Array,
+    starts: NDArray[np.int64],
+    items: NDArray[np.int32],
+    covers: NDArray[np.uint64],
+    tiles_x: int,
+    limits: Array,
+    counts: NDArray[np.int32],
+) -> None:
     """Counts the Gaussians that are blended into each pixel, with the same rules as ``blend``.
 
     Args:
@@ -72,8 +82,8 @@ def pairs_per_pixel(state: Gaussians, cameras: Sequence[CameraArrays], limits: L
     features, background = state.features(state.colours), np.zeros(4, np.float32)
     for camera in cameras:
         rasterizer.forward(state.means, state.factors, state.opacities, features, camera, background)
-        lists = rasterizer.tile_lists
-        counts = np.zeros(rasterizer.planes.shape[1:], np.int32)
-        count_pairs(rasterizer.splats, *lists, counts.shape[1] // TILE, rasterizer.limits, counts)
+        _, rows, stride = rasterizer.planes.shape
+        counts = np.zeros((rows, stride), np.int32)
+        count_pairs(rasterizer.splats, *rasterizer.tile_lists, stride // TILE, rasterizer.limits, counts)
         each.append(counts[: camera.height, : camera.width].ravel())
     return np.concatenate(each)

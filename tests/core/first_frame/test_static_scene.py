@@ -9,10 +9,7 @@ import pytest
 from box_scene import held_out_camera, make_box, make_rig, photograph, take_frame
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.engines.choose import renderer_of
-from scas4d_core.engines.fit import MEAN, OPACITY, SCALE
-from scas4d_core.engines.limits import DEFAULT
-from scas4d_core.engines.views import CameraArrays
+from scas4d_core.engines.fit import OPACITY
 from scas4d_core.first_frame import static_scene
 from scas4d_core.first_frame.fit_first_frame import fit_static_scene
 from scas4d_core.first_frame.fit_schedule import FitProgress
@@ -20,7 +17,6 @@ from scas4d_core.first_frame.static_scene import (
     STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
-    footprints,
 )
 from scas4d_core.fit.exposures import SPREAD
 from scas4d_core.fit.initial_gaussians import initial_parameters, logit
@@ -141,36 +137,6 @@ def test_faint_gaussians_are_removed_but_never_all() -> None:
     trainer.fit.table.parameters[:, OPACITY] = -9
     trainer.control_density(0)
     assert len(trainer.fit) > 0
-
-
-def test_only_gaussians_with_large_footprints_are_shrunk() -> None:
-    factory = ViewFactory(RIG)
-    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
-    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
-    large, outside = np.arange(4), np.arange(4, 8)
-    parameters[[*large, *outside], SCALE] += 2
-    parameters[outside, MEAN] += 100  # no camera sees them
-    trainer = StaticTrainer(factory, views, parameters, SceneSettings(), SETTINGS)
-    trainer.fit.run([0], trainer.scalars)
-    before, moments = trainer.fit.table.parameters.copy(), trainer.fit.table.first.copy()
-    trainer.shrink_large()
-    changed = trainer.fit.table.parameters - before
-    assert (changed[large, SCALE] < 0).all()
-    assert not changed[outside].any()
-    assert set(np.unique((changed[:, SCALE] < 0).sum(axis=1))) == {0, 3}
-    changed[:, SCALE] = 0
-    assert not changed.any()
-    np.testing.assert_array_equal(trainer.fit.table.first, moments)
-
-
-@pytest.mark.parametrize("opacity", [0.05, 0.9])
-def test_a_footprint_is_the_number_of_pixels_that_a_gaussian_covers(opacity: float) -> None:
-    camera = CameraArrays.of(RIG.cameras[0])
-    parameters = initial_parameters(np.zeros((1, 3)), np.ones((1, 3), np.float32), None, 1, np.random.default_rng(0))
-    parameters[0, SCALE], parameters[0, OPACITY] = np.log(0.05), logit(np.array(opacity))
-    state = Gaussians.of_points([[0, 0, 0]], radius=0.05).replace(opacities=np.array([opacity], np.float32))
-    light = renderer_of("cpu", (0, 0, 0), DEFAULT).render(state, camera).transmittance
-    assert footprints(parameters, [camera]) == pytest.approx((light < 1).sum(), rel=0.1)
 
 
 def test_exposures_of_the_cameras_are_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
