@@ -321,11 +321,6 @@ class CpuRasterizer:
         return self._last.splats
 
     @property
-    def tile_lists(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint64]]:
-        """Starts, Gaussians and blocks of the tile lists of the last forward pass; see ``blend_kernels.blend``."""
-        return self._last.starts, self._last.items, self._last.covers
-
-    @property
     def counts(self) -> NDArray[np.int32]:
         """Number [N] of tiles covered by each Gaussian in the last forward pass. It is 0 for culled Gaussians."""
         return self._last.counts
