@@ -127,7 +127,7 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
     for view in views:
         forward(view)
         blended = blended_pairs(rasterizer.splats, rasterizer.counts, view.width, view.height, limits)
-        pairs, lanes = pairs + blended[0], lanes + blended[1]
+        pairs, lanes = pairs + int(blended[0].sum()), lanes + blended[1]
     micro = MicroKernel(threads())
     # Other processes do not affect a single thread's CPU time, but several threads also wait for each other.
     clock = time.process_time if threads() == 1 else time.perf_counter

@@ -46,7 +46,7 @@ SUMS = 6 + CHANNELS
 
 def blended_pairs(
     splats: Array, counts: NDArray[np.int32], width: int, height: int, limits: Limits = DEFAULT
-) -> tuple[int, int, Array]:
+) -> tuple[NDArray[np.int32], int, Array]:
     """Counts the blended pairs of an image without tiles, Gaussian by Gaussian in depth order.
 
     Args:
@@ -57,23 +57,23 @@ def blended_pairs(
         limits: rasterizer limits.
 
     Returns:
-        The number of pairs; the number of pixels in the 4×4 blocks that a support touches; and the remaining light,
-        shape [H, W]. A block-wise kernel computes at least these pixels. If the count is correct, the remaining light
-        equals the rasterizer's ``transmittance``.
+        The number of pairs of each pixel, shape [H, W]; the number of pixels in the 4×4 blocks that a support touches;
+        and the remaining light, shape [H, W]. A block-wise kernel computes at least these pixels. If the count is
+        correct, the remaining light equals the rasterizer's ``transmittance``.
     """
     visible = np.flatnonzero(counts > 0)
     order = visible[np.argsort(splats[visible, DEPTH], kind="stable")]
     light = np.ones((height, width), np.float32)
     blocks = np.full((-(-height // BLOCK), -(-width // BLOCK)), -1, np.int64)
-    pairs, met = _count(splats, order, np.array(limits, np.float32), np.ones_like(light), light, blocks)
-    return int(pairs), int(met) * BLOCK * BLOCK, light
+    pairs = np.zeros((height, width), np.int32)
+    met = _count(splats, order, np.array(limits, np.float32), np.ones_like(light), light, pairs, blocks)
+    return pairs, int(met) * BLOCK * BLOCK, light
 
 
 @kernel  # type: ignore[untyped-decorator]
-def _count(splats: Any, order: Any, limits: Any, alive: Any, light: Any, last_met: Any) -> Any:
+def _count(splats: Any, order: Any, limits: Any, alive: Any, light: Any, pairs: Any, last_met: Any) -> Any:
     floor, cap, stop = limits[0], limits[1], limits[2]
     height, width = light.shape
-    pairs = 0
     met = 0
     for i in order:
         mx, my = splats[i, MEAN_X], splats[i, MEAN_Y]
@@ -94,12 +94,12 @@ def _count(splats: Any, order: Any, limits: Any, alive: Any, light: Any, last_me
                     if alive[y, x] > ZERO:
                         after = alive[y, x] * (ONE - alpha)
                         if after >= stop:
-                            pairs += 1
+                            pairs[y, x] += 1
                             alive[y, x] = after
                             light[y, x] = after
                         else:
                             alive[y, x] = ZERO
-    return pairs, met
+    return met
 
 
 class MicroKernel:

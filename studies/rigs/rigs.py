@@ -24,12 +24,15 @@ from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture, Frame
+from scas4d_core.engines.limits import rig_limits
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import compile_in_processes
 from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
+from studies.rigs.pairs import pairs_per_pixel
 
 ENOUGH_TO_HOLD_OUT = 5
 """Minimum number of cameras for holding one out. With fewer, each camera sees content that no other camera sees."""
@@ -42,6 +45,10 @@ COLUMNS = (
     Column("first points", "method"),
     Column("covered", "coverage", ".2f"),
     Column("Gaussians", "gaussians", ",d"),
+    Column("pairs", "pairs", ".1f"),
+    Column("99%", "pairs_99", ".0f"),
+    Column("last", "pairs_last", ".1f"),
+    Column("99%", "pairs_last_99", ".0f"),
     Column("frame 0 s", "seconds_first", ".0f"),
     Column("update s", "seconds_update", ".1f"),
     Column("held", "held", "d"),
@@ -127,6 +134,11 @@ def measured(
         seconds.append(time.perf_counter() - began)
         held += report.outcome.rejected
         unmoved += report.candidate is Candidate.PREVIOUS
+    cameras, limits = scene.rig.cameras, rig_limits(settings.scene.near, scene.world, given.rig.cameras)
+    pairs, pairs_last = (
+        pairs_per_pixel(scene.history.gaussians(index), [CameraArrays.of(camera) for camera in cameras], limits)
+        for index in (0, count - 1)
+    )
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,
@@ -136,6 +148,10 @@ def measured(
         "method": None if cloud is None else cloud.method,
         "coverage": None if cloud is None else cloud.coverage,
         "gaussians": len(scene.history.first),
+        "pairs": float(pairs.mean()),
+        "pairs_99": float(np.percentile(pairs, 99)),
+        "pairs_last": float(pairs_last.mean()),
+        "pairs_last_99": float(np.percentile(pairs_last, 99)),
         "seconds_first": first,
         "shortened": list(scene.history.report(0).get("shortened") or []),
         "seconds_update": float(np.median(seconds)) if seconds else None,
