@@ -13,7 +13,7 @@ from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
 from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import gpu_kernels, kernels, moving, startup
-from studies.live.commands import live
+from studies.live.commands import live, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -37,7 +37,7 @@ STUDIES = {
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
     "Hard cases": (stability, timing),
-    "The running service": (faults, ingest, live, views, memory, sleeping, crossing, cluster, head, simulate),
+    "The running service": (faults, ingest, live, viewer, views, memory, sleeping, crossing, cluster, head, simulate),
 }
 """Maps each heading of `scripts/bench --help` to its commands."""
 
