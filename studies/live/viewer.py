@@ -35,11 +35,15 @@ WATCH = """() => {
   const now = () => performance.timeOrigin + performance.now();
   window.whole = {};
   window.first = {};
+  window.stages = [];
   const [view, latency] = ['view', 'latency'].map((id) => document.getElementById(id));
   const whole = () => { window.whole[view.dataset.frame] ??= now(); };
   new MutationObserver(whole).observe(view, { attributes: true, attributeFilter: ['data-frame'] });
   if (!latency) return;
-  const first = () => { window.first[latency.textContent.match(/\\d+/)?.[0]] ??= now(); };
+  const first = () => {
+    const [, frame, sent, drawn] = latency.textContent.match(/^Frame (\\d+).* sent (\\d+), drawn (\\d+)$/) ?? [];
+    if (frame) window.first[frame] ??= now(), window.stages.push([Number(sent), Number(drawn)]);
+  };
   new MutationObserver(first).observe(latency, { childList: true, characterData: true });
 }"""
 
@@ -52,12 +56,14 @@ class ViewerResult:
         size: bytes that the page received for the states of each frame after the first.
         first_ms: milliseconds from each commit to the first picture of the frame's motion, ascending.
         whole_ms: milliseconds from each commit to the first picture that shows the frame itself, ascending.
+        stages_ms: [frames, 2] milliseconds from commit to sending, and from arrival to the first picture.
         frames: number of frames that were committed.
     """
 
     size: float
     first_ms: list[float]
     whole_ms: list[float]
+    stages_ms: list[tuple[float, float]]
     frames: int
 
 
@@ -108,10 +114,10 @@ def measure(service: Service, folder: Path, frames: int, fps: float) -> ViewerRe
             page.wait_for_timeout(max(0.0, 1e3 * (began + index / fps - time.monotonic())))
             service.put(scene, index, images, {})
         page.wait_for_function(f"() => document.getElementById('view').dataset.frame === '{frames}'")
-        first, whole = page.evaluate("[window.first, window.whole]")
+        first, whole, stages = page.evaluate("[window.first, window.whole, window.stages]")
         browser.close()
     service.http.delete(f"/v1/scenes/{scene}")
-    return ViewerResult(sum(received) / frames, _delays(first, commits), _delays(whole, commits), frames)
+    return ViewerResult(sum(received) / frames, _delays(first, commits), _delays(whole, commits), stages, frames)
 
 
 def browser_path() -> str | None:
@@ -162,6 +168,7 @@ def report(result: ViewerResult, fps: float) -> str:
             return "–"
         return f"{np.quantile(found, 0.5):.0f} / {np.quantile(found, 0.95):.0f} ms ({len(found)} frames)"
 
+    stages = " / ".join(f"{value:.0f} ms" for value in np.median(result.stages_ms, axis=0)) if result.stages_ms else "–"
     return "\n".join(
         [
             f"{result.frames} frames at {fps:g} per second, drawn by the browser ({in_words(machine())}):",
@@ -170,6 +177,7 @@ def report(result: ViewerResult, fps: float) -> str:
             "|---|---|",
             f"| bytes received per frame | {result.size / 1e3:.1f} kB |",
             f"| commit to the first picture with the frame's motion, p50 / p95 | {quantiles(result.first_ms)} |",
+            f"| of which commit to sending, arrival to picture, p50 | {stages} |",
             f"| commit to the first picture of the frame itself, p50 / p95 | {quantiles(result.whole_ms)} |",
         ]
     )

@@ -50,7 +50,7 @@ def test_what_moves_is_drawn_here_and_what_rests_by_the_service(page, service, f
     assert page.locator("#drawn").is_visible()
     until(page, BY_THE_SERVICE)
     assert page.locator("#drawn").is_hidden()
-    assert len([one for one in sent[before:] if '"update"' in one]) == 1  # the exact picture, at rest
+    assert len([one for one in sent[before:] if '"render"' in one]) == 1  # the exact picture, at rest
     assert page.faults == []
 
 

@@ -77,7 +77,7 @@ export class Here {
     const begin = this.beginOf(index);
     if (this.withParts || begin === undefined) return;
     this.withParts = true;
-    this.get(begin, CHUNK, true);
+    this.get(begin, true);
   }
 
   /** Whether pictures of a mode are drawn here once their frame is loaded. */
@@ -125,10 +125,10 @@ export class Here {
   fetch(index) {
     const frames = readable();
     const at = frames.findIndex((report) => report.index === index);
-    if (!this.has(index)) this.get(this.beginOf(index), CHUNK);
+    if (!this.has(index)) this.get(this.beginOf(index));
     else if (at % CHUNK >= CHUNK - AHEAD) {
       const next = frames[at - (at % CHUNK) + CHUNK]?.index;
-      if (next !== undefined && !this.has(next)) this.get(next, CHUNK);
+      if (next !== undefined && !this.has(next)) this.get(next);
     }
   }
 
@@ -139,20 +139,20 @@ export class Here {
     return frames[at - (at % CHUNK)]?.index;
   }
 
-  /** Requests frames, one request at a time; only one further request is kept in the meantime. */
-  async get(first, limit, parts = false) {
+  /** Requests a chunk of frames, one request at a time; only one further request is kept in the meantime. */
+  async get(first, parts = false) {
     if (first === undefined) return;
-    const wanted = JSON.stringify([first, limit, parts]);
+    const wanted = JSON.stringify([first, parts]);
     if (this.abort) {
-      if (this.abort.wanted !== wanted && !this.wish?.[2]) this.wish = [first, limit, parts];
+      if (this.abort.wanted !== wanted && !this.wish?.[1]) this.wish = [first, parts];
       return;
     }
     const { scene } = this;
     const abort = (this.abort = new AbortController());
     abort.wanted = wanted;
     try {
-      const frames = readable().filter((report) => report.index >= first).slice(0, limit).map((report) => report.index);
-      for (let from = first, left = limit; left > 0;) { // a response ends at the end of one of the service's files
+      const frames = readable().filter((report) => report.index >= first).slice(0, CHUNK).map((report) => report.index);
+      for (let from = first, left = CHUNK; left > 0;) { // a response ends at the end of one of the service's files
         const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${from}&limit=${left}&parts=${parts}`, undefined, abort.signal);
         const bytes = new Uint8Array(await answer.arrayBuffer());
         if (this.abort !== abort) return;

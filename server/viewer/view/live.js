@@ -154,8 +154,7 @@ export class LiveView {
 
   /** Draws a new live state. */
   receiveState(head, bytes) {
-    if (!this.follow()) return;
-    this.here.receive(head, bytes);
+    if (this.follow()) this.here.receive(head, bytes);
     this.moved();
   }
 
@@ -214,7 +213,7 @@ export class LiveView {
     if (!live) here.fetch(index);
     if (!here.has(index)) return here.alone && !here.said;
     const moment = live ? here.liveMoment() : { index, ...this.between };
-    if (here.alone) this.stream.unsubscribe("view");
+    if (here.alone || live) this.stream.unsubscribe("view"); // otherwise, the service would render every new frame
     this.overtaken = this.tag; // pictures that have not arrived yet show another view
     clearTimeout(this.slow);
     const camera = this.orbit.camera(...here.size(this.canvas.parentElement.getBoundingClientRect(), moving));
@@ -243,7 +242,7 @@ export class LiveView {
   request(share = 1) {
     const [width, height] = this.size(share);
     const camera = this.orbit.camera(width, height);
-    const frame = this.follow() ? this.here.live.frame : this.frame; // live states replace the pictures of new frames
+    const frame = this.follow() ? this.here.live.frame : this.frame;
     const request = { camera, frame, parts: this.mode === "parts" ? this.parts : null,
       background: this.background, ...MODES[this.mode] };
     this.asked.set(++this.tag, { camera, mode: this.mode, at: performance.now(), share });
