@@ -107,7 +107,22 @@ class PartsEvent(BinaryEvent):
         return PartsModel.model_validate_json(self.body)
 
 
-Event = SceneMessage | FrameMessage | ViewEvent | TracksEvent | PartsEvent
+@dataclass(frozen=True)
+class StatesEvent(BinaryEvent):
+    """Event with the newest state, as records of a compact 4D file.
+
+    The bodies of successive events, joined, are a compact file; see `live_states`.
+
+    Attributes:
+        after: frame of the previous event, which the records continue from, or None if they start a new file.
+        age: seconds from the commit of the frame to the sending of the event; None if unknown.
+    """
+
+    after: int | None
+    age: float | None
+
+
+Event = SceneMessage | FrameMessage | StatesEvent | ViewEvent | TracksEvent | PartsEvent
 
 
 @dataclass(frozen=True)
@@ -140,6 +155,25 @@ def finished_frames() -> SubscriptionRequest:
     2
     """
     return SubscriptionRequest(Topic.FRAMES, NoRequest())
+
+
+def live_states() -> SubscriptionRequest:
+    """Returns a subscription to the newest state, first as a key frame, then as changes from the previous event.
+
+    Append the bodies to a file to read the states; if `after` is None, start a new file. Decoding requires NumPy and
+    zstandard.
+
+    >>> from scas4d_core.compact import CompactReader
+    >>> with Stream(url, scene) as stream, open(f"{out}.s4d", "wb") as file:
+    ...     stream.subscribe("states", live_states())
+    ...     event = stream.receive(timeout=20)
+    ...     written = file.write(event.body)
+    >>> with CompactReader(f"{out}.s4d") as reader:
+    ...     state = reader.state(event.frame)
+    >>> event.after, event.frame, state.means.shape
+    (None, 2, (2, 3))
+    """
+    return SubscriptionRequest(Topic.STATES, NoRequest())
 
 
 def view(
@@ -211,11 +245,13 @@ def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
     return SubscriptionRequest(Topic.PARTS, PartsSubscription(count=count, every=every))
 
 
-def event_of(head: BinaryHead, body: bytes) -> ViewEvent | TracksEvent | PartsEvent:
+def event_of(head: BinaryHead, body: bytes) -> StatesEvent | ViewEvent | TracksEvent | PartsEvent:
     """Returns the event for a binary message."""
     given = (head.id, head.tag, head.missed, head.frame, head.media_type, head.headers, body)
     if head.type == "tracks":
         return TracksEvent(*given, first=head.frame if head.first is None else head.first)
+    if head.type == "states":
+        return StatesEvent(*given, after=head.after, age=head.age)
     return ViewEvent(*given) if head.type == "render" else PartsEvent(*given)
 
 

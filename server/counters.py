@@ -48,7 +48,7 @@ UPDATE_SECONDS = Histogram(
 )
 FRAME_LATENCY = Histogram(
     "scas4d_frame_latency_seconds",
-    "Latency of committed frames, by stage: queue, update, commit; total is from acknowledgement to commit.",
+    "Latency by stage: queue, update, commit, and their total; publish is from commit to sending to the first viewer.",
     ["stage"],
     buckets=SECONDS,
     registry=registry,

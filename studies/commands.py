@@ -13,7 +13,7 @@ from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
 from studies.hard_cases.commands import stability, timing
 from studies.kernels.commands import gpu_kernels, kernels, moving, startup
-from studies.live.commands import live, soak
+from studies.live.commands import live, soak, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -42,6 +42,7 @@ STUDIES = {
         ingest,
         live,
         soak,
+        viewer,
         views,
         memory,
         sleeping,

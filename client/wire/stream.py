@@ -46,6 +46,7 @@ class Topic(StrEnum):
 
     SCENE = "scene"
     FRAMES = "frames"
+    STATES = "states"
     RENDER = "render"
     TRACKS = "tracks"
     PARTS = "parts"
@@ -70,6 +71,7 @@ class PartsSubscription(Model):
 REQUESTS: dict[Topic, type[Model]] = {
     Topic.SCENE: NoRequest,
     Topic.FRAMES: NoRequest,
+    Topic.STATES: NoRequest,
     Topic.RENDER: RenderRequest,
     Topic.TRACKS: TracksRequest,
     Topic.PARTS: PartsSubscription,
@@ -194,15 +196,24 @@ SERVER_MESSAGE: TypeAdapter[
 class BinaryHead(Model):
     """The header of a binary message, which describes the data that follows."""
 
-    type: Literal["render", "tracks", "parts"]
+    type: Literal["states", "render", "tracks", "parts"]
     id: SubscriptionId
     tag: Tag = None
     missed: int = Field(
         description="Number of unsent messages, for earlier frames or camera positions, that this one replaces."
     )
-    frame: int = Field(description="Frame of the render, last frame of the tracks, or newest frame of the parts.")
+    frame: int = Field(
+        description="Frame of the state or view, last frame of the tracks, or newest frame of the parts."
+    )
     first: int | None = Field(
         default=None, description="Tracks only: first frame in the message; earlier frames were already sent."
+    )
+    after: int | None = Field(
+        default=None,
+        description="States only: frame that the records continue from; absent if they start a new compact file.",
+    )
+    age: float | None = Field(
+        default=None, description="States only: seconds from the commit to the sending of this message, if known."
     )
     media_type: str = Field(description="Media type of the body, as for the same request over HTTP.")
     headers: dict[str, str] = Field(

@@ -2,6 +2,7 @@
 
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.head import FileHeader
+from scas4d_core.compact.live import LiveEncoder
 from scas4d_core.compact.reader import CompactReader, DamagedFileError, FileError
 from scas4d_core.compact.records import FormatError, checked_records
 from scas4d_core.compact.writer import CompactWriter
@@ -14,5 +15,6 @@ __all__ = [
     "FileError",
     "FileHeader",
     "FormatError",
+    "LiveEncoder",
     "checked_records",
 ]

@@ -13,29 +13,13 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.compact.birth_code import encode_born
-from scas4d_core.compact.cluster_motion import Clusters
-from scas4d_core.compact.columns import Columns
-from scas4d_core.compact.frame_code import encode, errors_of
+from scas4d_core.compact.encoder import ERRORS, KEY_EVERY, FrameEncoder
 from scas4d_core.compact.head import FileHeader
 from scas4d_core.compact.index import footer, index_body
 from scas4d_core.compact.planes import pack
 from scas4d_core.compact.reader import STATES, CompactReader
-from scas4d_core.compact.records import (
-    FileError,
-    Record,
-    RecordKind,
-    checksum_bytes,
-    note_bytes,
-    parse_head,
-    record_bytes,
-)
+from scas4d_core.compact.records import FileError, Record, RecordKind, parse_head, record_bytes
 from scas4d_core.gaussians import Gaussians
-
-ERRORS = "errors"
-"""Key under which a note stores the largest errors of its frame."""
-KEY_EVERY = 8
-"""Interval between key frames, and thus the maximum number of states decoded to access one frame."""
 
 
 class CompactWriter:
@@ -72,23 +56,13 @@ class CompactWriter:
     def __init__(
         self, path: Path | str, head: FileHeader, key_every: int = KEY_EVERY, *, clustered: bool = True
     ) -> None:
-        if key_every < 1:
-            raise FileError(f"key_every must be at least 1; got {key_every}")
-        text = head.text()  # serialized first, so an invalid header creates no file
         self.path = Path(path)
-        self.head = head
+        self._encoder = FrameEncoder(head, self.path.name, key_every, clustered=clustered)
+        text = head.text()  # serialized first, so an invalid header creates no file
         self.errors: dict[str, float] = {}
-        self._key_every = key_every
-        self._clustered = clustered
         self._file: BinaryIO = self.path.open("xb")
         self._records: list[Record] = []
-        self._born: Columns | None = None
-        self._clusters = Clusters(np.zeros(0, np.int64))
-        self._last: Columns | None = None
-        self._since_key = 0
-        self._opacities: NDArray[np.float32] | None = None
-        """Exact opacities of all Gaussians so far, or None if unknown."""
-        self._record = Record(RecordKind.HEAD, -1, 0.0, 0, 0, 0)
+        self._record: Record | None = None
         """The record of the last state."""
         self._append(record_bytes(RecordKind.HEAD, text))
 
@@ -112,10 +86,9 @@ class CompactWriter:
             last = reader.encoder_state()
             known = [reader.note(index).get(ERRORS, {}) for index in reader.frames]
         writer = cls.__new__(cls)
-        writer.path, writer.head, writer.errors, writer._key_every = Path(path), last.head, {}, key_every
-        writer._records, writer._record, writer._since_key = list(last.records), last.record, last.since_key
-        writer._born, writer._clusters, writer._last = last.born, last.clusters, last.state
-        writer._opacities = None
+        writer.path, writer.errors = Path(path), {}
+        writer._encoder = FrameEncoder.resume(last, writer.path.name, key_every)
+        writer._records, writer._record = list(last.records), last.record
         for errors in known:
             writer._note_errors(errors)
         writer._file = writer.path.open("r+b")
@@ -149,34 +122,10 @@ class CompactWriter:
             FileError: if the frame cannot follow the previous frames.
             ValueError: if the note cannot be serialized as JSON.
         """
-        self._check(index, state)
-        note_bytes(note or {})
-        columns, before = Columns.of(state), self._last
-        self._opacities = columns.opacities.copy() if self._opacities is None else self._opacities
-        records = (
-            [] if before is not None and len(state) == len(before) else [(RecordKind.BORN, self._add_newborn(columns))]
-        )
-        born = self._born
-        assert born is not None
-        if before is None:
-            decoded = born
-            errors: Mapping[str, float] = errors_of(born, columns)
-        else:
-            if len(before) < len(born):
-                before = before.concatenate(born.from_row(len(before)))
-            key = self._since_key + 1 >= self._key_every
-            self._since_key = 0 if key else self._since_key + 1
-            coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
-            reference = (
-                b"" if key else checksum_bytes(self._record)
-            )  # lets a reader detect a mismatched reference state
-            records.append((RecordKind.KEY if key else RecordKind.DELTA, reference + coded.body))
-            decoded, errors = coded.decoded, coded.errors
-        if note is not None:
-            records.insert(0, (RecordKind.NOTE, note_bytes({**note, ERRORS: dict(errors)})))
-        for kind, body in records:
-            self._append(record_bytes(kind, body, index, time))
-        self._record, self._last = self._records[-1], decoded
+        records, errors = self._encoder.encode(index, time, state, note)
+        for record in records:
+            self._append(record)
+        self._record = self._records[-1]
         self._note_errors(errors)
         return errors
 
@@ -191,39 +140,13 @@ class CompactWriter:
             FileError: if the index is not that of the last frame, or the number of labels is wrong.
         """
         values = np.asarray(labels, np.int64)
-        known = 0 if self._born is None else len(self._born)
-        if index != self._record.frame or values.shape != (known,):
+        known = self._encoder.count
+        if index != self.last_frame or values.shape != (known,):
             raise FileError(
                 f"{self.path.name}: part labels of shape {values.shape} for frame {index} do not match the last frame, "
-                f"{self._record.frame}, which has {known} Gaussians"
+                f"{self.last_frame}, which has {known} Gaussians"
             )
         self._append(record_bytes(RecordKind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
-
-    def _check(self, index: int, state: Gaussians) -> None:
-        """Rejects a state that cannot follow the previous ones, before anything is written."""
-        last, name = self._record.frame, self.path.name
-        if index <= last:
-            raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in ascending order")
-        if not len(state):
-            raise FileError(f"{name}: frame {index} has no Gaussians; start with a frame that contains Gaussians")
-        if (born := self._born) is not None:
-            known = len(born)
-            if len(state) < known or not np.array_equal(state.ids[:known], born.ids):
-                raise FileError(f"{name}: frame {index} lacks Gaussians of frame {last}; do not remove or reorder any")
-            if self._opacities is not None and not np.array_equal(state.own_opacities[:known], self._opacities):
-                raise FileError(f"{name}: frame {index} changes opacities from frame {last}; they are fixed at birth")
-            if _glossy(state.gloss) != (0 if born.gloss is None else born.gloss.shape[1]):
-                raise FileError(
-                    f"{name}: frame {index} has gloss for {_glossy(state.gloss)} Gaussians, unlike the first frame"
-                )
-        for field in ("means", "factors", "rotations", "colours", "own_opacities", "gloss"):
-            if (array := getattr(state, field)) is None or np.isfinite(array).all():
-                continue
-            wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
-            raise FileError(
-                f"{name}: frame {index}: {len(wrong)} Gaussians have non-finite {field}, rows "
-                f"{wrong[:5].tolist()}; omit the frame, or fix these Gaussians"
-            )
 
     def close(self) -> None:
         """Writes the index and closes the file. A file without an index remains readable by scanning its records."""
@@ -237,14 +160,19 @@ class CompactWriter:
             self._file.close()
 
     @property
+    def head(self) -> FileHeader:
+        """Header of the file."""
+        return self._encoder.head
+
+    @property
     def frames(self) -> int:
         """Number of frames written."""
-        return sum(record.kind in STATES for record in self._records) + (self._last is not None)
+        return sum(record.kind in STATES for record in self._records) + (self._record is not None)
 
     @property
     def last_frame(self) -> int:
         """Index of the last frame, or −1 if there is none."""
-        return self._record.frame
+        return -1 if self._record is None else self._record.frame
 
     def sync(self) -> None:
         """Flushes all written data to disk (fsync)."""
@@ -255,20 +183,6 @@ class CompactWriter:
         with suppress(OSError):
             self._file.close()
 
-    def _add_newborn(self, state: Columns) -> bytes:
-        """Registers the newborn Gaussians of a state; returns the body of their birth record."""
-        if self._last is None:
-            born = state
-            clusters = Clusters.of(state.gaussians()) if self._clustered else Clusters(np.zeros(len(state), np.int64))
-        else:
-            born = state.from_row(len(self._last))
-            clusters = Clusters(self._clusters.nearest(self._last, born))
-        body, decoded = encode_born(born, clusters, self.head.bounds)
-        self._born = decoded if self._born is None else self._born.concatenate(decoded)
-        self._clusters = self._clusters.concatenate(clusters.labels)
-        self._opacities = state.opacities.copy()
-        return len(born).to_bytes(4, "little") + body
-
     def _note_errors(self, errors: Mapping[str, float]) -> None:
         for name, value in errors.items():
             self.errors[name] = max(value, self.errors.get(name, 0.0))
@@ -278,7 +192,3 @@ class CompactWriter:
         self._file.write(data)
         self._file.flush()
         self._records.append(parse_head(data, 0, self.path.name).at(offset))
-
-
-def _glossy(gloss: NDArray[np.float32] | None) -> int:
-    return 0 if gloss is None else len(gloss)

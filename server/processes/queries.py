@@ -93,7 +93,20 @@ class CompactQuery:
     parts: bool = False
 
 
-Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | PlyQuery | CompactQuery
+@dataclass(frozen=True)
+class StatesQuery:
+    """Query for the newest state as records of a compact 4D file.
+
+    `after` is the last frame that the subscriber received from the given `encoder`; both are None at first.
+    """
+
+    kind: ClassVar[str] = "states"
+    frame: int
+    encoder: str | None = None
+    after: int | None = None
+
+
+Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | PlyQuery | CompactQuery | StatesQuery
 
 
 def refused_field(query: Query) -> tuple[str, object]:

@@ -1,4 +1,4 @@
-"""Reader processes of a scene: one renders views, the other answers queries for tracks, parts and files.
+"""Reader processes of a scene: one serves views and live states, the other tracks, parts and files.
 
 The processes never wait for an update. ``server.processes.readers`` queues their queries.
 """
@@ -30,6 +30,7 @@ from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFr
 from server.messages import DamageFound, SceneSpec, Stop
 from server.processes import track_answers
 from server.processes.compact_answers import compact_head, write_compact
+from server.processes.live_states import LiveStates
 from server.processes.part_labels import PartLabels, resize_labels
 from server.processes.placement import use_one_thread
 from server.processes.queries import (
@@ -43,6 +44,7 @@ from server.processes.queries import (
     Query,
     QueryRefused,
     RenderQuery,
+    StatesQuery,
     TracksQuery,
 )
 from server.storage.layout import EXPORT
@@ -66,7 +68,7 @@ log = logging.getLogger("scas4d.renderer")
 
 
 def run_view_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Entry point of the process for views, which runs until it is asked to stop or the service exits."""
+    """Entry point of the process for views and live states; runs until asked to stop or the service exits."""
     _serve(spec, connection, view_device(spec))
 
 
@@ -120,6 +122,7 @@ class QueryReader:
         self._history: History | None = None
         self._reader: CommittedScene | None = None
         self._parts = PartLabels(spec.folder.parts)
+        self._live = LiveStates(spec)
 
     @property
     def history(self) -> History:
@@ -227,6 +230,9 @@ class QueryReader:
                 lives = [GaussianModel.model_validate(asdict(life)) for life in self.history.lives(query.ids)]
                 listing = GaussiansModel(frame=self.history.indices[-1], gaussians=lives)
                 return Answer(number, listing.model_dump_json().encode(), "application/json")
+            case StatesQuery():
+                body, headers = self._live.records(self.history, query)
+                return Answer(number, body, BYTES, headers)
             case PlyQuery():
                 return self._file(number, lambda file: self.reader.write_ply(file, query.frame))
             case CompactQuery():

@@ -1,7 +1,8 @@
 """Queries about the committed states of a scene, answered by two reader processes with one queue each.
 
-Views have their own process, so a long track or part query never delays them. The other process starts at the first
-query that needs it and runs at lower priority. It is stopped if its query is cancelled, since all its data is on disk.
+Views and live states have their own process, so a long track or part query never delays them. The other process starts
+at the first query that needs it and runs at lower priority. It is stopped if its query is cancelled, since all its data
+is on disk.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from server.processes.queries import (
     Query,
     QueryRefused,
     RenderQuery,
+    StatesQuery,
     TracksQuery,
     refused_field,
 )
@@ -63,7 +65,7 @@ class Readers:
     """Reader processes that answer queries about a scene's committed frames.
 
     Attributes:
-        views: executor of view queries.
+        views: executor of queries for views and live states.
         bulk: executor of all other queries.
     """
 
@@ -105,6 +107,8 @@ class Readers:
     async def _answer(self, query: Query) -> Answer:
         if isinstance(query, TracksQuery):
             return await self._tracks(query)
+        if isinstance(query, StatesQuery):
+            return _check_answer(await self.views.ask(query), query)
         if not isinstance(query, RenderQuery):
             return _check_answer(await self.bulk.ask(query), query)
         if "parts" not in query.kinds:

@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from server.processes.queries import Answer, Query, RenderQuery
+from server.processes.queries import Answer, Query, RenderQuery, StatesQuery
 
 QUERIES_AT_ONCE = 2
 """Maximum number of subscriber queries in flight per lane: one that is running and one that is ready to follow.
@@ -60,9 +60,10 @@ def fingerprint(value: Any) -> Hashable:
 def lane(query: Query) -> str:
     """Returns the lane of a query, "views" or "bulk".
 
-    Tracks and parts have a separate lane, because they take longer and must not delay views.
+    Tracks and parts have a separate lane, because they take longer and must not delay views or live states.
     """
-    return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
+    quick = isinstance(query, StatesQuery) or (isinstance(query, RenderQuery) and "parts" not in query.kinds)
+    return "views" if quick else "bulk"
 
 
 class SharedQueries:

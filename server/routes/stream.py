@@ -26,7 +26,7 @@ log = logging.getLogger("scas4d.server")
 
 @router.websocket("/{id}/stream")
 async def stream(websocket: WebSocket, id: str) -> None:
-    """Streams the client's subscriptions: scene state, finished frames, live views, tracks and parts."""
+    """Streams the client's subscriptions: scene state, finished frames, live states, views, tracks and parts."""
     scenes: Scenes = websocket.app.state.scenes
     hub: Hub = websocket.app.state.hub
     async with contextlib.AsyncExitStack() as held:

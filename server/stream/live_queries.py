@@ -1,4 +1,4 @@
-"""Live queries for views, tracks and parts; each has at most one query and one message in flight.
+"""Live queries for states, views, tracks and parts; each has at most one query and one message in flight.
 
 A live query is issued only after the previous answer was sent, and requests whichever frame is newest at that time.
 Slow clients thus cause less load, and a dragged camera is rendered only at its current pose.
@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 from client.wire import RenderRequest, TracksRequest
 from client.wire.base import Model
-from client.wire.stream import BinaryHead, PartsSubscription, StreamProblem, pack
+from client.wire.stream import BinaryHead, NoRequest, PartsSubscription, StreamProblem, pack
 from server.problems import SERVICE_FAULT, Problem
-from server.processes.queries import PartsQuery, Query, RenderQuery, TracksQuery
+from server.processes.queries import Answer, PartsQuery, Query, RenderQuery, StatesQuery, TracksQuery
 from server.processes.shared_queries import SharedQueries, fingerprint
 from server.queries.render import render_query
 from server.queries.tracks import tracks_query
@@ -45,7 +45,7 @@ class LiveSharedQuery:
 
 
 class LiveQuery(ABC):
-    """Live subscription to views, tracks or parts.
+    """Live subscription to states, views, tracks or parts.
 
     Attributes:
         request: current request of the client.
@@ -98,11 +98,10 @@ class LiveQuery(ABC):
         asked = self._ask()
         if (asked.key, asked.head.tag) != self._sent:
             asked, answer = await self._queries.answer(self._ask)
-            headers = {name.lower(): value for name, value in answer.headers.items()}
-            head = asked.head.model_copy(update={"media_type": answer.media_type, "headers": headers})
+            head = self.answered(asked.head, answer)
             self._outbox.put(
                 self.id,
-                lambda missed: pack(head.model_copy(update={"missed": missed}), answer.body),
+                lambda missed: pack(head.model_copy(update={"missed": missed, **self.when_sent(head)}), answer.body),
                 missed=asked.changes - 1,
             )
             self._sent = (asked.key, head.tag)
@@ -124,6 +123,15 @@ class LiveQuery(ABC):
         """Returns True if the answer depends on every committed frame."""
         return False
 
+    def answered(self, head: BinaryHead, answer: Answer) -> BinaryHead:
+        """Returns the head of a message, completed from the answer."""
+        headers = {name.lower(): value for name, value in answer.headers.items()}
+        return head.model_copy(update={"media_type": answer.media_type, "headers": headers})
+
+    def when_sent(self, head: BinaryHead) -> dict[str, Any]:
+        """Returns fields of the head whose values depend on the time of sending."""
+        return {}
+
     def on_sent(self, head: BinaryHead) -> None:
         """Called after a message with this head was put into the outbox."""
         return
@@ -139,6 +147,41 @@ class LiveQuery(ABC):
     @abstractmethod
     def head(self, query: Query) -> BinaryHead:
         """Returns the head of the message that answers the query."""
+
+
+class LiveStates(LiveQuery):
+    """Live compact records of the newest state: first a key frame, then what changed since the previous message."""
+
+    request: NoRequest
+    _encoder: str | None = None
+    _after: int | None = None
+
+    def query(self) -> StatesQuery:
+        """Returns the query for the newest state."""
+        return StatesQuery(self.scene.committed[-1], self._encoder, self._after)
+
+    def head(self, query: Query) -> BinaryHead:
+        """Returns the message head with the frame index."""
+        assert isinstance(query, StatesQuery)
+        return _head("states", query.frame)
+
+    def due(self) -> bool:
+        """Returns True if the newest state has not been sent yet."""
+        return self._after != self.scene.committed[-1]
+
+    def answered(self, head: BinaryHead, answer: Answer) -> BinaryHead:
+        """Returns the head of a message with the frame that its records continue from."""
+        self._encoder = answer.headers["X-Encoder"]
+        after = answer.headers.get("X-After")
+        return head.model_copy(update={"media_type": answer.media_type, "after": None if after is None else int(after)})
+
+    def when_sent(self, head: BinaryHead) -> dict[str, Any]:
+        """Returns the age of the state, and records that it was published."""
+        return {"age": self.scene.updates.latencies.publish(head.frame)}
+
+    def on_sent(self, head: BinaryHead) -> None:
+        """Records which state the subscriber has."""
+        self._after = head.frame
 
 
 class LiveRender(LiveQuery):
@@ -226,5 +269,5 @@ class LiveParts(LiveQuery):
         self._next = head.frame + self.request.every
 
 
-def _head(kind: Literal["render", "tracks", "parts"], frame: int) -> BinaryHead:
+def _head(kind: Literal["states", "render", "tracks", "parts"], frame: int) -> BinaryHead:
     return BinaryHead(type=kind, id="-", missed=0, frame=frame, media_type="")

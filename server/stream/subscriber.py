@@ -34,7 +34,7 @@ from server.problems import Problem, count_noun
 from server.queries.render import MOST_PIXELS
 from server.queries.tracks import MOST_POINTS
 from server.scene.scene import Scene
-from server.stream.live_queries import LiveParts, LiveQuery, LiveRender, LiveTracks
+from server.stream.live_queries import LiveParts, LiveQuery, LiveRender, LiveStates, LiveTracks
 from server.stream.outbox import Outbox
 
 T = TypeVar("T")
@@ -49,7 +49,12 @@ MESSAGE_KB = 256
 
 FIELD_PREFIX = "see docs/stream.md for all messages"
 
-LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: LiveTracks, Topic.PARTS: LiveParts}
+LIVE: dict[Topic, type[LiveQuery]] = {
+    Topic.STATES: LiveStates,
+    Topic.RENDER: LiveRender,
+    Topic.TRACKS: LiveTracks,
+    Topic.PARTS: LiveParts,
+}
 
 
 class Subscriber:

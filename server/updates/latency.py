@@ -22,6 +22,7 @@ class FrameTimes:
     started: float | None = None
     solved: float | None = None
     committed: float | None = None
+    published: float | None = None
 
 
 class Latencies:
@@ -70,6 +71,21 @@ class Latencies:
             if (latency := self.of(index)) is not None:
                 for stage, seconds in latency:
                     counters.FRAME_LATENCY.labels(stage).observe(seconds)
+
+    def publish(self, index: int) -> float | None:
+        """Records that the state of a frame is being sent to a viewer; only the first viewer counts in the metrics.
+
+        Returns:
+            The seconds since the commit, or None if they are unknown.
+        """
+        times = self._frames.get(index)
+        if times is None or times.committed is None:
+            return None
+        age = self._now() - times.committed
+        if times.published is None:
+            times.published = self._now()
+            counters.FRAME_LATENCY.labels("publish").observe(age)
+        return age
 
     def of(self, index: int) -> FrameLatency | None:
         """Returns the latency of a committed frame, or None if its times are unknown."""

@@ -5,7 +5,7 @@ import { listenToKeys } from "./keys.js";
 import { $, curtain, inOrder, node, note, page, sentence } from "./page.js";
 import { ClusterView } from "./panels/cluster.js";
 import { Figures } from "./panels/figures.js";
-import { showCameras, showEffects, showFacts, showQueue, showWarnings } from "./panels/facts.js";
+import { showCameras, showEffects, showFacts, showLatency, showQueue, showWarnings } from "./panels/facts.js";
 import { PartList } from "./panels/parts.js";
 import { TakeAway } from "./panels/takeaway.js";
 import { Timeline } from "./panels/timeline.js";
@@ -24,6 +24,7 @@ const FINISHED = ["committed", "failed", "missing", "skipped"];
 const view = new LiveView($("picture"), $("overlay"), {
   pick: (...at) => tracks.pick(...at),
   shown: showInfo,
+  live: (times) => showLatency($("latency"), page.reports.get(times.frame), times),
   slow: (mode) => {
     const ready = page.status?.committed > 0;
     $("busy").hidden = !ready || page.lost;
@@ -111,7 +112,7 @@ function closeScene() {
   $("facts").replaceChildren();
   showWarnings($("warnings"), $("to-check"), []);
   $("queue").replaceChildren();
-  $("queue-words").textContent = $("note").textContent = "";
+  $("latency").textContent = $("queue-words").textContent = $("note").textContent = "";
   $("cameras").replaceChildren();
   delete $("view").dataset.tag;
 }
@@ -237,6 +238,7 @@ function showMoment() {
 
 function bulk(head, bytes) {
   if (head.type === "render") view.receive(head, bytes).catch((error) => note(`The picture cannot be shown: ${error.message}`));
+  else if (head.type === "states") view.receiveState(head, bytes);
   else if (head.type === "tracks") tracks.grow(head, JSON.parse(new TextDecoder().decode(bytes)));
 }
 

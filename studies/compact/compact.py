@@ -17,8 +17,8 @@ from scas4d_core import metrics
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures import Capture
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, FileHeader
+from scas4d_core.compact.encoder import KEY_EVERY
 from scas4d_core.compact.records import RecordKind, scan
-from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.engines.limits import DEFAULT, Limits, rig_limits
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench live` and `soak`."""
+"""The commands `scripts/bench live`, `soak` and `viewer`."""
 
 from __future__ import annotations
 
@@ -72,3 +72,25 @@ def soak(
     write_page(out, text)
     if growth(rows) > TARGET:
         raise typer.Exit(1)
+
+
+def viewer(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Output folder of `scas4d reconstruct`.")],
+    frames: Annotated[int, typer.Option(min=10, help="Number of frames.")] = 60,
+    fps: Annotated[float, typer.Option(min=0.1, help="Frames per second.")] = 5.0,
+    work: Annotated[Path, typer.Option(help="Folder for the data folder and log; its contents are deleted.")] = Path(
+        "out/viewer"
+    ),
+    out: Page = None,
+) -> None:
+    """Measures the bytes of a live frame, and the time from its commit to its picture, in a browser.
+
+    Example: scripts/bench viewer out/reconstruct
+    """
+    from client.cli.extras import need_server
+    from studies.live.viewer import report, run
+
+    need_server()
+    text = report(run(folder, frames, fps, work), fps)
+    typer.echo(text)
+    write_page(out, text)

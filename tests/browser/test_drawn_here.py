@@ -12,6 +12,7 @@ from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import IngestSettings
+from client.wire.stream import unpack
 
 HERE = "document.getElementById('view').dataset.drawn === 'here'"
 BY_THE_SERVICE = "document.getElementById('view').dataset.drawn === 'service'"
@@ -49,7 +50,7 @@ def test_what_moves_is_drawn_here_and_what_rests_by_the_service(page, service, f
     assert page.locator("#drawn").is_visible()
     until(page, BY_THE_SERVICE)
     assert page.locator("#drawn").is_hidden()
-    assert len([one for one in sent[before:] if '"update"' in one]) == 1  # the exact picture, at rest
+    assert len([one for one in sent[before:] if '"render"' in one]) == 1  # the exact picture, at rest
     assert page.faults == []
 
 
@@ -134,9 +135,114 @@ def test_a_new_frame_is_drawn_live(page, service):
     assert [fault for fault in page.faults if "404" not in fault] == []
 
 
+def live_messages(page):
+    """Headers of the binary messages with live states that the page receives."""
+    heads = []
+
+    def took(data):
+        if isinstance(data, bytes) and (head := unpack(data)[0]).type == "states":
+            heads.append(head)
+
+    page.on("websocket", lambda socket: socket.on("framereceived", took))
+    return heads
+
+
+def test_a_live_take_is_drawn_from_the_stream_and_between_its_states(page, service, sent):
+    fetched, heads = [], live_messages(page)
+    page.on("request", lambda request: fetched.append(request.url) if "states.s4d" in request.url else None)
+    page.add_init_script("""
+      window.drawn = [];
+      const post = Worker.prototype.postMessage;
+      Worker.prototype.postMessage = function (message, ...rest) {
+        if (message.kind === 'draw') window.drawn.push(message);
+        return post.call(this, message, ...rest);
+      };
+    """)
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
+        id = start_scene(sdk, "live")
+        push(sdk, id, 0)
+        sdk.wait(id, 0)
+        opened(page, service, id)
+        shown(page, frame="0", drawn="service")
+        assert not any('"states"' in message for message in sent)  # the scene may be finished
+        for index in range(1, 8):
+            push(sdk, id, index)
+            shown(page, frame=str(index))
+        until(page, BY_THE_SERVICE)  # the exact picture, once no further frame comes
+        assert fetched == []
+        assert [head.after for head in heads] == [None, *(head.frame for head in heads[:-1])]
+        assert heads[-1].frame == 7
+        drawn = page.evaluate("window.drawn")
+        assert any(0 < one["share"] < 1 and one["next"] == one["index"] + 1 for one in drawn)
+        assert "drawn" in page.locator("#latency").inner_text()
+        page.locator("#time").fill("2")
+        shown(page, frame="2")
+        until(page, "document.getElementById('live').getAttribute('aria-pressed') === 'false'")
+        assert any('"unsubscribe"' in message for message in sent)
+        sdk.delete_scene(id)
+    assert [fault for fault in page.faults if "404" not in fault] == []
+
+
+def test_after_a_broken_connection_live_states_start_anew(page, service):
+    heads = live_messages(page)
+    page.add_init_script("""
+      window.sockets = [];
+      const Plain = WebSocket;
+      window.WebSocket = class extends Plain { constructor(...all) { super(...all); window.sockets.push(this); } };
+    """)
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
+        id = start_scene(sdk, "broken")
+        push(sdk, id, 0)
+        sdk.wait(id, 0)
+        opened(page, service, id)
+        page.select_option("#who", "here")
+        shown(page, frame="0", drawn="here")
+        page.evaluate("window.sockets.at(-1).close()")
+        until(page, "window.sockets.length === 2 && window.sockets[1].readyState === WebSocket.OPEN")
+        push(sdk, id, 1)
+        shown(page, frame="1", drawn="here")
+        assert heads[0].after is None
+        assert heads[-1].frame == 1
+        assert [head.after for head in heads].count(None) == 2
+        sdk.delete_scene(id)
+    assert [fault for fault in page.faults if "404" not in fault] == []
+
+
+def test_the_motion_between_live_states_ends_when_the_next_is_expected(page, service):
+    page.goto(service.url)
+    moments = page.evaluate(
+        """async () => {
+          const { Here } = await import('/viewer/view/here.js');
+          const here = new Here(document.createElement('canvas'), { drawn() {}, arrived() {}, parts() {} });
+          let now = 0;
+          performance.now = () => now;
+          const found = [];
+          const look = (previous, gap, time, drawing) => {
+            Object.assign(here.live, { frame: 9, previous, at: 1000, gap });
+            here.times.here = drawing;
+            now = time;
+            found.push(here.liveMoment());
+          };
+          look(8, 100, 1025, 0);
+          look(8, 100, 1025, 50);  // the picture will be finished 75 ms after the arrival
+          look(8, 100, 1100, 0);
+          look(8, 5000, 1100, 0);  // not slower than 200 ms
+          look(null, 100, 1025, 0);  // a first state
+          return found;
+        }"""
+    )
+    assert moments == [
+        {"index": 8, "next": 9, "share": 0.25},
+        {"index": 8, "next": 9, "share": 0.75},
+        {"index": 9, "next": None, "share": 0},
+        {"index": 8, "next": 9, "share": 0.5},
+        {"index": 9, "next": None, "share": 0},
+    ]
+
+
 def test_where_chunks_do_not_come_the_service_draws(page, service, finished):
     page.route("**/states.s4d*", lambda route: route.abort())
-    opened(page, service, finished)
+    opened(page, service, finished, 2)
     shown(page, drawn="service")
     turn(page, 3)
     page.wait_for_timeout(600)

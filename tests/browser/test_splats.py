@@ -14,6 +14,7 @@ from PIL import Image
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.compact import CompactReader
 from scas4d_core.compact.columns import Columns
+from scas4d_core.compact.records import RecordKind
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
 from scas4d_core.engines.limits import scene_limits
 from scas4d_core.engines.views import CameraArrays
@@ -35,6 +36,19 @@ READ = """
   return { frames: reader.frames, times: reader.times, damage: reader.damage, parts,
     states: order.map((place) => [place, state(place)]) };
 }""".replace("NAMES", str(list(ATTRIBUTES)))
+GROW = READ.replace(
+    "const reader = new CompactReader(bytes);",
+    """
+  const [ends, last, trims] = order.splice(0, 3);
+  const reader = new CompactReader(bytes.slice(0, ends[0]));
+  ends.slice(1).forEach((end, k) => {
+    reader.append(bytes.slice(ends[k], end));
+    reader.state(k + 1);
+  });
+  if (trims) reader.trim();
+  order.push(reader.frames.indexOf(last));
+""",
+)
 PAINT = """
   const { Painter } = await import('/viewer/splats/painter.js');
   const { Projector } = await import('/viewer/splats/project.js');
@@ -144,6 +158,20 @@ def test_all_frames_are_read_as_python_reads_them(page, service, file):
             same(state, reader.state(reader.frames[place]))
             counts.add(len(base64.b64decode(state["opacities"])) // 4)
     assert counts == {bent.BORN, bent.BORN + bent.LATER}
+
+
+@pytest.mark.parametrize("trims", [False, True])
+def test_a_file_that_grows_is_read_frame_by_frame(page, service, file, trims):
+    data = file.read_bytes()
+    with CompactReader(file) as reader:
+        last = reader.frames[-1]
+        ends = [reader._states[place].end for place in range(len(reader.frames))]
+        found = run(page, service, GROW, data, [ends, last, trims])
+        same(found["states"][0][1], reader.state(last))
+        keys = [place for place, record in enumerate(reader._states) if record.kind is RecordKind.KEY]
+        key = next(place for place in keys if place >= len(ends) / 2)
+        kept = [0, *range(key, len(ends))] if trims else range(len(ends))
+        assert found["frames"] == [reader.frames[place] for place in kept]
 
 
 def test_a_file_that_was_cut_is_read_up_to_there(page, service, file):

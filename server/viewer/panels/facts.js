@@ -84,6 +84,18 @@ export function showQueue(box, words, status) {
   box.classList.toggle("full", full);
 }
 
+/**
+ * Describes how long each stage of a live frame took, in milliseconds.
+ *
+ * @param times { published, drawn }: seconds from the commit to the sending of the state, and from its arrival to its picture
+ */
+export function showLatency(words, report, { frame, published, drawn }) {
+  const { queue, update, commit } = report?.latency ?? {};
+  const stages = [["queued", queue], ["decoded", report?.seconds?.decode], ["updated", update], ["committed", commit], ["sent", published], ["drawn", drawn]];
+  const known = stages.filter(([, seconds]) => seconds != null).map(([name, seconds]) => `${name} ${Math.round(1000 * seconds)}`);
+  words.textContent = `Frame ${frame}, in ms: ${known.join(", ")}`;
+}
+
 /** Time offset of a camera if it is clearly out of step, which is a lasting fault that the scene's warnings also report. */
 const outOfStep = (one) => (one?.out_of_step ? `, which takes its pictures ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others` : "");
 

@@ -1,17 +1,23 @@
-// Reader of a compact 4D file in memory, frame by frame in any order; the file may be truncated.
+// Reader of a compact 4D file in memory, frame by frame in any order; the file may be truncated, or grow while it is read.
 
-import { BORN, DELTA, FileError, KEY, PARTS, bodyOf, list, readHead } from "./records.js";
+import { BORN, DELTA, FileError, HEAD_SIZE, KEY, PARTS, bodyOf, list, readHead } from "./records.js";
 import { Sections } from "./planes.js";
 import { appended, decodeBorn, decodeState, extended } from "./states.js";
 
 const MOST_PER_BYTE = 4; // maximum Gaussians per byte, so that an invalid count does not exhaust the memory
+const MOST_GROWN = 32e6; // bytes of a growing file above which its older half is removed
 
 export class CompactReader {
   /** @param bytes Uint8Array with the whole file or its beginning */
   constructor(bytes) {
     this.bytes = bytes;
-    const { records, damage } = list(bytes);
-    this.head = readHead(bytes, records[0]);
+    this.read(list(bytes));
+    this.forget();
+  }
+
+  read({ records, damage }) {
+    this.records = records;
+    this.head ??= readHead(this.bytes, records[0]);
     this.damage = damage;
     this.births = records.filter((record) => record.kind === BORN);
     this.partRecords = records.filter((record) => record.kind === PARTS);
@@ -22,6 +28,38 @@ export class CompactReader {
     if (!this.states.length) throw new FileError(`the file has no frames${damage ? `: ${damage}` : ""}`);
     this.frames = this.states.map((record) => record.frame);
     this.times = this.states.map((record) => record.time);
+  }
+
+  /** Appends complete records; if the file becomes too large, its older states are removed. */
+  append(more) {
+    const size = this.bytes.length;
+    const all = this.bytes.byteOffset + size + more.length;
+    if (all > this.bytes.buffer.byteLength) {
+      const grown = new Uint8Array(2 * all);
+      grown.set(this.bytes);
+      this.bytes = grown.subarray(0, size);
+    }
+    this.bytes = new Uint8Array(this.bytes.buffer, this.bytes.byteOffset, size + more.length);
+    this.bytes.set(more, size);
+    const { records, damage } = list(this.bytes, size);
+    if (damage) throw new FileError(damage);
+    this.read({ records: [...this.records, ...records], damage });
+    if (this.bytes.length > MOST_GROWN) this.trim();
+  }
+
+  /** Removes the older half of the states, up to a key frame; the first record of newborn Gaussians is also a state and stays. */
+  trim() {
+    const key = this.states.findIndex(({ kind }, place) => place >= this.states.length / 2 && kind === KEY);
+    const removed = new Set(this.states.slice(1, Math.max(key, 1)));
+    const kept = this.records.filter((record) => !removed.has(record));
+    const bytes = new Uint8Array(kept.reduce((sum, { size }) => sum + HEAD_SIZE + size, 0));
+    let at = 0;
+    for (const { offset, size } of kept) {
+      bytes.set(this.bytes.subarray(offset - HEAD_SIZE, offset + size), at);
+      at += HEAD_SIZE + size;
+    }
+    this.bytes = bytes;
+    this.read(list(bytes));
     this.forget();
   }
 

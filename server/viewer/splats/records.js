@@ -1,7 +1,7 @@
 // Records of a compact 4D file (docs/format.md): heads and bodies with checksums, and the head of the file.
 
 const MAGIC = 0x52643473; // "s4dR", little-endian
-const HEAD_SIZE = 36;
+export const HEAD_SIZE = 36;
 const VERSION = 1;
 export const HEAD = 1;
 export const BORN = 2;
@@ -29,13 +29,13 @@ export function crc32(bytes) {
 /**
  * Lists the complete records of a file; an incomplete record at the end is ignored.
  *
- * @param bytes Uint8Array
+ * @param bytes Uint8Array  @param from offset of the first record to list
  * @returns { records, damage }: records { kind, frame, time, offset, size, checksum }, and the damage after them, or null
  */
-export function list(bytes) {
+export function list(bytes, from = 0) {
   const records = [];
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  for (let at = 0; at + HEAD_SIZE <= bytes.length;) {
+  for (let at = from; at + HEAD_SIZE <= bytes.length;) {
     const kind = bytes[at + 4];
     if (view.getUint32(at, true) !== MAGIC || view.getUint32(at + 32, true) !== crc32(bytes.subarray(at, at + 32))) {
       return { records, damage: `the file is damaged at byte ${at}, where a record should start` };

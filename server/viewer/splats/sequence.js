@@ -17,13 +17,14 @@ export class Sequence {
     this.head = null;
   }
 
-  /** Adds the frames of a file; frames that are already known are read from this file from now on. */
+  /** Adds the frames of a file, or the new ones of a file that has grown; from now on, they are read from this file. */
   add(reader) {
     this.head ??= reader.head;
     const fresh = reader.frames.map((index, place) => ({ index, time: reader.times[place], reader, place }));
-    const known = new Set(reader.frames);
-    for (const index of known) this.kept.delete(index);
-    this.frames = [...this.frames.filter((frame) => !known.has(frame.index)), ...fresh].sort((a, b) => a.index - b.index);
+    const found = new Set(reader.frames);
+    const others = this.frames.filter((frame) => frame.reader !== reader);
+    for (const { index } of others) if (found.has(index)) this.kept.delete(index);
+    this.frames = [...others.filter((frame) => !found.has(frame.index)), ...fresh].sort((a, b) => a.index - b.index);
     this.used.add(reader);
     this.bound(reader);
   }

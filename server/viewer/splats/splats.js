@@ -43,6 +43,11 @@ export class Splats {
     this.worker.postMessage({ kind: "file", bytes, name }, [bytes.buffer]);
   }
 
+  /** Adds live states, whose buffer is transferred to the worker; `starts` means that they do not continue the previous ones. */
+  addLive(bytes, starts, name) {
+    this.worker.postMessage({ kind: "live", bytes, starts, name }, [bytes.buffer]);
+  }
+
   /**
    * Draws a picture, now or after the current one; of several pending requests, only the last is drawn.
    *

@@ -18,6 +18,7 @@ const ways = new Ways();
 let painter = null;
 let sequence = new Sequence();
 let most; // maximum bytes of files to keep, if the page sets it
+let live = null; // reader of the live states, which grows
 let near = 0;
 let labels = null; // part of each Gaussian
 let shown = null; // last picture: { camera, moment }
@@ -39,27 +40,19 @@ const actions = {
     trackWalk.stop();
     forgetTrails();
     sequence = new Sequence(most);
-    labels = shown = cover = null;
+    labels = shown = cover = live = null;
     followed = -1;
   },
 
   file({ bytes, name }) {
-    const reader = new CompactReader(bytes);
-    sequence.add(reader);
-    near = nearOf(sequence.head);
-    const found = reader.parts();
-    if (found) {
-      labels = found;
-      paints.labels = null;
-      actions.look({});
-    }
-    if (look.trails) {
-      if (found && look.hiddenParts.length) forgetTrails(); // the hidden Gaussians have changed
-      guarded("trails", gatherTrails); // the places of frames have changed
-    }
-    const parts = labels ? Math.max(-1, ...new Set(labels)) + 1 : 0;
-    post("frames", { name, frames: sequence.frames.map(({ index, time }) => [index, time]), head: sequence.head, count: reader.count,
-      parts, damage: reader.damage });
+    added(new CompactReader(bytes), name);
+  },
+
+  /** Adds live states; `starts` means that they do not continue the previous ones. */
+  live({ bytes, name, starts }) {
+    if (starts) live = new CompactReader(bytes);
+    else live.append(bytes);
+    added(live, name, true);
   },
 
   look(changes) {
@@ -121,6 +114,25 @@ const actions = {
     }, () => post("track", { row, track }), (error) => failed("track", error));
   },
 };
+
+/** Adds the frames of a reader to the sequence and reports all frames. */
+function added(reader, name, isLive = false) {
+  sequence.add(reader);
+  near = nearOf(sequence.head);
+  const found = reader.parts();
+  if (found) {
+    labels = found;
+    paints.labels = null;
+    actions.look({});
+  }
+  if (look.trails) {
+    if (found && look.hiddenParts.length) forgetTrails(); // the hidden Gaussians have changed
+    guarded("trails", gatherTrails); // the places of frames have changed
+  }
+  const parts = labels ? Math.max(-1, ...new Set(labels)) + 1 : 0;
+  post("frames", { name, live: isLive, frames: sequence.frames.map(({ index, time }) => [index, time]), head: sequence.head, count: reader.count,
+    parts, damage: reader.damage });
+}
 
 const centreOf = ({ means, count }, row) => [0, 1, 2].map((k) => means[k * count + row]);
 

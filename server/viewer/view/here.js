@@ -1,4 +1,4 @@
-// Views that the page draws itself from the service's compact files, so that turning, playing and scrubbing cost the service nothing.
+// Views that the page draws itself from compact files and live states, so that turning, playing and scrubbing cost the service nothing.
 
 import { fetched, scenePath } from "../service.js";
 import { node, note, readable } from "../page.js";
@@ -10,6 +10,7 @@ const AHEAD = 8; // number of frames before the end of a chunk at which the next
 const SLOW_MS = 250; // time per picture that counts as slow: fewer than four per second
 const SLOWER = 1.5; // factor over the service's time from which the browser counts as slower
 const WARM = 3; // pictures before times are measured, since the first ones compile shaders
+const LONGEST_BLEND_MS = 200; // longest transition between two live states
 const AGAIN_MS = 20_000; // delay before another attempt after a failure
 const SPAN = 30; // number of frames in a trail
 const BESIDE = ["ahead", "trails", "track"]; // operations whose failure does not affect the picture
@@ -28,6 +29,7 @@ export class Here {
     this.frames = new Set(); // indices of the frames that the worker has
     this.asked = new Map(); // pictures that are being drawn, keyed by tag
     this.wish = null;
+    this.live = { frame: null, previous: null, at: -Infinity, gap: 0, age: null, drawn: true };
     this.failedAt = -Infinity;
     this.drawn = 0;
     this.slow = false;
@@ -75,7 +77,7 @@ export class Here {
     const begin = this.beginOf(index);
     if (this.withParts || begin === undefined) return;
     this.withParts = true;
-    this.get(begin, CHUNK, true);
+    this.get(begin, true);
   }
 
   /** Whether pictures of a mode are drawn here once their frame is loaded. */
@@ -88,15 +90,45 @@ export class Here {
     return this.frames.has(index);
   }
 
-  /** Requests a frame from the service: alone if it is the newest, otherwise with the frames around it. */
-  fetch(index, alone) {
-    if (alone) return this.get(index, 1);
+  /** Takes a message of the topic `states`: the newest state, `head.age` seconds after its commit. */
+  receive(head, bytes) {
+    const { live } = this;
+    const starts = head.after === undefined;
+    const now = performance.now();
+    const gap = now - live.at;
+    this.begin().addLive(bytes, starts, this.opened);
+    Object.assign(live, { previous: starts ? null : live.frame, frame: head.frame, at: now, age: head.age ?? null, drawn: false,
+      gap: starts ? 0 : live.gap ? 0.7 * live.gap + 0.3 * gap : gap });
+    this.frames.add(head.frame); // the worker handles messages in order
+  }
+
+  /**
+   * Moment of the live take that a picture begun now should show, { index, next, share }: the motion from the previous state
+   * to the newest takes as long as the time between states, so that it is smooth, but at most LONGEST_BLEND_MS.
+   */
+  liveMoment() {
+    const { frame, previous, at, gap } = this.live;
+    const shown = performance.now() + this.times.here; // when the picture will be finished
+    const share = (shown - at) / Math.min(gap, LONGEST_BLEND_MS);
+    return previous !== null && share < 1 ? { index: previous, next: frame, share } : { index: frame, next: null, share: 0 };
+  }
+
+  /** Milliseconds from the arrival of the newest live state to its first picture, once; null for later pictures. */
+  liveDelay({ index, next }) {
+    const { live } = this;
+    if (live.drawn || (next ?? index) !== live.frame) return null;
+    live.drawn = true;
+    return performance.now() - live.at;
+  }
+
+  /** Requests a frame from the service, together with the frames around it. */
+  fetch(index) {
     const frames = readable();
     const at = frames.findIndex((report) => report.index === index);
-    if (!this.has(index)) this.get(this.beginOf(index), CHUNK);
+    if (!this.has(index)) this.get(this.beginOf(index));
     else if (at % CHUNK >= CHUNK - AHEAD) {
       const next = frames[at - (at % CHUNK) + CHUNK]?.index;
-      if (next !== undefined && !this.has(next)) this.get(next, CHUNK);
+      if (next !== undefined && !this.has(next)) this.get(next);
     }
   }
 
@@ -107,20 +139,20 @@ export class Here {
     return frames[at - (at % CHUNK)]?.index;
   }
 
-  /** Requests frames, one request at a time; only one further request is kept in the meantime. */
-  async get(first, limit, parts = false) {
+  /** Requests a chunk of frames, one request at a time; only one further request is kept in the meantime. */
+  async get(first, parts = false) {
     if (first === undefined) return;
-    const wanted = JSON.stringify([first, limit, parts]);
+    const wanted = JSON.stringify([first, parts]);
     if (this.abort) {
-      if (this.abort.wanted !== wanted && !this.wish?.[2]) this.wish = [first, limit, parts];
+      if (this.abort.wanted !== wanted && !this.wish?.[1]) this.wish = [first, parts];
       return;
     }
     const { scene } = this;
     const abort = (this.abort = new AbortController());
     abort.wanted = wanted;
     try {
-      const frames = readable().filter((report) => report.index >= first).slice(0, limit).map((report) => report.index);
-      for (let from = first, left = limit; left > 0;) { // a response ends at the end of one of the service's files
+      const frames = readable().filter((report) => report.index >= first).slice(0, CHUNK).map((report) => report.index);
+      for (let from = first, left = CHUNK; left > 0;) { // a response ends at the end of one of the service's files
         const answer = await fetched("GET", `${scenePath(scene)}/states.s4d?first=${from}&limit=${left}&parts=${parts}`, undefined, abort.signal);
         const bytes = new Uint8Array(await answer.arrayBuffer());
         if (this.abort !== abort) return;
@@ -146,11 +178,12 @@ export class Here {
     const worker = new Worker(new URL("../splats/worker.js", import.meta.url), { type: "module" });
     const hear = (action) => (message) => (message.name ?? message.asked?.opened ?? this.opened) === this.opened && action(message);
     this.splats = new Splats(this.canvas, worker, {
-      frames: hear(({ frames, parts }) => {
+      frames: hear(({ frames, parts, live }) => {
         this.frames = new Set(frames.map(([index]) => index));
+        if (this.live.frame !== null) this.frames.add(this.live.frame); // the worker may not have handled its message yet
         this.said = "";
         if (parts !== this.labelled) this.on.parts((this.labelled = parts));
-        this.on.arrived();
+        if (!live) this.on.arrived(); // live states are drawn without waiting for this message
       }),
       drawn: hear((message) => this.shown(message)),
       failed: hear((message) => this.failed(message)),

@@ -23,7 +23,7 @@ const MODES = {
 };
 
 export class LiveView {
-  /** @param on { pick(u, v, camera, frame), shown(info), turned(), slow(mode), stale(whether), parts(count) } */
+  /** @param on { pick(u, v, camera, frame), shown(info), live(times), turned(), slow(mode), stale(whether), parts(count) } */
   constructor(canvas, overlay, on) {
     this.canvas = canvas;
     this.overlay = overlay;
@@ -38,6 +38,7 @@ export class LiveView {
     this.here = new Here(canvas, { drawn: (...drawn) => this.drawnHere(...drawn), arrived: (all) => this.arrived(all), parts: (count) => on.parts(count) });
     this.touchedAt = this.movedAt = -Infinity;
     this.listen();
+    document.addEventListener("visibilitychange", () => this.moved());
     new ResizeObserver(() => this.moved()).observe(canvas.parentElement);
   }
 
@@ -50,6 +51,8 @@ export class LiveView {
     this.tag = 0;
     this.asked = new Map();
     this.shown = null;
+    this.newest = null; // index of the last committed frame that was announced
+    this.takesFrames = false; // whether frames were committed since the scene was opened
     this.coarse = 1;
     this.frame = null;
     this.between = { next: null, share: 0 };
@@ -129,9 +132,30 @@ export class LiveView {
     this.touch();
   }
 
-  /** Handles a newly committed frame. */
+  /** Handles a committed frame; from the second one on, the page follows the live take. */
   committed(index) {
-    if (this.stream && this.frame === null && this.isTouched() && this.here.draws(this.mode)) this.here.fetch(index, true);
+    this.takesFrames ||= this.newest !== null && index > this.newest;
+    this.newest = index;
+    this.follow();
+  }
+
+  /** Subscribes to the live states while the page draws the newest frame itself, and unsubscribes otherwise. */
+  follow() {
+    if (!this.stream) return false;
+    const { subscriptions } = this.stream;
+    const wanted = this.frame === null && this.here.draws(this.mode) && (this.takesFrames || this.isTouched()) && !document.hidden;
+    if (wanted && !subscriptions.has("states")) this.stream.subscribe("states", "states");
+    else if (!wanted && subscriptions.has("states")) {
+      this.stream.unsubscribe("states");
+      this.here.live.frame = null;
+    }
+    return wanted;
+  }
+
+  /** Draws a new live state. */
+  receiveState(head, bytes) {
+    if (this.follow()) this.here.receive(head, bytes);
+    this.moved();
   }
 
   /** Looks through a camera of the rig. */
@@ -164,6 +188,7 @@ export class LiveView {
   /** Draws or requests a picture after a change of camera, size or mode: a quick one now, a sharp one at rest. */
   moved(sharp = false) {
     if (!this.stream) return;
+    if (document.hidden) return void this.follow();
     clearTimeout(this.settle);
     this.movedAt = performance.now();
     if (this.drawHere(true)) this.settle = setTimeout(() => this.rest(), SETTLE_MS);
@@ -182,15 +207,17 @@ export class LiveView {
   /** Draws the view in the page; returns false if it cannot, so that the service must render it. */
   drawHere(moving = false) {
     const { here } = this;
-    const index = this.frame ?? readable().at(-1)?.index;
-    if (!here.draws(this.mode) || index === undefined || !this.isTouched()) return false;
-    here.fetch(index, this.frame === null && !here.has(index));
+    const live = this.follow();
+    const index = live ? here.live.frame : this.frame ?? readable().at(-1)?.index;
+    if (!here.draws(this.mode) || index === undefined || !(live || this.isTouched())) return false;
+    if (!live) here.fetch(index);
     if (!here.has(index)) return here.alone && !here.said;
-    if (here.alone) this.stream.unsubscribe("view");
+    const moment = live ? here.liveMoment() : { index, ...this.between };
+    if (here.alone || live) this.stream.unsubscribe("view"); // otherwise, the service would render every new frame
     this.overtaken = this.tag; // pictures that have not arrived yet show another view
     clearTimeout(this.slow);
     const camera = this.orbit.camera(...here.size(this.canvas.parentElement.getBoundingClientRect(), moving));
-    here.draw({ index, ...this.between, camera, mode: this.mode, background: this.background, moving });
+    here.draw({ ...moment, camera, mode: this.mode, background: this.background, moving });
     return true;
   }
 
@@ -202,6 +229,9 @@ export class LiveView {
     this.draw();
     const [near, far] = range ?? [];
     this.on.shown({ ...this.shown, width: asked.camera.width, height: asked.camera.height, near, far, here: true });
+    const delay = this.here.liveDelay(asked);
+    if (delay !== null) this.on.live({ frame: this.here.live.frame, published: this.here.live.age, drawn: delay / 1000 });
+    if (this.frame === null && asked.next !== null) requestAnimationFrame(() => this.frame === null && this.moved());
   }
 
   /** Handles the arrival of frames that can be drawn here. */
@@ -212,7 +242,8 @@ export class LiveView {
   request(share = 1) {
     const [width, height] = this.size(share);
     const camera = this.orbit.camera(width, height);
-    const request = { camera, frame: this.frame, parts: this.mode === "parts" ? this.parts : null,
+    const frame = this.follow() ? this.here.live.frame : this.frame;
+    const request = { camera, frame, parts: this.mode === "parts" ? this.parts : null,
       background: this.background, ...MODES[this.mode] };
     this.asked.set(++this.tag, { camera, mode: this.mode, at: performance.now(), share });
     this.canvas.parentElement.dataset.asked = this.tag;

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import Camera, Rig, WorldFrame
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, DamagedFileError, FileError, FileHeader
 from scas4d_core.compact.columns import Columns
+from scas4d_core.compact.encoder import KEY_EVERY
 from scas4d_core.compact.frame_code import errors_of
 from scas4d_core.compact.index import footer
 from scas4d_core.compact.planes import compress
 from scas4d_core.compact.records import HEAD_SIZE, RecordKind, parse_head, record_bytes, scan
-from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.gaussians import Gaussians, quaternion_products
 
 RIG = Rig((Camera("front", [[100.0, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48),))

@@ -10,8 +10,21 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from client.errors import InvalidRequest, NotFound
-from client.stream import Stream, TracksEvent, ViewEvent, finished_frames, parts, scene_changes, tracks, view
+from client.stream import (
+    StatesEvent,
+    Stream,
+    TracksEvent,
+    ViewEvent,
+    finished_frames,
+    live_states,
+    parts,
+    scene_changes,
+    tracks,
+    view,
+)
 from client.wire.stream import MAGIC, STREAM_PROTOCOL, BinaryHead, FrameMessage, SceneMessage, pack, unpack
+from scas4d_core.compact import CompactReader
+from server.counters import FRAME_LATENCY
 
 
 @pytest.fixture
@@ -271,3 +284,56 @@ def test_long_trajectories_are_asked_for_in_pieces(service, sdk, scene, stream, 
     event = until(stream, lambda e: True)[-1]
     assert (event.first, event.frame) == (0, 3)
     assert bulk._asked == 4
+
+
+def states_of(bodies, path):
+    """The states in a file of joined bodies, by frame."""
+    path.write_bytes(b"".join(bodies))
+    with CompactReader(path) as reader:
+        return {index: reader.state(index) for index in reader.frames}
+
+
+def test_states_come_as_a_key_frame_and_then_as_changes(sdk, service, scene, stream, tmp_path):
+    push(sdk, scene, range(2))
+    stream.subscribe("s", live_states(), tag=3)
+    events = until(stream, lambda e: True)
+    for index in (2, 3):
+        push(sdk, scene, [index])
+        events += until(stream, lambda e, index=index: e.frame == index)
+    assert all(isinstance(event, StatesEvent) for event in events)
+    assert [(event.frame, event.after, event.missed, event.tag) for event in events] == [
+        (1, None, 0, 3),
+        (2, 1, 0, 3),
+        (3, 2, 0, 3),
+    ]
+    assert all(event.age >= 0 for event in events)
+    found = states_of([event.body for event in events], tmp_path / "live.s4d")
+    true = states_of([sdk.states(scene)[0]], tmp_path / "all.s4d")
+    assert set(found) == {1, 2, 3}
+    for index, state in found.items():  # two decodings of one state
+        assert np.allclose(state.means, true[index].means, atol=2 * 0.04 * 0.05)
+        assert np.array_equal(state.ids, true[index].ids)
+    committed = {sample.labels["stage"] for metric in FRAME_LATENCY.collect() for sample in metric.samples}
+    assert "publish" in committed
+
+
+def test_viewers_share_one_encoding_and_one_that_joins_late_gets_a_key_frame(service, sdk, scene, stream, tmp_path):
+    push(sdk, scene, [0])
+    with Stream(service.url, scene) as other, Stream(service.url, scene) as late:
+        queries = service.app.state.hub._channels[scene].queries
+        for one in (stream, other):
+            one.subscribe("s", live_states())
+            assert until(one, lambda e: True)[-1].after is None
+        for index in (1, 2):
+            push(sdk, scene, [index])
+            bodies = {until(one, lambda e, index=index: e.frame == index)[-1].body for one in (stream, other)}
+            assert len(bodies) == 1
+        assert queries.asked == 3
+        late.subscribe("s", live_states())
+        joined = until(late, lambda e: True)[-1]
+        assert (joined.frame, joined.after) == (2, None)
+        push(sdk, scene, [3])
+        followed = [until(one, lambda e: e.frame == 3)[-1] for one in (stream, late)]
+        assert followed[0].body == followed[1].body
+        found = states_of([joined.body, followed[1].body], tmp_path / "late.s4d")
+        assert max(found) == 3
