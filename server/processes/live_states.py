@@ -15,7 +15,7 @@ Nobody was watching in the meantime, and states encoded relative to newer ones a
 """
 
 
-class LiveStates:
+class LiveStateEncoder:
     """Encoder of a scene's newest states, which starts anew if a state cannot continue the previous one.
 
     Args:

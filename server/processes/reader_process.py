@@ -30,7 +30,7 @@ from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFr
 from server.messages import DamageFound, SceneSpec, Stop
 from server.processes import track_answers
 from server.processes.compact_answers import compact_head, write_compact
-from server.processes.live_states import LiveStates
+from server.processes.live_states import LiveStateEncoder
 from server.processes.part_labels import PartLabels, resize_labels
 from server.processes.placement import use_one_thread
 from server.processes.queries import (
@@ -122,7 +122,7 @@ class QueryReader:
         self._history: History | None = None
         self._reader: CommittedScene | None = None
         self._parts = PartLabels(spec.folder.parts)
-        self._live = LiveStates(spec)
+        self._live = LiveStateEncoder(spec)
 
     @property
     def history(self) -> History:
