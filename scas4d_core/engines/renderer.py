@@ -133,6 +133,9 @@ class Renderer(Protocol):
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """Returns a state moved further along its motion; see ``extrapolated``."""
 
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+        """Returns a state whose normals rotated with their neighbourhoods; see ``with_turned_normals``."""
+
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """Returns a mask [h, w] of the ``BLOCK``-pixel blocks that the supports of moving Gaussians intersect.
 
@@ -188,3 +191,37 @@ def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians
     for name, array in arrays.items():
         array[rows] += np.float32(share) * (getattr(after, name)[rows] - getattr(before, name)[rows])
     return after.replace(**arrays)
+
+
+def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
+
+    Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a surface,
+    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the same result.
+
+    Args:
+        before, after: [N, 3] positions of the Gaussians in the two states, in metres.
+        near: [M, k] rows of the Gaussians in each neighbourhood.
+    """
+    there, now = before[near].astype(np.float64), after[near].astype(np.float64)
+    there -= there.mean(axis=1, keepdims=True)
+    now -= now.mean(axis=1, keepdims=True)
+    spread = np.einsum("nki,nkj->nij", now, there)
+    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # non-finite neighbourhoods are not rotated
+    left, _, right = np.linalg.svd(spread)
+    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    turns: NDArray[np.float64] = left @ right
+    return turns
+
+
+def with_turned_normals(before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+    """Returns a state whose normals rotated with their neighbourhoods since an earlier state; only the gloss changes.
+
+    Args:
+        before: state Θ_{t−1}.
+        after: state Θ_t with gloss.
+        near: [M, k] neighbourhood of each Gaussian with gloss; see ``neighbourhood_turns``.
+    """
+    assert after.gloss is not None
+    turns = neighbourhood_turns(before.means, after.means, near)
+    return after.replace(gloss=np.einsum("nij,nj->ni", turns, after.gloss).astype(np.float32))

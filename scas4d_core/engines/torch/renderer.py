@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import BLOCK, Comparison, Picture, colour_step, extrapolated
+from scas4d_core.engines.renderer import BLOCK, Comparison, Picture, colour_step, extrapolated, with_turned_normals
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import colours_seen, no_turns
 from scas4d_core.engines.torch.parameters import leaf
@@ -88,6 +88,10 @@ class TorchRenderer:
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """See ``Renderer.extrapolate``."""
         return extrapolated(before, after, share)
+
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+        """See ``Renderer.turn_normals``."""
+        return with_turned_normals(before, after, near)
 
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``. A block is marked if a support contains one of its pixel centres."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from engine_cases import apart, case, gaussians, rig
+from scipy.spatial.transform import Rotation
 
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
@@ -115,3 +116,18 @@ def test_blocks_that_are_reached(tested: Renderer) -> None:
     assert mine.shape == true.shape
     assert not (true & ~mine).any()  # a support may pass between the centres of pixels
     assert (mine & ~true).sum() <= 0.2 * mine.sum()
+
+
+def test_normals_turn_with_their_neighbourhoods(tested: Renderer) -> None:
+    before, rng = gaussians(glossy=True), np.random.default_rng(0)
+    assert before.gloss is not None
+    turn = Rotation.from_rotvec([0.1, 0.5, 0.2]).as_matrix()
+    means = (before.means @ turn.T + rng.normal(0, 0.02, before.means.shape)).astype(np.float32)
+    means[3] = np.nan
+    near = rng.integers(len(before), size=(len(before.gloss), 8))
+    mine, true = (renderer.turn_normals(before, before.replace(means=means), near) for renderer in (tested, TRUE))
+    assert apart(mine.gloss, true.gloss) < CLOSE
+    assert apart(true.gloss, before.gloss) > 0.1
+    lost = (near == 3).any(axis=1)  # in neighbourhoods of a lost Gaussian
+    assert lost.any()
+    np.testing.assert_allclose(mine.gloss[lost], before.gloss[lost], atol=1e-6)
