@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.views import CameraArrays, TrainingView
+from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 
@@ -35,6 +35,21 @@ class Picture(NamedTuple):
 
     features: Array
     transmittance: Array
+
+
+def levels(values: Array) -> NDArray[np.uint8]:
+    """Rounds values in [0, 1] to 8 bits; other values are clipped.
+
+    >>> levels(np.float32([-1, 0.5, 2]))
+    array([  0, 128, 255], dtype=uint8)
+    """
+    rounded: NDArray[np.uint8] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return rounded
+
+
+def picture_levels(picture: Picture, opacity: bool) -> NDArray[np.uint8]:
+    """Implements ``Renderer.render_levels`` for renderers whose pictures are in host memory."""
+    return levels(1 - picture.transmittance if opacity else np.moveaxis(picture.features[:LABEL], 0, -1))
 
 
 def psnr_of(squares: float, pixels: int) -> float:
@@ -105,6 +120,18 @@ class Renderer(Protocol):
             depth_channel: channel of ``features`` to overwrite with the depth of each mean (metres along z), or −1.
             background: [C] float32 background. If None, the scene's background is used for RGB and 0 for all other
                 channels.
+        """
+
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """Renders the colours of a state, or its opacity, in 8 bits; see ``render`` and ``levels``.
+
+        Args:
+            state: Gaussians to render.
+            camera: camera in kernel format.
+            background: [4] float32 background.
+            opacity: whether to return the opacity [H, W] instead of the colours [H, W, 3].
         """
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:

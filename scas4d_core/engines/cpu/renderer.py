@@ -19,6 +19,7 @@ from scas4d_core.engines.renderer import (
     Picture,
     colour_step,
     extrapolated,
+    picture_levels,
     psnr_of,
     with_turned_normals,
 )
@@ -96,6 +97,12 @@ class CpuRenderer:
             background[:CHANNELS] = self._background
         given = (state.means, state.factors, state.opacities, shown, camera, background)
         return self.rasterizer.forward(*given, depth_channel)
+
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """See ``Renderer.render_levels``."""
+        return picture_levels(self.render(state, camera, background=background), opacity)
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""

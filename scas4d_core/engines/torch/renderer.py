@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import BLOCK, Comparison, Picture, colour_step, extrapolated, with_turned_normals
+from scas4d_core.engines.renderer import (
+    BLOCK,
+    Comparison,
+    Picture,
+    colour_step,
+    extrapolated,
+    picture_levels,
+    with_turned_normals,
+)
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import colours_seen, no_turns
 from scas4d_core.engines.torch.parameters import leaf
@@ -49,6 +57,12 @@ class TorchRenderer:
             shown[:, depth_channel] = CameraParams.of_arrays(camera).depths(leaf(state.means))
         picture = self._drawn(state, camera, shown, background)
         return Picture(picture.features.permute(2, 0, 1).float().numpy(), (1 - picture.alpha).float().numpy())
+
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """See ``Renderer.render_levels``."""
+        return picture_levels(self.render(state, camera, background=background), opacity)
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""

@@ -627,9 +627,10 @@ class PictureLoss:
         """Allocates buffers for the given number of views and image size, and marks all images for upload."""
         device, shape = self._device, (views, CHANNELS, rows, columns)
         pinned = wp.get_device(device).is_cuda
-        self.columns, self.rows, self._taken = columns, rows, [None] * views
+        self.columns = self.rows = 0  # if memory is full, the next call allocates everything again
         # Blocks must not span two channels.
         bands = -(-rows // ROWS)
+        self._taken = [None] * views
         self._threads = (CHANNELS, -(-bands // 8) * 8, -(-columns // 32) * 32)
         self.cameras = wp.zeros(views, dtype=Camera, device=device)
         self.channels = wp.zeros(views, dtype=wp.int32, device=device)
@@ -647,3 +648,4 @@ class PictureLoss:
         self._host_channels, self._host_exposures = self._channels.numpy(), self._exposures.numpy()
         self._host_levels = self._staged_levels.numpy()
         self._host_exposures[:] = [1, 0]
+        self.columns, self.rows = columns, rows

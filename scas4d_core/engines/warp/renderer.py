@@ -139,6 +139,24 @@ def extrapolate_numbers(
 
 
 @wp.kernel
+def round_to_levels(
+    planes: wp.array3d[wp.float32], first: wp.int32, sign: wp.float32, offset: wp.float32, levels: wp.array3d[wp.uint8]
+) -> None:
+    """Rounds planes to 8 bits like ``renderer.levels``, with one thread per pixel.
+
+    Args:
+        planes: [5, rows, columns] rendering.
+        first: index of the first plane to round.
+        sign, offset: factor and offset of the values, 1 and 0, or −1 and 1 to invert them.
+        levels: [H, W, C] output.
+    """
+    y, x = wp.tid()
+    for c in range(levels.shape[2]):
+        value = wp.clamp(offset + sign * planes[first + c, y, x], 0.0, 1.0)
+        levels[y, x, c] = wp.uint8(wp.rint(255.0 * value))
+
+
+@wp.kernel
 def turn_normals(
     near: wp.array2d[wp.int32],
     before: wp.array[wp.vec3],
@@ -202,7 +220,8 @@ class WarpRenderer:
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
         self._copies = copies_on(device)
-        self._downloads, self._log_downloads = Downloads(device), Downloads(device)  # each reuses one buffer
+        # each reuses one buffer
+        self._downloads, self._log_downloads, self._level_downloads = (Downloads(device) for _ in range(3))
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
@@ -238,6 +257,21 @@ class WarpRenderer:
         if len(drawn) == 1:
             return Picture(drawn[0][:CHANNELS], drawn[0][CHANNELS])
         return Picture(np.concatenate([planes[:CHANNELS] for planes in drawn]), drawn[0][CHANNELS])
+
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """See ``Renderer.render_levels``. Only the 8-bit values are downloaded."""
+        cameras = self._camera(camera)
+        features = features_seen(self._copies, state, cameras)
+        self._project(state, camera, cameras, [features])
+        self._draw(cameras, features, background)
+        shape = camera.height, camera.width
+        levels = wp.empty((*shape, 1 if opacity else LABEL), dtype=wp.uint8, device=self.device)
+        chosen = (CHANNELS, -1.0, 1.0) if opacity else (0, 1.0, 0.0)
+        wp.launch(round_to_levels, shape, [self._rasterizer.planes, *chosen, levels], device=self.device)
+        pixels: NDArray[np.uint8] = self._level_downloads.read(levels)[0]
+        return pixels[..., 0] if opacity else pixels
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""

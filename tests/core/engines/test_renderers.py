@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
-from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.renderer import Renderer, levels
 from scas4d_core.engines.torch.renderer import TorchRenderer
 from scas4d_core.engines.views import LABEL, CameraArrays
 
@@ -42,6 +42,18 @@ def test_pictures(tested: Renderer, glossy: bool) -> None:
     if glossy:
         dull = TRUE.render(state.replace(gloss=None, environment=None), CAMERA)
         assert apart(dull.features, true.features) > 0.01
+
+
+@pytest.mark.parametrize("glossy", [False, True])
+def test_pictures_in_8_bits_are_the_rounded_ones(tested: Renderer, glossy: bool) -> None:
+    state, behind = gaussians(glossy=glossy), np.float32([1.2, -0.3, 0.5, 0])  # some values are clipped
+    view = tested.render(state, CAMERA, background=behind)
+    colours, opacity = (tested.render_levels(state, CAMERA, behind, opacity=opacity) for opacity in (False, True))
+    assert colours.dtype == opacity.dtype == np.uint8
+    assert np.array_equal(colours, levels(np.moveaxis(view.features[:LABEL], 0, -1)))
+    assert np.array_equal(opacity, levels(1 - view.transmittance))
+    assert set(np.unique(colours)) >= {0, 255}
+    assert opacity.std() > 10
 
 
 def test_depth_features_and_another_background(tested: Renderer) -> None:
