@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -128,10 +129,11 @@ def test_a_frame_uploads_at_most_a_twentieth_beside_its_images(monkeypatch: pyte
         {
             "device": "gpu",
             "scene": {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)},
-            "update": {"iterations": 2, "stop_gain": 0, "skip_tolerance": 0},
+            "update": {"iterations": 5, "stop_gain": 0, "skip_tolerance": 0},
+            "effects": {"prediction": "on"},  # uploads the motion of the previous frame
         }
     )
-    shots = [shown(state, index, cameras) for index in range(4)]
+    shots = [replace(shown(state, 8 * index, cameras), index=index, time=index / 30) for index in range(4)]
     uploads = Uploads(monkeypatch)
     scene = Reconstruction.start(cameras, shots[0], given, static=known(state, cameras))
     for shot in shots[1:-1]:  # the first update uploads the clusters
@@ -139,6 +141,6 @@ def test_a_frame_uploads_at_most_a_twentieth_beside_its_images(monkeypatch: pyte
     uploads.bytes.clear()
     report = scene.step(shots[-1])
     assert report.outcome == "updated"
-    images = sum(image.nbytes for image in shots[-1].images.values())
+    images = sum(array.nbytes for array in (*shots[-1].images.values(), *shots[-1].masks.values()))
     assert uploads.bytes.pop("uint8") == images  # each once, although some are probe views too
     assert 0 < sum(uploads.bytes.values()) <= 0.05 * images, uploads.bytes
