@@ -60,6 +60,15 @@ def _hardware_fault(device: str) -> str | None:
     return None
 
 
+def free_gpu_mb() -> float | None:
+    """Returns the free memory of the GPU in MB (10⁶ bytes), or None if device "gpu" is not a GPU."""
+    if warp_device() == "cpu" or gpu_fault() is not None:
+        return None
+    import warp
+
+    return float(warp.get_device(warp_device()).free_memory / 1e6)
+
+
 def resolve_device(device: Literal["auto", "cpu", "gpu"]) -> Device:
     """Resolves the setting ``device`` to a device.
 

@@ -253,7 +253,7 @@ class UpdateEngine(Protocol):
         """Loads Θ_{t−1} and discards learned colours and gloss. The next call must be ``set_tables``."""
 
     def set_tables(self, tables: Tables) -> None:
-        """Sets the parameters of the deformation."""
+        """Sets the parameters of the deformation. The arrays may become read-only."""
 
     def begin(self, start: AttemptStart) -> None:
         """Starts an attempt, with zero Adam moments and an empty log."""

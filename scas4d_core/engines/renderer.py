@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.views import CameraArrays, TrainingView
+from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 
@@ -35,6 +35,21 @@ class Picture(NamedTuple):
 
     features: Array
     transmittance: Array
+
+
+def levels(values: Array) -> NDArray[np.uint8]:
+    """Rounds values in [0, 1] to 8 bits; other values are clipped.
+
+    >>> levels(np.float32([-1, 0.5, 2]))
+    array([  0, 128, 255], dtype=uint8)
+    """
+    rounded: NDArray[np.uint8] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return rounded
+
+
+def picture_levels(picture: Picture, opacity: bool) -> NDArray[np.uint8]:
+    """Implements ``Renderer.render_levels`` for renderers whose pictures are in host memory."""
+    return levels(1 - picture.transmittance if opacity else np.moveaxis(picture.features[:LABEL], 0, -1))
 
 
 def psnr_of(squares: float, pixels: int) -> float:
@@ -107,6 +122,18 @@ class Renderer(Protocol):
                 channels.
         """
 
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """Renders the colours of a state, or its opacity, in 8 bits; see ``render`` and ``levels``.
+
+        Args:
+            state: Gaussians to render.
+            camera: camera in kernel format.
+            background: [4] float32 background.
+            opacity: whether to return the opacity [H, W] instead of the colours [H, W, 3].
+        """
+
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """Renders a state and compares it with the training image of a view; see ``render``."""
 
@@ -132,6 +159,9 @@ class Renderer(Protocol):
 
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """Returns a state moved further along its motion; see ``extrapolated``."""
+
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+        """Returns a state whose normals rotated with their neighbourhoods; see ``with_turned_normals``."""
 
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """Returns a mask [h, w] of the ``BLOCK``-pixel blocks that the supports of moving Gaussians intersect.
@@ -190,3 +220,33 @@ def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians
         flat = (array.reshape(len(result), -1) for array in (old, new))
         extrapolate_rows(*flat, after.moving, np.float32(share), result.reshape(len(result), -1))
     return after.replace(means=means, factors=factors)
+
+
+def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (``kernels.turns``).
+
+    Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a surface,
+    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the same result.
+
+    Args:
+        before, after: [N, 3] positions of the Gaussians in the two states, in metres.
+        near: [M, k] rows of the Gaussians in each neighbourhood.
+    """
+    from scas4d_core.kernels.turns import turn_neighbourhoods  # deferred import, because it loads the kernels
+
+    turns = np.empty((len(near), 3, 3))
+    turn_neighbourhoods(before, after, near, turns)
+    return turns
+
+
+def with_turned_normals(before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+    """Returns a state whose normals rotated with their neighbourhoods since an earlier state; only the gloss changes.
+
+    Args:
+        before: state Θ_{t−1}.
+        after: state Θ_t with gloss.
+        near: [M, k] neighbourhood of each Gaussian with gloss; see ``neighbourhood_turns``.
+    """
+    assert after.gloss is not None
+    turns = neighbourhood_turns(before.means, after.means, near)
+    return after.replace(gloss=np.einsum("nij,nj->ni", turns, after.gloss).astype(np.float32))

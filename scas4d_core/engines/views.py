@@ -57,6 +57,7 @@ class TrainingView:
         target: [C, H, W] float32 image, RGB in [0, 1], followed by the mask if the frame has one. C is 3 or 4.
         exposure: [C, 2] gain and offset of each channel, which are 1 and 0 for the mask.
         source: [H, W, 3] uint8 image and [H, W] uint8 mask (or None) from which ``target`` was converted, if any.
+        finer: target [C, h, w] of a larger view that ``target`` was area-averaged from, if any.
     """
 
     name: str
@@ -64,6 +65,7 @@ class TrainingView:
     target: Array
     exposure: Array
     source: tuple[NDArray[np.uint8], NDArray[np.uint8] | None] | None = None
+    finer: Array | None = None
 
     @property
     def pixels(self) -> NDArray[np.uint8]:

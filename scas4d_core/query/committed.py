@@ -72,8 +72,16 @@ class CommittedScene:
         gaussians = self._state(index)
         if labels is not None and np.shape(labels) == (self.history.count,):
             labels = np.asarray(labels)[: len(gaussians)]
-        behind = self.history.background if background is None else background
-        return self._view.render(gaussians, camera, behind, labels=labels)
+        return self._view.render(gaussians, camera, self._background(background), labels=labels)
+
+    def render_levels(
+        self, camera: Camera, index: int | None, background: tuple[float, float, float] | None, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """Renders the colours [H, W, 3] or opacity [H, W] of a frame in 8 bits; see ``render`` and ``ViewRenderer``."""
+        return self._view.render_levels(self._state(index), camera, self._background(background), opacity=opacity)
+
+    def _background(self, given: tuple[float, float, float] | None) -> tuple[float, float, float]:
+        return self.history.background if given is None else given
 
     def _state(self, index: int | None) -> Gaussians:
         return self.history.gaussians(self.history.indices[-1] if index is None else index)

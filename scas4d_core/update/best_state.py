@@ -176,6 +176,7 @@ class BestState:
         self._motion, self._momentum = motion, momentum
         self.seconds = seconds
         self.errors: dict[Candidate, dict[str, float]] = {}
+        self._warm: tuple[float, Tables] | None = None
 
     @property
     def whole(self) -> bool:
@@ -291,7 +292,13 @@ class BestState:
         self._set(self._motion if candidate is Candidate.WARM else None)
 
     def _set(self, motion: Motion | None) -> Tables:
-        tables = warm_start(self._hierarchy, motion, self.seconds, self._momentum)
+        if motion is None:
+            tables = Tables.identity(self._hierarchy)
+        elif self._warm is not None and self._warm[0] == self.seconds:
+            tables = self._warm[1]
+        else:
+            tables = warm_start(self._hierarchy, motion, self.seconds, self._momentum)
+            self._warm = self.seconds, tables  # an engine uploads the same tables only once
         self._engine.set_tables(tables)
         return tables
 

@@ -46,7 +46,7 @@ class Attempt:
         previous: previous state Θ_{t−1}.
         views: training views that the attempt uses.
         rates: learning rates of this attempt.
-        tables: initial deformation; a part may change it in ``begin``.
+        tables: initial deformation; a part may replace it in ``begin``. The arrays may be read-only.
         carried: arrays from the previous frame, keyed by effect name. In ``end``, parts replace them with the arrays
             for the next frame.
         gains: [cameras, 3] initial camera gains, or None if gains are not estimated.

@@ -89,7 +89,7 @@ class ViewFactory:
             target = np.moveaxis(view.target, 0, -1).astype(np.float64)
             small = area_average(target, (camera.width, camera.height)).astype(np.float32)
             planes = np.ascontiguousarray(np.moveaxis(small, -1, 0))
-        return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure)
+        return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure, finer=view.target)
 
     def retouched(self, view: TrainingView, target: Array) -> TrainingView:
         """Returns the view with its planes replaced by ``target`` [C, H, W] of the same size."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from client.wire import RigModel
@@ -56,6 +58,8 @@ BEARING = ("entering", "uncovered")
 """Effects that add Gaussians and therefore detect new content in the images."""
 SCALES = (0.75, 0.5, 0.35, 0.25, 0.125)
 """Image scales to suggest for a scene that does not fit into memory, in order of preference."""
+
+log = logging.getLogger("scas4d.server")
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
@@ -111,14 +115,51 @@ def refuse_if_too_large(rig: RigModel, settings: Settings, server: ServerSetting
     needed = estimate(rig, settings, server)
     if needed.memory_mb <= needed.limit_mb:
         return
+    fault = f"the scene needs an estimated {needed.memory_mb:.0f} MB of memory; the limit is {needed.limit_mb:.0f} MB"
+    remedy = "raise SCAS4D_MAX_SCENE_MEMORY_MB"
+    raise _too_large(rig, settings, server, fault, remedy, lambda smaller: smaller.memory_mb <= needed.limit_mb)
+
+
+def fit_gpu(rig: RigModel, settings: Settings, server: ServerSettings, free_mb: float | None) -> Settings:
+    """Returns the settings, with device `cpu` instead of `auto` if the GPU lacks memory for the scene.
+
+    Args:
+        rig: rig of the scene.
+        settings: settings of the scene.
+        server: settings of the service.
+        free_mb: free GPU memory in MB, or None if there is no GPU.
+
+    Raises:
+        Problem: 422 if the scene requires a GPU whose free memory is too small.
+    """
+    needed = estimate(rig, settings, server).gpu_mb
+    if free_mb is None or needed <= free_mb:
+        return settings
+    fault = f"the scene needs an estimated {needed:.0f} MB of GPU memory; {free_mb:.0f} MB are free"
+    if settings.device == "auto":
+        log.warning("device 'auto' selects the CPU: %s", fault)
+        return settings.model_copy(update={"device": "cpu"})
+    raise _too_large(rig, settings, server, fault, "set settings.device to 'cpu'", lambda it: it.gpu_mb <= free_mb)
+
+
+def _too_large(
+    rig: RigModel,
+    settings: Settings,
+    server: ServerSettings,
+    fault: str,
+    remedy: str,
+    fits: Callable[[SceneEstimate], bool],
+) -> Problem:
+    """Returns the refusal of a scene; the remedy suggests an image scale for which `fits` is true, if there is one."""
+    needed = estimate(rig, settings, server)
+    remedy = f"use fewer or smaller images, lower settings.static.max_gaussians, or {remedy}"
     smaller = [scale for scale in SCALES if scale < settings.scene.image_scale]
-    fits = next((s for s in smaller if estimate(rig, settings, server, s).memory_mb <= needed.limit_mb), None)
-    remedy = "use fewer or smaller images, lower settings.static.max_gaussians, or raise SCAS4D_MAX_SCENE_MEMORY_MB"
-    if fits is not None:
-        remedy = f"set settings.scene.image_scale to {fits:g}, or {remedy}"
-    raise Problem(
+    scale = next((scale for scale in smaller if fits(estimate(rig, settings, server, scale))), None)
+    if scale is not None:
+        remedy = f"set settings.scene.image_scale to {scale:g}, or {remedy}"
+    return Problem(
         422,
-        f"the scene needs an estimated {needed.memory_mb:.0f} MB of memory; the limit is {needed.limit_mb:.0f} MB",
+        fault,
         field="rig.cameras",
         value=f"{count_noun(len(rig.cameras), 'camera')}, {needed.scaled_pixels} pixels, {needed.gaussians} Gaussians",
         remedy=remedy,

@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from scas4d_core.query.view import View
 
 BYTES = "application/octet-stream"
+EIGHT_BIT = ("colour", "alpha")
+"""Kinds that are rendered in 8 bits per channel for image formats."""
 QUALITY = 92
 """Default quality of JPEG and WebP images, 1…100."""
 CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
@@ -208,6 +210,12 @@ class QueryReader:
     def _answer(self, number: int, query: Query) -> Answer:
         match query:
             case RenderQuery():
+                if query.format not in ("npz", "float32") and query.kinds[0] in EIGHT_BIT:
+                    pixels = self.reader.render_levels(
+                        query.camera, query.frame, query.background, opacity=query.kinds[0] == "alpha"
+                    )
+                    body, media_type = encode_pixels(pixels, query.format, query.quality)
+                    return Answer(number, body, media_type, {"X-Frame": str(query.frame)})
                 painted = query.labels
                 if painted is not None:
                     painted = resize_labels(painted, len(self.history.gaussians(query.frame)))
@@ -278,7 +286,8 @@ def encode_view(
 ) -> tuple[bytes, str, dict[str, str]]:
     """Encodes a view and returns the body, media type and headers.
 
-    The image formats encode only the first of `kinds`; the route has already checked that there is exactly one.
+    The image formats encode only the first of `kinds`, which is depth or parts; see `EIGHT_BIT` for the others. The
+    route has already checked that there is exactly one.
 
     Args:
         view: rendered view.
@@ -293,19 +302,23 @@ def encode_view(
         body, headers = float32(arrays)
         return body, BYTES, headers
     pixels, headers = _pixels(kinds[0], arrays[kinds[0]])
-    media_type = f"image/{format}"
     if kinds[0] == "parts":  # imageio cannot write palettes
         picture, file = Image.fromarray(pixels), io.BytesIO()
         picture.putpalette(_PART_COLOURS)
         picture.save(file, "PNG", compress_level=1)
-        return file.getvalue(), media_type, headers
+        return file.getvalue(), f"image/{format}", headers
+    return *encode_pixels(pixels, format, quality), headers
+
+
+def encode_pixels(pixels: NDArray[np.uint8 | np.uint16], format: str, quality: int | None = None) -> tuple[bytes, str]:
+    """Encodes an image [H, W] or [H, W, 3] as ``png``, ``jpeg`` or ``webp``; returns the body and the media type."""
     options: dict[str, Any] = {"compress_level": 1}
     if format == "jpeg":
         options = {"quality": quality or QUALITY, "subsampling": 0}
     elif format == "webp":
         # Live views need speed more than small files; method 0 takes a third of the default's time.
         options = {"quality": quality or QUALITY, "method": 0}
-    return imageio.imwrite("<bytes>", pixels, extension=f".{format}", plugin="pillow", **options), media_type, headers
+    return imageio.imwrite("<bytes>", pixels, extension=f".{format}", plugin="pillow", **options), f"image/{format}"
 
 
 def part_colours() -> list[int]:
@@ -320,12 +333,10 @@ _PART_COLOURS = part_colours()
 
 
 def _pixels(kind: str, array: NDArray[Any]) -> tuple[NDArray[np.uint8 | np.uint16], dict[str, str]]:
-    """Returns the pixels and headers of an image: depth in 16 bits, parts as palette indices, others in 8 bits."""
-    if kind == "depth":
-        met = np.isfinite(array)
-        near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)
-        steps = 1 + np.rint(65534 * (np.where(met, array, near) - near) / max(far - near, 1e-12))
-        return np.where(met, steps, 0).astype(np.uint16), {"X-Depth-Near": repr(near), "X-Depth-Far": repr(far)}
+    """Returns the pixels and headers of an image: depth in 16 bits, or parts as palette indices."""
     if kind == "parts":
         return array, {}
-    return np.rint(255 * np.clip(array, 0, 1)).astype(np.uint8), {}
+    met = np.isfinite(array)
+    near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)
+    steps = 1 + np.rint(65534 * (np.where(met, array, near) - near) / max(far - near, 1e-12))
+    return np.where(met, steps, 0).astype(np.uint16), {"X-Depth-Near": repr(near), "X-Depth-Far": repr(far)}

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request, Response
 
 from client.wire import SceneCreate, SceneEdit, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
-from scas4d_core.engines.choose import gpu_fault
+from scas4d_core.engines.choose import free_gpu_mb, gpu_fault
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
@@ -105,6 +105,9 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
             )
     check_nodes(request, scenes.placement)
     await check_settings(request, settings, server, scenes.placement)
+    if settings.device != "cpu" and not scenes.placement.has_labels:
+        free = await asyncio.to_thread(free_gpu_mb)  # may initialize CUDA
+        settings = estimate.fit_gpu(request.rig, settings, server, free)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()

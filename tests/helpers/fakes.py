@@ -16,6 +16,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 
+from scas4d_core.engines.renderer import levels
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History, HistoryError, run_now
 
@@ -229,6 +230,10 @@ class FakeCommitted:
         depth[0, 0], depth[0, 1:2] = np.nan, 4.0
         parts = None if labels is None else np.full(colour.shape[:2], labels.max() + 1, np.uint8)
         return SimpleNamespace(colour=colour, alpha=np.ones(colour.shape[:2]), depth=depth, parts=parts)
+
+    def render_levels(self, camera, index, background, *, opacity):
+        view = self.render(camera, index, background=background)
+        return levels(view.alpha if opacity else view.colour)
 
     def _depth(self, camera, index):
         return np.full((camera.height, camera.width), np.inf), np.zeros((camera.height, camera.width))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -85,3 +87,54 @@ def drawn(
 def index(number: int) -> wp.array:
     """A number on the device."""
     return wp.array([number], dtype=wp.int32, device=DEVICE)
+
+
+class Uploads:
+    """Counts bytes that go to the device as NumPy arrays or from page-locked buffers, by type, from now on.
+
+    Structs and lists of a few numbers are not counted.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.bytes: Counter[str] = Counter()
+        self._locked: list[wp.array] = []  # kept, so that no other array takes their place
+        self._inside = False
+        zeros, copy, construct, assign = wp.zeros, wp.copy, wp.array.__init__, wp.array.assign
+
+        def made(*given: object, **named: object) -> wp.array:
+            array = zeros(*given, **named)
+            if "pinned" in named:
+                self._locked.append(array)
+            return array
+
+        def copied(
+            target: wp.array, source: wp.array, dest_offset: int = 0, src_offset: int = 0, count: int = 0
+        ) -> None:
+            if any(one.ptr <= source.ptr < one.ptr + one.capacity for one in self._locked):
+                self._add(source.dtype, (count or source.size) * wp.types.type_size_in_bytes(source.dtype))
+            copy(target, source, dest_offset, src_offset, count)
+
+        def constructed(array: wp.array, data: object = None, *given: object, **named: object) -> None:
+            self._watch(data, lambda: construct(array, data, *given, **named))
+
+        def assigned(array: wp.array, values: object) -> None:
+            self._watch(np.asarray(values), lambda: assign(array, values))
+
+        monkeypatch.setattr(wp, "zeros", made)
+        monkeypatch.setattr(wp, "copy", copied)
+        monkeypatch.setattr(wp.array, "__init__", constructed)
+        monkeypatch.setattr(wp.array, "assign", assigned)
+
+    def _watch(self, data: object, act: Callable[[], None]) -> None:
+        """Counts the data of the outermost call."""
+        if self._inside:
+            return act()
+        if isinstance(data, np.ndarray):
+            self._add(data.dtype, data.nbytes)
+        self._inside = True
+        act()
+        self._inside = False
+
+    def _add(self, kind: object, size: int) -> None:
+        name = "uint8" if kind is wp.uint8 else str(kind)
+        self.bytes[name] += size

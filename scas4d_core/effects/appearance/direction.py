@@ -30,23 +30,6 @@ FEW = 4
 """Number of views from which the evidence is computed."""
 
 
-def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (``kernels.turns``).
-
-    Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a surface,
-    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the same result.
-
-    Args:
-        before, after: [N, 3] positions of the Gaussians in the two states, in metres.
-        near: [M, k] rows of the Gaussians in each neighbourhood.
-    """
-    from scas4d_core.kernels.turns import turn_neighbourhoods  # deferred import, because it loads the kernels
-
-    turns = np.empty((len(near), 3, 3))
-    turn_neighbourhoods(before, after, near, turns)
-    return turns
-
-
 def neighbourhoods(means: Array) -> NDArray[np.int64]:
     """Returns the [N, k] rows of the k nearest neighbours of each Gaussian, starting with the Gaussian itself."""
     count = len(means)
@@ -67,8 +50,7 @@ class DirectionPart(UpdatePart):
             return state
         if self._near is None:
             self._near = neighbourhoods(self._roots[: len(state.gloss)])
-        turns = neighbourhood_turns(attempt.previous.means, state.means, self._near)
-        return state.replace(gloss=np.einsum("nij,nj->ni", turns, state.gloss).astype(np.float32))
+        return attempt.renderer.turn_normals(attempt.previous, state, self._near)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class NewbornTracking(UpdatePart):
             return
         rest = attempt.previous.retire(arrays["newborn"])
         hull = carve_new(measure_novelty(rest, rest.colours, attempt.views, self._factory.posed, attempt.renderer))
+        attempt.tables = attempt.tables.copy()  # an engine may keep the tables that it has loaded
         thing = np.full(len(attempt.previous), -1)
         thing[arrays["newborn"]] = arrays["thing"]
         of_entries, labels = thing[self._hierarchy.rows], self._hierarchy.labels[0]

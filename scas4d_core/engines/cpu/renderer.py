@@ -12,7 +12,17 @@ from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture, colour_step, extrapolated, psnr_of
+from scas4d_core.engines.renderer import (
+    CHANNELS,
+    Comparison,
+    Gradients,
+    Picture,
+    colour_step,
+    extrapolated,
+    picture_levels,
+    psnr_of,
+    with_turned_normals,
+)
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import image_loss, tiles
@@ -88,6 +98,12 @@ class CpuRenderer:
         given = (state.means, state.factors, state.opacities, shown, camera, background)
         return self.rasterizer.forward(*given, depth_channel)
 
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """See ``Renderer.render_levels``."""
+        return picture_levels(self.render(state, camera, background=background), opacity)
+
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
         self.forward(state.means, state.factors, state.opacities, features_seen(state, view.camera), view)
@@ -123,6 +139,10 @@ class CpuRenderer:
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """See ``Renderer.extrapolate``."""
         return extrapolated(before, after, share)
+
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+        """See ``Renderer.turn_normals``."""
+        return with_turned_normals(before, after, near)
 
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``."""

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import BLOCK, Comparison, Picture, colour_step, extrapolated
+from scas4d_core.engines.renderer import (
+    BLOCK,
+    Comparison,
+    Picture,
+    colour_step,
+    extrapolated,
+    picture_levels,
+    with_turned_normals,
+)
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import colours_seen, no_turns
 from scas4d_core.engines.torch.parameters import leaf
@@ -50,6 +58,12 @@ class TorchRenderer:
         picture = self._drawn(state, camera, shown, background)
         return Picture(picture.features.permute(2, 0, 1).float().numpy(), (1 - picture.alpha).float().numpy())
 
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """See ``Renderer.render_levels``."""
+        return picture_levels(self.render(state, camera, background=background), opacity)
+
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
         planes = leaf(self.render(state, view.camera).features[:LABEL])
@@ -88,6 +102,10 @@ class TorchRenderer:
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """See ``Renderer.extrapolate``."""
         return extrapolated(before, after, share)
+
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+        """See ``Renderer.turn_normals``."""
+        return with_turned_normals(before, after, near)
 
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``. A block is marked if a support contains one of its pixel centres."""

@@ -53,6 +53,12 @@ def step_colours(
     step_element(adam, features, i, k, g)
 
 
+@wp.kernel
+def set_rows(rows: wp.array[wp.int32], value: wp.float32, values: wp.array[wp.float32]) -> None:
+    """Sets the elements of an array at the given rows, with one thread per row."""
+    values[rows[wp.tid()]] = value
+
+
 class WarpColours:
     """Colours learned during an attempt, i.e. the first three columns of the features.
 
@@ -69,23 +75,22 @@ class WarpColours:
 
     def __init__(self, plan: UpdatePlan, count: int, rows: NDArray[np.int64], scalars: wp.array) -> None:
         assert plan.colours is not None
-        self._static, self._rows, self._count, self._device = plan.colours.static, rows, count, scalars.device
+        self._static, self._count, self._device = plan.colours.static, count, scalars.device
         self._weight = plan.soft_colour / max(3 * count, 1)
         learned = np.full(count, self._static, np.int32)
         learned[rows] = 1
+        self._rows = wp.array(rows, dtype=wp.int32, device=self._device)
         self._learned = wp.array(learned, dtype=wp.int32, device=self._device)
         self.gradients = wp.zeros((count, 3), dtype=wp.float32, device=self._device)
         self.optimizer = Optimizer((count, 3), scalars, varies_by_row=True)
-        self._rates: tuple[float, float] | None = None
 
     def begin(self, start: AttemptStart) -> None:
         """Starts an attempt, with zero moments."""
         self._reported = int(start.curve)
-        rates, by_row = (start.static_colour if self._static else 0.0, start.colour), None
-        if rates != self._rates:
-            self._rates, by_row = rates, np.full(self._count, rates[0], np.float32)
-            by_row[self._rows] = rates[1]
-        self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2), by_row)
+        by_row = self.optimizer.adam.by_row
+        by_row.fill_(start.static_colour if self._static else 0.0)
+        wp.launch(set_rows, len(self._rows), [self._rows, start.colour, by_row], device=self._device)
+        self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2))
 
     def step(
         self, before: wp.array, g_features: wp.array, features: wp.array, iteration: wp.array, losses: wp.array

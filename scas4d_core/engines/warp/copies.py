@@ -25,10 +25,11 @@ class DeviceCopies:
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
+        most: maximum number of copies.
     """
 
-    def __init__(self, device: str) -> None:
-        self._device = device
+    def __init__(self, device: str, most: int = MOST) -> None:
+        self._device, self._most = device, most
         self._copies: OrderedDict[tuple[Any, ...], tuple[tuple[NDArray[Any], ...], wp.array]] = OrderedDict()
 
     def of(self, array: NDArray[Any], dtype: object) -> wp.array:
@@ -66,7 +67,7 @@ class DeviceCopies:
             if isinstance(source.base, np.ndarray):
                 source.base.flags.writeable = False
         self._copies[self._key(copy.dtype, sources)] = sources, copy  # the reference keeps the ids unique
-        while len(self._copies) > MOST:
+        while len(self._copies) > self._most:
             self._copies.popitem(last=False)
 
     @staticmethod

@@ -10,11 +10,16 @@ from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.warp import cluster_map, gaussian_deltas
 from scas4d_core.engines.warp.adam import Optimizer
+from scas4d_core.engines.warp.copies import DeviceCopies
+from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.lanes import lanes_of
 from scas4d_core.engines.warp.neighbour_terms import neighbour_terms
 from scas4d_core.engines.warp.step_records import StepRecords
 
 Array = NDArray[np.float32]
+
+TABLES = 4
+"""Number of host tables whose device copies are kept: the candidates of an attempt."""
 
 
 class WarpDeformation:
@@ -55,7 +60,7 @@ class WarpDeformation:
         self._points, self._jacobians, self._turned = (
             [self._zeros(count, dtype) for _ in tables] for dtype in (wp.vec3, wp.mat33, wp.vec4)
         )
-        self._jacobians[0].assign(np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)))
+        self._jacobians[0].fill_(wp.mat33(1, 0, 0, 0, 1, 0, 0, 0, 1))
         self._g_points, self._g_jacobians = self._zeros(count, wp.vec3), self._zeros(count, wp.mat33)
         self._g_turned = self._zeros(count, wp.vec4)
         self._tied_means, self._tied_turns = self._zeros(count, wp.vec3), self._zeros(count, wp.vec4)
@@ -69,6 +74,7 @@ class WarpDeformation:
             self._neighbours = self._upload(graph.index, wp.int32, 2)
             self._distances = self._upload(graph.distances, wp.float32, 2)
             self._pair_weights = self._upload(graph.weights, wp.float32, 2)
+        self._copies = DeviceCopies(device, TABLES * len(tables))
         self._samples, self._sample_sizes = self._zeros((0, 0), wp.int32), list[int]()
         self._published = int(plan.cluster_map == "published")
         self._terms = gaussian_deltas.Terms()
@@ -105,9 +111,17 @@ class WarpDeformation:
         """Sets the parameters from host tables."""
         for table, values in zip([*self.clusters, self.deltas], [*tables.clusters, tables.deltas], strict=True):
             if values.any():
-                table.assign(values)
+                wp.copy(table, self._copies.of(values, wp.float32))
             else:  # by default, the deltas always start at 0
                 table.zero_()
+
+    def tables(self, downloads: Downloads) -> Tables:
+        """Waits for the device, and returns host tables of the parameters. ``set_tables`` does not upload them."""
+        tables = [*self.clusters, self.deltas]
+        values = downloads.read(*tables)
+        for table, host in zip(tables, values, strict=True):
+            self._copies.store(wp.clone(table), host)
+        return Tables(values[:-1], values[-1])
 
     def begin(self, start: AttemptStart) -> bool:
         """Starts an attempt from the current parameters. ``restart`` must be called next.

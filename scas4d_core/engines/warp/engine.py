@@ -353,8 +353,7 @@ class WarpEngine:
     def tables(self) -> Tables:
         """See ``UpdateEngine.tables``."""
         self._settle()
-        *clusters, deltas = self.downloads.read(*self._deformation.clusters, self._deformation.deltas)
-        return Tables(clusters, deltas)
+        return self._deformation.tables(self.downloads)
 
     def log(self) -> IterationLog:
         """See ``UpdateEngine.log``."""

@@ -193,6 +193,33 @@ def expand_levels(
 
 
 @wp.kernel
+def average_area(
+    finer: wp.array3d[wp.float32], rows: wp.int32, columns: wp.int32, target: wp.array3d[wp.float32]
+) -> None:
+    """Resizes planes by area averaging, with one thread per resulting pixel and channel.
+
+    Args:
+        finer: [C, H, W] planes.
+        rows, columns: size of the result. If it is the size of ``finer``, the planes are copied.
+        target: [C, rows or more, columns or more] output.
+    """
+    channel, y, x = wp.tid()
+    down = wp.float32(finer.shape[1]) / wp.float32(rows)
+    across = wp.float32(finer.shape[2]) / wp.float32(columns)
+    top = wp.float32(y) * down
+    left = wp.float32(x) * across
+    total = wp.float32(0.0)
+    for row in range(wp.int32(top), wp.min(wp.int32(wp.ceil(top + down)), finer.shape[1])):
+        tall = wp.min(top + down, wp.float32(row + 1)) - wp.max(top, wp.float32(row))
+        line = wp.float32(0.0)
+        for column in range(wp.int32(left), wp.min(wp.int32(wp.ceil(left + across)), finer.shape[2])):
+            wide = wp.min(left + across, wp.float32(column + 1)) - wp.max(left, wp.float32(column))
+            line += wide * finer[channel, row, column]
+        total += tall * line
+    target[channel, y, x] = total / (down * across)
+
+
+@wp.kernel
 def find_blank(
     changed: wp.array[wp.int32],
     cameras: wp.array[Camera],
@@ -470,7 +497,8 @@ class PictureLoss:
     def load(self, views: Sequence[TrainingView]) -> bool:
         """Uploads the images, cameras and exposures of a frame.
 
-        Images that are already loaded are reused. Images that another instance has loaded are copied on the device.
+        Images that are already loaded are reused. Images that this or another instance has loaded are copied on the
+        device. Area averages of earlier views are computed on the device.
 
         Returns:
             Whether buffers were reallocated, which invalidates captured graphs.
@@ -482,28 +510,33 @@ class PictureLoss:
             self._allocate(max(len(views), len(self._taken)), columns, rows)
         elif self._sent is not None:  # a pending upload must not be overwritten
             wp.synchronize_event(self._sent)
-        floats, levels, copied = list[int](), list[int](), list[int]()
+        floats, levels = list[int](), list[int]()
+        copied: list[tuple[int, wp.array]] = []
         taken: dict[int, Array] = {}
+        loaded = dict[int, int]()
         for index, view in enumerate(views):
             channels, height, width = view.target.shape
             self._host_channels[index] = channels
             self._host_exposures[index, :channels] = view.exposure
             if self._taken[index] is not view.target:
                 taken[index] = view.target
-                if view.source is None:
+                if (same := self._loaded(view.target, loaded)) is not None:
+                    copied.append((index, same[:channels, :height, :width]))
+                elif view.finer is not None and (finer := self._loaded(view.finer, loaded)) is not None:
+                    rows_there, columns_there = view.finer.shape[1:]
+                    copied.append((index, finer[:channels, :rows_there, :columns_there]))
+                elif view.source is None:
                     if index not in self._staged_floats:
                         self._staged_floats[index] = self._pinned()
                     self._staged_floats[index].numpy()[:channels, :height, :width] = view.target
                     floats.append(index)
-                elif (loaded := self._loaded_elsewhere(view.target)) is not None:
-                    wp.copy(self._levels[index, :, :height, :width], loaded[:, :height, :width])
-                    copied.append(index)
                 else:
                     image, mask = view.source
                     self._host_levels[index, :3, :height, :width] = np.moveaxis(image, -1, 0)
                     if mask is not None:
                         self._host_levels[index, 3, :height, :width] = mask
                     levels.append(index)
+            loaded[id(view.target)] = index
         cameras = [camera_of(view.camera) for view in views]
         wp.copy(self.cameras, wp.array(cameras, dtype=Camera, device="cpu"), count=len(views))
         for there, here in ((self.channels, self._channels), (self.exposures, self._exposures)):
@@ -514,10 +547,13 @@ class PictureLoss:
         for index in levels:  # a quarter of the bytes
             used = size * int(self._host_channels[index]) // CHANNELS  # without the mask if there is none
             wp.copy(self._levels, self._staged_levels, size * index, size * index, used)
-        for index in [*levels, *copied]:
+        for index in levels:
             inputs = [index, int(self._host_channels[index]), self._levels, self.targets]
             wp.launch(expand_levels, self.targets.shape[1:], inputs, device=self._device)
-        if changed := floats + levels + copied:
+        for index, target in copied:
+            shape = views[index].target.shape
+            wp.launch(average_area, shape, [target, *shape[1:], self.targets[index]], device=self._device)
+        if changed := floats + levels + [index for index, _ in copied]:
             places = wp.array(changed, dtype=wp.int32, device=self._device)
             inputs = [places, self.cameras, *self._window, self.targets, self.target_means, self.target_squares]
             wp.launch(target_moments, (len(changed), *self.targets.shape[1:]), inputs, device=self._device)
@@ -529,13 +565,20 @@ class PictureLoss:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
 
-    def _loaded_elsewhere(self, target: Array) -> wp.array | None:
-        """Returns the levels [4, rows, columns] of an image that another instance has loaded, or None."""
+    def _loaded(self, target: Array, loaded: dict[int, int]) -> wp.array | None:
+        """Returns the device copy [4, rows, columns] of a target that is loaded, or None.
+
+        Args:
+            target: target to look for.
+            loaded: indices of the targets that this instance has loaded and will not overwrite, keyed by id.
+        """
+        if id(target) in loaded:
+            return self.targets[loaded[id(target)]]
         for other in _instances:
             if other is not self and other._device == self._device:
                 for index, taken in enumerate(other._taken):
                     if taken is target:
-                        return other._levels[index]
+                        return other.targets[index]
         return None
 
     def _pinned(self) -> wp.array:
@@ -584,9 +627,10 @@ class PictureLoss:
         """Allocates buffers for the given number of views and image size, and marks all images for upload."""
         device, shape = self._device, (views, CHANNELS, rows, columns)
         pinned = wp.get_device(device).is_cuda
-        self.columns, self.rows, self._taken = columns, rows, [None] * views
+        self.columns = self.rows = 0  # if memory is full, the next call allocates everything again
         # Blocks must not span two channels.
         bands = -(-rows // ROWS)
+        self._taken = [None] * views
         self._threads = (CHANNELS, -(-bands // 8) * 8, -(-columns // 32) * 32)
         self.cameras = wp.zeros(views, dtype=Camera, device=device)
         self.channels = wp.zeros(views, dtype=wp.int32, device=device)
@@ -604,3 +648,4 @@ class PictureLoss:
         self._host_channels, self._host_exposures = self._channels.numpy(), self._exposures.numpy()
         self._host_levels = self._staged_levels.numpy()
         self._host_exposures[:] = [1, 0]
+        self.columns, self.rows = columns, rows

@@ -110,8 +110,9 @@ class PicturePass:
     def load_views(self, views: Sequence[TrainingView]) -> None:
         """Uploads the images, cameras and exposures of a frame. Images that are already loaded are reused."""
         replaced = self._loss.load(views)
-        if replaced:
+        if not self._rasterizer.holds(self._loss.columns, self._loss.rows):
             self._rasterizer.resize(self._loss.columns, self._loss.rows)
+            replaced = True
         sizes = [kept_size(view) for view in views]
         rows, columns = max(rows for rows, _ in sizes), max(columns for _, columns in sizes)
         if rows > self._kept.shape[2] or columns > self._kept.shape[3]:

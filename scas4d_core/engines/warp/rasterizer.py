@@ -58,7 +58,7 @@ class Rasterizer:
     def resize(self, columns: int, rows: int) -> None:
         """Allocates buffers for images of the given size, and for ``capacity`` tile-list entries."""
         device = self._device
-        self._columns, self._rows = columns, rows
+        self._columns = self._rows = 0  # if memory is full, the buffers hold no image
         self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity, self._detached)
         self.tiles_x = -(-columns // TILE)
         self._tiles = self.tiles_x * -(-rows // TILE)
@@ -74,6 +74,7 @@ class Rasterizer:
         self._segment_features = wp.zeros(segments * PIXELS, dtype=wp.vec4, device=device)
         self._keys = wp.zeros(self.capacity, dtype=wp.uint64, device=device)
         self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
+        self._columns, self._rows = columns, rows
 
     def draw_fewer(self, count: int) -> None:
         """Sets the number of Gaussians to render, which must not exceed the size of the buffers."""

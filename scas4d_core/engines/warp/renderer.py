@@ -138,6 +138,62 @@ def extrapolate_numbers(
     moved[i, k] = after[i, k] + share * (after[i, k] - before[i, k])
 
 
+@wp.kernel
+def round_to_levels(
+    planes: wp.array3d[wp.float32], first: wp.int32, sign: wp.float32, offset: wp.float32, levels: wp.array3d[wp.uint8]
+) -> None:
+    """Rounds planes to 8 bits like ``renderer.levels``, with one thread per pixel.
+
+    Args:
+        planes: [5, rows, columns] rendering.
+        first: index of the first plane to round.
+        sign, offset: factor and offset of the values, 1 and 0, or −1 and 1 to invert them.
+        levels: [H, W, C] output.
+    """
+    y, x = wp.tid()
+    for c in range(levels.shape[2]):
+        value = wp.clamp(offset + sign * planes[first + c, y, x], 0.0, 1.0)
+        levels[y, x, c] = wp.uint8(wp.rint(255.0 * value))
+
+
+@wp.kernel
+def turn_normals(
+    near: wp.array2d[wp.int32],
+    before: wp.array[wp.vec3],
+    after: wp.array[wp.vec3],
+    gloss: wp.array2d[wp.float32],
+    turned: wp.array2d[wp.float32],
+) -> None:
+    """Rotates normals with their neighbourhoods in float64, with one thread per Gaussian with gloss.
+
+    Args:
+        near: [G, k] rows of the Gaussians in each neighbourhood.
+        before, after: [N] means of two states.
+        gloss: [G, 3] normal of each Gaussian, scaled by its gloss strength.
+        turned: [G, 3] output.
+    """
+    i = wp.tid()
+    count = near.shape[1]
+    mean_before = wp.vec3d()
+    mean_after = wp.vec3d()
+    for k in range(count):
+        mean_before += wp.vec3d(before[near[i, k]]) / wp.float64(count)
+        mean_after += wp.vec3d(after[near[i, k]]) / wp.float64(count)
+    spread = wp.mat33d()
+    for k in range(count):
+        spread += wp.outer(wp.vec3d(after[near[i, k]]) - mean_after, wp.vec3d(before[near[i, k]]) - mean_before)
+    if not wp.isfinite(wp.ddot(spread, spread)):
+        spread = wp.identity(n=3, dtype=wp.float64)
+    left = wp.mat33d()
+    sizes = wp.vec3d()
+    right = wp.mat33d()
+    wp.svd3(spread, left, sizes, right)  # both matrices are rotations
+    own = wp.vec3d(wp.vec3(gloss[i, 0], gloss[i, 1], gloss[i, 2]))
+    normal = left * (wp.transpose(right) * own)
+    for c in range(3):
+        turned[i, c] = wp.float32(normal[c])
+
+
 class WarpRenderer:
     """The ``Renderer`` implementation in NVIDIA Warp. Calls that return pixels or numbers wait for the device.
 
@@ -164,11 +220,13 @@ class WarpRenderer:
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
         self._copies = copies_on(device)
-        self._downloads, self._log_downloads = Downloads(device), Downloads(device)  # each reuses one buffer
+        # each reuses one buffer
+        self._downloads, self._log_downloads, self._level_downloads = (Downloads(device) for _ in range(3))
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
         self._log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
+        self._near: tuple[NDArray[np.int64], wp.array] | tuple[None, None] = None, None
 
     def render(
         self,
@@ -199,6 +257,21 @@ class WarpRenderer:
         if len(drawn) == 1:
             return Picture(drawn[0][:CHANNELS], drawn[0][CHANNELS])
         return Picture(np.concatenate([planes[:CHANNELS] for planes in drawn]), drawn[0][CHANNELS])
+
+    def render_levels(
+        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
+    ) -> NDArray[np.uint8]:
+        """See ``Renderer.render_levels``. Only the 8-bit values are downloaded."""
+        cameras = self._camera(camera)
+        features = features_seen(self._copies, state, cameras)
+        self._project(state, camera, cameras, [features])
+        self._draw(cameras, features, background)
+        shape = camera.height, camera.width
+        levels = wp.empty((*shape, 1 if opacity else LABEL), dtype=wp.uint8, device=self.device)
+        chosen = (CHANNELS, -1.0, 1.0) if opacity else (0, 1.0, 0.0)
+        wp.launch(round_to_levels, shape, [self._rasterizer.planes, *chosen, levels], device=self.device)
+        pixels: NDArray[np.uint8] = self._level_downloads.read(levels)[0]
+        return pixels[..., 0] if opacity else pixels
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
@@ -251,6 +324,19 @@ class WarpRenderer:
             wp.launch(extrapolate_numbers, inputs[0].shape, [share, *inputs, as_numbers(moved)], device=self.device)
             self._copies.store(moved, getattr(state, name))
         return state
+
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+        """See ``Renderer.turn_normals``."""
+        assert after.gloss is not None
+        if near is not self._near[0]:
+            self._near = near, wp.array(near, dtype=wp.int32, device=self.device)
+        means = (self._copies.of(state.means, wp.vec3) for state in (before, after))
+        gloss = self._copies.of(after.gloss, wp.float32)
+        turned = wp.empty_like(gloss)
+        wp.launch(turn_normals, len(gloss), [self._near[1], *means, gloss, turned], device=self.device)
+        normals = self._downloads.read(turned)[0]
+        self._copies.store(turned, normals)
+        return after.replace(gloss=normals)
 
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``."""

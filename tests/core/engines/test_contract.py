@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -177,8 +178,9 @@ def test_tables_come_back_as_they_were_set(engine: UpdateEngine) -> None:
     back = engine.tables()
     assert all(map(np.array_equal, back.clusters, tables.clusters))
     assert np.array_equal(back.deltas, tables.deltas)
-    tables.deltas[:] = 7  # the engine has its own
-    assert not np.array_equal(engine.tables().deltas, tables.deltas)
+    with suppress(ValueError):  # the engine has its own, or has made these read-only
+        tables.deltas[:] = 7
+    assert np.array_equal(engine.tables().deltas, back.deltas)
 
 
 def test_a_probe_of_the_state_before_does_not_depend_on_the_tables(engine: UpdateEngine) -> None:

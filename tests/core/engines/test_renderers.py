@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from engine_cases import apart, case, gaussians, rig
+from scipy.spatial.transform import Rotation
 
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
-from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.renderer import Renderer, levels
 from scas4d_core.engines.torch.renderer import TorchRenderer
 from scas4d_core.engines.views import LABEL, CameraArrays
 
@@ -41,6 +42,18 @@ def test_pictures(tested: Renderer, glossy: bool) -> None:
     if glossy:
         dull = TRUE.render(state.replace(gloss=None, environment=None), CAMERA)
         assert apart(dull.features, true.features) > 0.01
+
+
+@pytest.mark.parametrize("glossy", [False, True])
+def test_pictures_in_8_bits_are_the_rounded_ones(tested: Renderer, glossy: bool) -> None:
+    state, behind = gaussians(glossy=glossy), np.float32([1.2, -0.3, 0.5, 0])  # some values are clipped
+    view = tested.render(state, CAMERA, background=behind)
+    colours, opacity = (tested.render_levels(state, CAMERA, behind, opacity=opacity) for opacity in (False, True))
+    assert colours.dtype == opacity.dtype == np.uint8
+    assert np.array_equal(colours, levels(np.moveaxis(view.features[:LABEL], 0, -1)))
+    assert np.array_equal(opacity, levels(1 - view.transmittance))
+    assert set(np.unique(colours)) >= {0, 255}
+    assert opacity.std() > 10
 
 
 def test_depth_features_and_another_background(tested: Renderer) -> None:
@@ -115,3 +128,18 @@ def test_blocks_that_are_reached(tested: Renderer) -> None:
     assert mine.shape == true.shape
     assert not (true & ~mine).any()  # a support may pass between the centres of pixels
     assert (mine & ~true).sum() <= 0.2 * mine.sum()
+
+
+def test_normals_turn_with_their_neighbourhoods(tested: Renderer) -> None:
+    before, rng = gaussians(glossy=True), np.random.default_rng(0)
+    assert before.gloss is not None
+    turn = Rotation.from_rotvec([0.1, 0.5, 0.2]).as_matrix()
+    means = (before.means @ turn.T + rng.normal(0, 0.02, before.means.shape)).astype(np.float32)
+    means[3] = np.nan
+    near = rng.integers(len(before), size=(len(before.gloss), 8))
+    mine, true = (renderer.turn_normals(before, before.replace(means=means), near) for renderer in (tested, TRUE))
+    assert apart(mine.gloss, true.gloss) < CLOSE
+    assert apart(true.gloss, before.gloss) > 0.1
+    lost = (near == 3).any(axis=1)  # in neighbourhoods of a lost Gaussian
+    assert lost.any()
+    np.testing.assert_allclose(mine.gloss[lost], before.gloss[lost], atol=1e-6)

@@ -14,7 +14,10 @@ from running import Running, fake_settings, make_rig, problem
 from waiting import HANG_S
 
 from client.wire import RigModel
-from server.health.estimate import NOVEL_PIXEL
+from scas4d_core.settings import Settings
+from server.health.estimate import NOVEL_PIXEL, fit_gpu
+from server.problems import Problem
+from server.settings import ServerSettings
 
 ROOT = Path(__file__).parents[3]
 
@@ -78,3 +81,31 @@ def test_what_will_not_fit_is_refused_with_what_would(tmp_path):
         assert httpx.post(f"{running.url}/v1/scenes", json=body, timeout=HANG_S).status_code == 201
     finally:
         running.stop()
+
+
+@pytest.mark.parametrize("device", ["auto", "gpu"])
+def test_a_gpu_without_enough_free_memory_is_not_used(http, device):
+    body = {"rig": rig(2000), "settings": {"device": device}}
+    needed = http.post("/v1/estimate", json=body).json()["gpu_mb"]
+    server, settings, model = ServerSettings(), Settings(device=device), RigModel.model_validate(rig(2000))
+    assert fit_gpu(model, settings, server, needed + 1) is fit_gpu(model, settings, server, None) is settings
+    if device == "auto":
+        assert fit_gpu(model, settings, server, needed - 1) == settings.model_copy(update={"device": "cpu"})
+        return
+    with pytest.raises(Problem) as refused:
+        fit_gpu(model, settings, server, needed - 1)
+    document = refused.value.document
+    assert f"{needed:.0f} MB of GPU memory" in document.detail
+    assert "image_scale to 0.75" in document.remedy
+    assert "settings.device to 'cpu'" in document.remedy
+
+
+def test_a_scene_for_which_the_gpu_has_no_room_is_created_on_the_cpu(http, service, monkeypatch, caplog):
+    monkeypatch.setattr("server.routes.scenes.free_gpu_mb", lambda: 100.0)
+    created = http.post("/v1/scenes", json={"rig": rig(100), "settings": {"device": "auto"}})
+    assert created.status_code == 201, created.text
+    id = created.json()["id"]
+    assert "device 'auto' selects the CPU" in caplog.text
+    assert "100 MB are free" in caplog.text
+    assert service.app.state.scenes.awake[id].spec.settings.device == "cpu"
+    http.delete(f"/v1/scenes/{id}")

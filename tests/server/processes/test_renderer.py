@@ -13,6 +13,7 @@ from histories import state
 from running import make_rig
 
 from scas4d_core.engines.choose import WARP_DEVICE
+from scas4d_core.engines.renderer import levels
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
@@ -82,12 +83,16 @@ def test_views_are_rendered_by_the_scenes_device(tmp_path, monkeypatch, caplog):
 def test_a_gpu_and_the_cpu_render_the_same_image(renderer, monkeypatch):
     pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
     monkeypatch.setenv(WARP_DEVICE, os.environ.get(WARP_DEVICE, "cpu"))
-    query = RenderQuery(make_rig().cameras[0], 3, ("colour",), "png", (0.0, 0.3, 0.0))
-    images = []
-    for reader in (renderer, QueryReader(renderer.spec, "gpu")):
-        found = reader.answer(NumberedQuery(1, query))
-        assert isinstance(found, Answer), found
-        images.append(imageio.imread(found.body).astype(int))
-        assert reader.reader._view.device == reader.device
-    assert images[0].std() > 5
-    assert np.abs(images[0] - images[1]).max() <= 1
+    camera = make_rig().cameras[0]
+    for kind in ("colour", "alpha"):
+        images = []
+        for reader in (renderer, QueryReader(renderer.spec, "gpu")):
+            found = reader.answer(NumberedQuery(1, RenderQuery(camera, 3, (kind,), "png", (0.0, 0.3, 0.0))))
+            assert isinstance(found, Answer), found
+            assert found.headers["X-Frame"] == "3"
+            images.append(imageio.imread(found.body).astype(int))
+            assert reader.reader._view.device == reader.device
+            view = reader.reader.render(camera, 3, background=(0.0, 0.3, 0.0))
+            assert np.array_equal(images[-1], levels(getattr(view, kind)))
+        assert images[0].std() > {"colour": 5, "alpha": 0}[kind]
+        assert np.abs(images[0] - images[1]).max() <= 1

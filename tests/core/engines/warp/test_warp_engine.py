@@ -14,7 +14,7 @@ from engine_cases import CLUSTERS, EFFECTS, TOGETHER, Case, apart, assert_repeat
 from warp_cases import DEVICE
 
 from scas4d_core.engines.cpu.engine import CpuEngine
-from scas4d_core.engines.engine import StepScalars
+from scas4d_core.engines.engine import StepScalars, Tables
 from scas4d_core.engines.warp import engine as module
 from scas4d_core.engines.warp.engine import WarpEngine
 from scas4d_core.engines.warp.graphs import Graphs
@@ -77,6 +77,47 @@ def waits_of_a_frame(iterations: int) -> int:
     options = AttemptOptions(stopping=Stopping(iterations))
     updater.run(scene.previous, scene.views, None, 1 / 30, seed=3, options=options)
     return engine.downloads.waits
+
+
+def test_memory_that_is_full_for_a_while_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = three_layers(**TOGETHER)
+    engine, failures = WarpEngine(DEVICE), 0
+    engine.bind(scene.plan, scene.structure)
+    while failures < 100:
+        with monkeypatch.context() as limited:
+            limit_allocations(limited, failures)
+            try:
+                engine.load_views(scene.views, scene.probes)
+            except RuntimeError:
+                failures += 1
+            else:
+                break
+    assert failures > 10
+    records = []
+    for each in (engine, WarpEngine(DEVICE)):
+        if each is not engine:
+            each.bind(scene.plan, scene.structure)
+            each.load_views(scene.views, scene.probes)
+        each.load_state(scene.previous)
+        each.set_tables(Tables.identity(scene.structure.hierarchy))
+        each.begin(scene.start(layers=RATES))
+        for views, scalars in STEPS:
+            each.iterate(views, scalars)
+        records.append(each.log().losses + each.probe(range(len(scene.probes)), moved=True, learnt=True))
+    assert records[0] == pytest.approx(records[1], rel=1e-5)
+
+
+def limit_allocations(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Makes all but the next ``count`` calls of ``wp.zeros`` fail, as they do if memory is full."""
+    zeros, left = wp.zeros, [count]
+
+    def limited(*given: object, **named: object) -> wp.array:
+        if not left[0]:
+            raise RuntimeError("Failed to allocate 1 bytes on device 'cuda:0'")
+        left[0] -= 1
+        return zeros(*given, **named)
+
+    monkeypatch.setattr(wp, "zeros", limited)
 
 
 FREE, FIRST_FROZEN, TWO_FROZEN = (1.0, 1.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.0, 1.0)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
 
-import warp as wp
 from box_scene import RIG, make_box, moved, take_frame
+from warp_cases import Uploads
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.presence import entering
@@ -24,8 +23,10 @@ from scas4d_core.metrics.image import psnr
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import EFFECTS, Settings
 from scas4d_core.storage.history import History
-from tests.helpers.effect_cases.visited_room import known, scene, seen, visitor
+from studies.synthetic.wall import Size, known, rig, shown, wall
+from tests.helpers.effect_cases import visited_room
 from tests.helpers.effect_cases.visited_room import psnr as room_psnr
+from tests.helpers.effect_cases.visited_room import scene, seen, visitor
 
 DEVICES: tuple[Device, ...] = ("cpu", "gpu")
 UPDATE = {"clusters": (2, 12), "iterations": 12, "stop_gain": 0, "skip_tolerance": 0}
@@ -97,7 +98,7 @@ def test_frame_0_is_as_good_as_that_of_the_cpu_engine() -> None:
 
 def test_what_enters_is_added_as_by_the_cpu_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scas4d_core.effects.presence.newborn_fit.ITERATIONS", 120)
-    before, after = scene(known()), scene(known(), visitor())
+    before, after = scene(visited_room.known()), scene(visited_room.known(), visitor())
     born, gained = {}, {}
     for device in DEVICES:
         frame = seen(before, after, device=device)
@@ -121,32 +122,25 @@ def test_a_scene_is_resumed_on_the_other_device(tmp_path: Path) -> None:
     assert [again.history.report(index)["device"] for index in (1, 2)] == ["gpu", "cpu"]
 
 
-def test_a_frame_uploads_at_most_the_opacity_of_each_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
-    states = [make_box()]
-    while len(states) < 5:
-        states.append(moved(states[-1]))
-    shots = [take_frame(index, index / 30, state, RIG) for index, state in enumerate(states)]
-    scene = Reconstruction.start(RIG, shots[0], settings("gpu"), static=first_fit(glossy=False))
-    for shot in shots[1:-1]:
+def test_a_frame_uploads_at_most_a_twentieth_beside_its_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = Size(gaussians=10_000, width=256, height=256, cameras=24, moving=1.0)  # as the captures `stage` and `lamps`
+    state, cameras = wall(size), rig(size)
+    given = Settings.model_validate(
+        {
+            "device": "gpu",
+            "scene": {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)},
+            "update": {"iterations": 5, "stop_gain": 0, "skip_tolerance": 0},
+            "effects": {"prediction": "on"},  # uploads the motion of the previous frame
+        }
+    )
+    shots = [replace(shown(state, 8 * index, cameras), index=index, time=index / 30) for index in range(4)]
+    uploads = Uploads(monkeypatch)
+    scene = Reconstruction.start(cameras, shots[0], given, static=known(state, cameras))
+    for shot in shots[1:-1]:  # the first update uploads the clusters
         scene.step(shot)
-    uploads: list[NDArray[Any]] = []
-    construct, assign = wp.array.__init__, wp.array.assign
-
-    def constructed(self: wp.array, data: object = None, *given: object, **named: object) -> None:
-        if isinstance(data, np.ndarray) and data.ndim:
-            uploads.append(data)
-        construct(self, data, *given, **named)
-
-    def assigned(self: wp.array, values: object) -> None:
-        uploads.append(np.asarray(values))
-        assign(self, values)
-
-    monkeypatch.setattr(wp.array, "__init__", constructed)
-    monkeypatch.setattr(wp.array, "assign", assigned)
+    uploads.bytes.clear()
     report = scene.step(shots[-1])
-    count = len(scene.history.newest)
     assert report.outcome == "updated"
-    assert report.gaussians == count > 250
-    assert uploads
-    # opacities of a state without moving Gaussians, in which uncovered surfaces are searched
-    assert sum(array.nbytes for array in uploads if len(array) == count) <= 4 * count
+    images = sum(array.nbytes for array in (*shots[-1].images.values(), *shots[-1].masks.values()))
+    assert uploads.bytes.pop("uint8") == images  # each once, although some are probe views too
+    assert 0 < sum(uploads.bytes.values()) <= 0.05 * images, uploads.bytes
