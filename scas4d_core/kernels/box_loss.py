@@ -11,7 +11,8 @@ from numba import prange
 
 from scas4d_core.kernels.image_loss import REACH, band_of, loss_of_band
 from scas4d_core.kernels.jit import ZERO, inline, kernel, parallel_kernel
-from scas4d_core.kernels.tiles import BLOCK, TILE
+from scas4d_core.kernels.projection import TILE
+from scas4d_core.kernels.tiles import BLOCK
 
 
 @inline

@@ -281,7 +281,6 @@ Measured with `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernel
   covers the exp and multiply-add operations for the same number of pairs, in cache, with four channels.
 - "Counting all lanes" treats every pixel of the visited 4×4 blocks as a pair.
 - Times are CPU time with one thread and wall-clock time with more. Ratios are medians of alternating runs.
-  Other pages have times of other days on this shared machine.
 - An update is one call of `Reconstruction.step`; its time is the median of {row["updates"]} updates. Peak memory is
   that of a process that fits frame 0 and runs {row["frames"] - 1} updates.
 

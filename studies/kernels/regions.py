@@ -42,7 +42,7 @@ class RegionCounter:
     def __init__(self) -> None:
         launch: Any = parallel._launch_threads
         launch()
-        layer: Any = import_module(f"numba.np.ufunc.{LAYERS[numba.threading_layer()]}")
+        layer: Any = import_module(f"numba.np.ufunc.{LAYERS[parallel.threading_layer()]}")
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, *[ctypes.c_size_t] * 3)
         original = kind(layer.parallel_for)
         self.count = 0
@@ -71,7 +71,7 @@ class CountingEngine:
             iterate(engine, views, step)
             self.regions.append(counter.count - before)
 
-        CpuEngine.iterate = counted  # type: ignore[method-assign]
+        setattr(CpuEngine, "iterate", counted)  # noqa: B010  # an assignment would not type-check
 
 
 def count_regions(folder: Path, settings: Settings, frames: int, first_file: Path) -> float:
