@@ -40,9 +40,9 @@ class RegionCounter:
     """
 
     def __init__(self) -> None:
-        launch: Any = parallel._launch_threads
-        launch()
-        layer: Any = import_module(f"numba.np.ufunc.{LAYERS[parallel.threading_layer()]}")
+        layers: Any = parallel
+        layers._launch_threads()
+        layer: Any = import_module(f"numba.np.ufunc.{LAYERS[layers.threading_layer()]}")
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, *[ctypes.c_size_t] * 3)
         original = kind(layer.parallel_for)
         self.count = 0
