@@ -27,7 +27,10 @@ COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
 EVERY_ROW = np.ones(1, np.float32)
 """Value of ``by_row`` if all rows have the same learning rates."""
 
-ROWS = 1024
+ROWS = 512
+"""Number of rows per task."""
+SERIAL = 2048
+"""Number of rows up to which one thread takes the whole step, because starting several would take longer."""
 
 
 def adam(
@@ -56,7 +59,8 @@ def adam(
         [2] number of gradient values that triggered each guard in ``COUNTED_GUARDS``.
     """
     guard_counts = np.zeros((-(-len(parameters) // ROWS), len(COUNTED_GUARDS)), np.int64)
-    adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)
+    take_step = adam_rows if len(parameters) > SERIAL else adam_few_rows
+    take_step(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)
     total: NDArray[np.int64] = guard_counts.sum(axis=0)
     return total
 
@@ -93,23 +97,47 @@ def guard_gradients(gradients, first, last, guard_counts):
     guard_counts[1] += np.int64(lanes.sum_of(flushed))
 
 
+@kernel
+def adam_task(task, parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts):
+    """Takes the step for the rows of one task, sixteen rows at a time; see ``adam``."""
+    rows, columns = parameters.shape
+    begin, end = task * ROWS, min(rows, (task + 1) * ROWS)
+    guard_gradients(gradients, begin * columns, end * columns, guard_counts[task])
+    correction1 = ONE - np.float32(beta1**step)
+    correction2 = ONE - np.float32(beta2**step)
+    # Sixteen rows are a whole number of vectors, in which the rates repeat every ``columns`` values.
+    rates_of_rows = np.empty(lanes.COUNT * columns, np.float32)
+    for k in range(lanes.COUNT * columns):
+        rates_of_rows[k] = by_row[0] * rates[k % columns]
+    for i in range(begin, end, lanes.COUNT):
+        some = min(end - i, lanes.COUNT)
+        if by_row.shape[0] > 1:
+            for row in range(some):
+                for k in range(columns):
+                    rates_of_rows[row * columns + k] = by_row[i + row] * rates[k]
+        for k in range(0, some * columns, lanes.COUNT):
+            place, left = i * columns + k, some * columns - k
+            g = lanes.load_first(gradients, place, left)
+            m = beta1 * lanes.load_first(first, place, left) + (ONE - beta1) * g
+            v = beta2 * lanes.load_first(second, place, left) + (ONE - beta2) * g * g
+            m = lanes.choose(lanes.magnitude(m) > SMALLEST, m, lanes.fill(ZERO))
+            v = lanes.choose(v > SMALLEST * SMALLEST, v, lanes.fill(ZERO))
+            lanes.store_first(first, place, left, m)
+            lanes.store_first(second, place, left, v)
+            change = lanes.load(rates_of_rows, k) * (m / correction1)
+            change = change / (lanes.square_root(v / correction2) + EPSILON)
+            lanes.store_first(parameters, place, left, lanes.load_first(parameters, place, left) - change)
+
+
 @parallel_kernel
 def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts):
     """Implements ``adam`` with parallel tasks, which add to ``guard_counts`` [tasks, 2]."""
-    rows, columns = parameters.shape
-    correction1 = ONE - np.float32(beta1**step)
-    correction2 = ONE - np.float32(beta2**step)
-    for task in prange((rows + ROWS - 1) // ROWS):
-        guard_gradients(gradients, task * ROWS * columns, min(rows, (task + 1) * ROWS) * columns, guard_counts[task])
-    for task in prange((rows + ROWS - 1) // ROWS):
-        for i in range(task * ROWS, min(rows, (task + 1) * ROWS)):
-            row = by_row[i] if by_row.shape[0] > 1 else by_row[0]
-            for k in range(columns):
-                g = gradients[i, k]
-                m = beta1 * first[i, k] + (ONE - beta1) * g
-                v = beta2 * second[i, k] + (ONE - beta2) * g * g
-                m = m if abs(m) > SMALLEST else ZERO
-                v = v if v > SMALLEST * SMALLEST else ZERO
-                first[i, k] = m
-                second[i, k] = v
-                parameters[i, k] -= row * rates[k] * (m / correction1) / (np.sqrt(v / correction2) + EPSILON)
+    for task in prange(guard_counts.shape[0]):
+        adam_task(np.int64(task), parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)
+
+
+@kernel
+def adam_few_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts):
+    """Same as ``adam_rows``, on one thread."""
+    for task in range(guard_counts.shape[0]):
+        adam_task(task, parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)

@@ -5,8 +5,9 @@ finest layer, and hence to one cluster in every layer. If the size of a cluster 
 sixteen, the last block of the cluster repeats its last Gaussian.
 
 Only points are stored between layers, because pivots are means of points. The backward pass
-recomputes factors and rotations, because recomputation is cheaper than memory access. A frozen
-layer is applied once (``freeze_layer``), and later passes skip the layer. The reference
+recomputes factors and rotations, because recomputation is cheaper than memory access. Clusters are
+nested, so parts with whole clusters of the coarsest layer are independent in every layer. The parts
+run in parallel. A frozen layer is applied once (``freeze_layer``), and later passes skip the layer. The reference
 implementation is ``engines.torch.deformation``.
 """
 
@@ -25,9 +26,7 @@ from scas4d_core.kernels.cascade import (
 )
 from scas4d_core.kernels.deltas import apply_gaussian_deltas, apply_gaussian_deltas_backward
 from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
-
-BLOCKS = 16
-"""Number of blocks per task."""
+from scas4d_core.kernels.neighbour_terms import sum_accumulators
 
 CARRIED = 13 * lanes.COUNT
 """Number of values in the factors and rotations of a block."""
@@ -77,9 +76,41 @@ def block_sums(points, present, sums):
         sum_block(np.int64(block), points, np.int64(0), present, sums)
 
 
+@kernel
+def fill_tables(part, layer, parameters, parts, ranges, sums, tables):
+    """Computes the tables of a layer's clusters in one part; see ``deform``."""
+    for j in range(parts[part, 1 + layer], parts[part + 1, 1 + layer]):
+        cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
+
+
+@kernel
+def move_to_next_layer(part, layer, parts, clusters, present, about_origin, points, sums, tables):
+    """Computes the points and sums before the next layer in one part; see ``deform``."""
+    blocks = clusters.shape[0]
+    for block in range(parts[part, 0], parts[part + 1, 0]):
+        place = ((layer + 1) * blocks + block) * 3 * lanes.COUNT
+        move_points(block, tables[clusters[block, layer]], about_origin, points, layer, points, place)
+        sum_block(block, points, layer + 1, present, sums)
+
+
+@kernel
+def freeze_part(
+    part, layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
+):  # fmt: skip
+    """Freezes a layer in one part; see ``freeze_layer``."""
+    fill_tables(part, layer, parameters, parts, ranges, sums, tables)
+    for block in range(parts[part, 0], parts[part + 1, 0]):
+        place = (layer * clusters.shape[0] + block) * 3 * lanes.COUNT
+        apply_cluster_map(
+            tables[clusters[block, layer]], about_origin, separate, points, place, entering[block], present,
+            block * lanes.COUNT, None,
+        )  # fmt: skip
+    move_to_next_layer(part, layer, parts, clusters, present, about_origin, points, sums, tables)
+
+
 @parallel_kernel
 def freeze_layer(
-    layer, parameters, offsets, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
+    layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
 ):  # fmt: skip
     """Freezes a layer by applying the layer to its input.
 
@@ -91,18 +122,11 @@ def freeze_layer(
         entering: [B, 13 · 16] factors and rotations before this layer, replaced by factors and
             rotations before the next layer.
     """
-    blocks = clusters.shape[0]
-    for j in prange(offsets[layer], offsets[layer + 1]):
-        cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
-    for task in prange((blocks + BLOCKS - 1) // BLOCKS):
-        for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
-            table, place = tables[clusters[block, layer]], 3 * lanes.COUNT * block
-            here, below = place + layer * 3 * lanes.COUNT * blocks, place + (layer + 1) * 3 * lanes.COUNT * blocks
-            apply_cluster_map(
-                table, about_origin, separate, points, here, entering[block], present, block * lanes.COUNT, None
-            )
-            move_points(block, table, about_origin, points, layer, points, below)
-            sum_block(block, points, layer + 1, present, sums)
+    for part in prange(parts.shape[0] - 1):
+        freeze_part(
+            np.int64(part), layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate,
+            points, sums, tables,
+        )  # fmt: skip
 
 
 @inline
@@ -112,9 +136,56 @@ def copy_row(rows, row, out, place):
         lanes.store(out, place + k, lanes.load(rows, row * CARRIED + k))
 
 
+@kernel
+def deform_part(
+    part, first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
+    points, sums, tables, means, factors, state, guard_counts,
+):  # fmt: skip
+    """Deforms the Gaussians of one part; see ``deform``."""
+    blocks, layers = clusters.shape
+    for layer in range(first, layers):
+        fill_tables(part, layer, parameters, parts, ranges, sums, tables)
+        if layer + 1 < layers:
+            move_to_next_layer(part, layer, parts, clusters, present, about_origin, points, sums, tables)
+    for k in range(guard_counts.shape[1]):
+        guard_counts[part, k] = 0
+    v = np.empty(CARRIED, np.float32)
+    moved_points = np.empty(3 * lanes.COUNT, np.float32)
+    for block in range(parts[part, 0], parts[part + 1, 0]):
+        prefetch(block + 1, rows, means, factors)
+        copy_row(entering, block, v, 0)
+        for layer in range(first, layers):
+            place = (layer * blocks + block) * 3 * lanes.COUNT
+            apply_cluster_map(
+                tables[clusters[block, layer]], about_origin, separate, points, place, v, present,
+                block * lanes.COUNT, guard_counts[part],
+            )  # fmt: skip
+        if layers > 0:
+            move_points(
+                block, tables[clusters[block, layers - 1]], about_origin, points, layers - 1, moved_points,
+                np.int64(0),
+            )  # fmt: skip
+        else:
+            for k in range(3):
+                lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
+        apply_gaussian_deltas(
+            deltas,
+            entries,
+            rows,
+            block * lanes.COUNT,
+            present,
+            v,
+            moved_points,
+            means,
+            factors,
+            state,
+            guard_counts[part],
+        )
+
+
 @parallel_kernel
 def deform(
-    first, parameters, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
+    first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
     points, sums, tables, means, factors, state, guard_counts,
 ):  # fmt: skip
     """Deforms M of N Gaussians, grouped into B blocks, with L layers that have K clusters in total.
@@ -122,7 +193,8 @@ def deform(
     Args:
         first: first layer that is not frozen. Points, sums and tables of frozen layers are reused.
         parameters: [K, 10] parameters of all clusters, ordered by layer from coarse to fine.
-        offsets: [L + 1] int64 first cluster of each layer.
+        parts: [P + 1, 1 + L] int64 first block of each of the P parts, and its first cluster in each layer. The last
+            row contains the ends.
         ranges: [K, 3] int64 first block, last block + 1, and number of Gaussians of each cluster
             that are not held back.
         clusters: [B, L] int64 cluster of each block in each layer.
@@ -142,61 +214,58 @@ def deform(
         means: [N, 3] output, written at ``rows``.
         factors: [N, 3, 3] output, written at ``rows``.
         state: [M, 16] output. Only means and rotations are written. See ``deltas`` for the columns.
-        guard_counts: [tasks of ``BLOCKS`` blocks, 3] int64 output, number of times each guard in
-            ``cascade.COUNTED_GUARDS`` was triggered.
+        guard_counts: [P, 3] int64 output, number of times each guard in ``cascade.COUNTED_GUARDS`` was triggered.
     """
+    for part in prange(parts.shape[0] - 1):
+        deform_part(
+            np.int64(part), first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas,
+            about_origin, separate, points, sums, tables, means, factors, state, guard_counts,
+        )  # fmt: skip
+
+
+@kernel
+def deform_backward_part(
+    part, first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate, points,
+    tables, scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records, gradients, g_deltas, losses,
+):  # fmt: skip
+    """Backpropagates through the Gaussians and clusters of one part; see ``deform_backward``."""
     blocks, layers = clusters.shape
-    tasks = (blocks + BLOCKS - 1) // BLOCKS
+    v = np.empty((layers + 1) * CARRIED, np.float32)
+    g = np.empty(16 * lanes.COUNT, np.float32)
+    begin, end = parts[part, 0], parts[part + 1, 0]
+    sum_accumulators(accumulators, entries[begin, 0], entries[end - 1, lanes.COUNT - 1] + 1, g_tied)
+    for block in range(begin, end):
+        prefetch(block + 1, rows, g_means, g_factors)
+        copy_row(entering, block, v, first * CARRIED)
+        for layer in range(first, layers):
+            leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
+            copy_row(v, layer, leaving, 0)
+            place = (layer * blocks + block) * 3 * lanes.COUNT
+            apply_cluster_map(
+                tables[clusters[block, layer]], about_origin, separate, points, place, leaving, present,
+                block * lanes.COUNT, None,
+            )  # fmt: skip
+        losses[block] = apply_gaussian_deltas_backward(
+            deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
+            g_means, g_factors, g_tied, g, g_deltas,
+        )  # fmt: skip
+        for back in range(layers - first):
+            layer = layers - 1 - back
+            place = (layer * blocks + block) * 3 * lanes.COUNT
+            record = (block * layers + layer) * records.shape[2]
+            apply_cluster_map_backward(
+                tables[clusters[block, layer]], about_origin, separate, points, place, v, layer * CARRIED, g,
+                records, record,
+            )  # fmt: skip
     for layer in range(first, layers):
-        for j in prange(offsets[layer], offsets[layer + 1]):
-            cluster_table(parameters[j], sums[layer], ranges[j, 0], ranges[j, 1], ranges[j, 2], tables[j])
-        if layer + 1 < layers:
-            for task in prange(tasks):
-                for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
-                    place = ((layer + 1) * blocks + block) * 3 * lanes.COUNT
-                    move_points(block, tables[clusters[block, layer]], about_origin, points, layer, points, place)
-                    sum_block(block, points, layer + 1, present, sums)
-    for task in prange(tasks):
-        for k in range(guard_counts.shape[1]):
-            guard_counts[task, k] = 0
-        v = np.empty(CARRIED, np.float32)
-        moved_points = np.empty(3 * lanes.COUNT, np.float32)
-        for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
-            prefetch(block + 1, rows, means, factors)
-            copy_row(entering, block, v, 0)
-            for layer in range(first, layers):
-                place = (layer * blocks + block) * 3 * lanes.COUNT
-                apply_cluster_map(
-                    tables[clusters[block, layer]], about_origin, separate, points, place, v, present,
-                    block * lanes.COUNT, guard_counts[task],
-                )  # fmt: skip
-            if layers > 0:
-                move_points(
-                    block, tables[clusters[block, layers - 1]], about_origin, points, layers - 1, moved_points,
-                    np.int64(0),
-                )  # fmt: skip
-            else:
-                for k in range(3):
-                    lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
-            apply_gaussian_deltas(
-                deltas,
-                entries,
-                rows,
-                block * lanes.COUNT,
-                present,
-                v,
-                moved_points,
-                means,
-                factors,
-                state,
-                guard_counts[task],
-            )
+        for j in range(parts[part, 1 + layer], parts[part + 1, 1 + layer]):
+            cluster_gradient(records, layer, ranges[j, 0], ranges[j, 1], tables[j], gradients[j])
 
 
 @parallel_kernel
 def deform_backward(
-    first, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate, points, tables,
-    scale_weight, bounds, g_means, g_factors, g_tied, records, gradients, g_deltas, losses,
+    first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate, points, tables,
+    scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records, gradients, g_deltas, losses,
 ):  # fmt: skip
     """Backpropagates through ``deform``, and adds the gradient of the scale loss.
 
@@ -207,39 +276,16 @@ def deform_backward(
         bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
         g_means: [N, 3] gradients of the means.
         g_factors: [N, 3, 3] gradients of the factors.
-        g_tied: [M, 8] additional gradients of means and rotations; see ``deltas`` for the columns.
+        accumulators: [4, M, 8] additional gradients of means and rotations, from ``neighbour_terms``.
+        g_tied: [M, 8] scratch buffer for their sums.
         records: [B, L, 32] scratch buffer.
         gradients: [K, 10] output, gradients of the cluster parameters.
         g_deltas: [M, 9] output, gradients of the deltas.
         losses: [B] output, total length by which the axes in each block exceed their bounds, in metres.
     """
-    blocks, layers = clusters.shape
-    for task in prange((blocks + BLOCKS - 1) // BLOCKS):
-        v = np.empty((layers + 1) * CARRIED, np.float32)
-        g = np.empty(16 * lanes.COUNT, np.float32)
-        for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
-            prefetch(block + 1, rows, g_means, g_factors)
-            copy_row(entering, block, v, first * CARRIED)
-            for layer in range(first, layers):
-                leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
-                copy_row(v, layer, leaving, 0)
-                place = (layer * blocks + block) * 3 * lanes.COUNT
-                apply_cluster_map(
-                    tables[clusters[block, layer]], about_origin, separate, points, place, leaving, present,
-                    block * lanes.COUNT, None,
-                )  # fmt: skip
-            losses[block] = apply_gaussian_deltas_backward(
-                deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
-                g_means, g_factors, g_tied, g, g_deltas,
-            )  # fmt: skip
-            for back in range(layers - first):
-                layer = layers - 1 - back
-                place = (layer * blocks + block) * 3 * lanes.COUNT
-                record = (block * layers + layer) * records.shape[2]
-                apply_cluster_map_backward(
-                    tables[clusters[block, layer]], about_origin, separate, points, place, v, layer * CARRIED, g,
-                    records, record,
-                )  # fmt: skip
-    for layer in range(first, layers):
-        for j in prange(offsets[layer], offsets[layer + 1]):
-            cluster_gradient(records, layer, ranges[j, 0], ranges[j, 1], tables[j], gradients[j])
+    for part in prange(parts.shape[0] - 1):
+        deform_backward_part(
+            np.int64(part), first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin,
+            separate, points, tables, scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records,
+            gradients, g_deltas, losses,
+        )  # fmt: skip

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.guards import SSIM_C1, SSIM_C2
 from scas4d_core.kernels import lanes
-from scas4d_core.kernels.jit import ONE, TWO, ZERO, inline, kernel, parallel_kernel
+from scas4d_core.kernels.jit import ONE, TWO, ZERO, inline, kernel, parallel_kernel, threads
 
 REACH = 5
 """Radius of the window in pixels."""
@@ -37,8 +37,8 @@ PAD = lanes.COUNT
 """Number of zeros with which a row is padded on either side before the row is filtered."""
 
 
-BAND = 16
-"""Number of image rows per task."""
+BAND = 32
+"""Minimum number of image rows per task. A task also computes rows of its neighbours that its own rows depend on."""
 
 WINDOWS, LOSS, SPREAD, GRADIENT = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
 """Flags that select the quantities to compute for sixteen columns of a row: windowed quantities, loss, loss gradients
@@ -75,6 +75,11 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
         some = sums[np.minimum(rows + 1 + up, height)] > sums[np.maximum(rows - up, 0)]
         result |= np.where(some, what, np.uint8(0))
     return result
+
+
+def bands_of(channels: int, height: int) -> int:
+    """Returns the number of bands into which the rows of each channel are divided, enough for all threads."""
+    return max(1, min(-(-threads() // channels), height // BAND))
 
 
 def stride(width: int) -> int:
@@ -338,13 +343,53 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
     g_exposure[channel, y, 1] = lanes.sum_of(g_offset)
 
 
+@inline
+def band_of(task, bands, height):
+    """Returns the channel, first row and last row + 1 of a task."""
+    band = task % bands
+    return task // bands, height * band // bands, height * (band + 1) // bands
+
+
+@kernel
+def loss_of_band(
+    channel, begin, end, image, exposure, target, target_means, target_squares, weights, pixels, scratch, wanted,
+    g_image, losses, g_exposure, spans,
+):  # fmt: skip
+    """Runs all passes of ``image_loss`` on the rows [begin, end) of a channel.
+
+    Each pass depends on rows within ``REACH`` of the previous pass. Two bands compute the rows near their common
+    border, and write the same values.
+
+    Args:
+        spans: [C, H, 4] scratch buffer; see ``span_of``.
+    """
+    height, pitch = target.shape[1], scratch.shape[3]
+    gain, offset = exposure[channel, 0], exposure[channel, 1]
+    rows = np.empty((3, pitch + 2 * PAD), np.float32)
+    for y in range(max(0, begin - 4 * REACH), min(height, end + 4 * REACH)):
+        span_of(image, gain, offset, target, channel, y, pitch, spans[channel, y])
+    for y in range(max(0, begin - 2 * REACH), min(height, end + 2 * REACH)):
+        windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted)
+    for y in range(max(0, begin - REACH), min(height, end + REACH)):
+        loss_of_row(
+            image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses,
+            channel, y, wanted,
+        )  # fmt: skip
+    for y in range(begin, end):
+        gradient_of_row(
+            image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted
+        )
+
+
 @parallel_kernel
 def image_loss(
-    image, exposure, target, target_means, target_squares, weights, pixels, scratch, wanted, g_image, losses, g_exposure
-):
+    bands, image, exposure, target, target_means, target_squares, weights, pixels, scratch, wanted, g_image, losses,
+    g_exposure,
+):  # fmt: skip
     """Computes the loss and gradient of a rendered image, or of part of one.
 
     Args:
+        bands: number of bands per channel, from ``bands_of``. The result does not depend on it.
         image: [>= C, >= H, >= W] rendered image.
         exposure: [C, 2] gain and offset of the camera for each channel.
         target: [C, H, W] target image.
@@ -360,30 +405,10 @@ def image_loss(
         g_exposure: [C, H, 2] output, contribution of each row to the gradients of gain and offset.
     """
     channels, height, _ = target.shape
-    pitch = scratch.shape[3]
-    bands = (height + BAND - 1) // BAND
     spans = np.empty((channels, height, 4), np.int64)
     for task in prange(channels * bands):
-        channel, first = task // bands, task % bands * BAND
-        gain, offset = exposure[channel, 0], exposure[channel, 1]
-        for y in range(first, min(height, first + BAND)):
-            span_of(image, gain, offset, target, channel, y, pitch, spans[channel, y])
-    for task in prange(channels * bands):
-        channel, first = task // bands, task % bands * BAND
-        rows = np.empty((3, pitch + 2 * PAD), np.float32)
-        for y in range(first, min(height, first + BAND)):
-            windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted)
-    for task in prange(channels * bands):
-        channel, first = task // bands, task % bands * BAND
-        rows = np.empty((3, pitch + 2 * PAD), np.float32)
-        for y in range(first, min(height, first + BAND)):
-            loss_of_row(
-                image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses,
-                channel, y, wanted,
-            )  # fmt: skip
-    for task in prange(channels * bands):
-        channel, first = task // bands, task % bands * BAND
-        for y in range(first, min(height, first + BAND)):
-            gradient_of_row(
-                image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted
-            )
+        channel, begin, end = band_of(np.int64(task), bands, height)
+        loss_of_band(
+            channel, begin, end, image, exposure, target, target_means, target_squares, weights, pixels, scratch,
+            wanted, g_image, losses, g_exposure, spans,
+        )  # fmt: skip

@@ -5,8 +5,8 @@ The reference implementations are ``rigidity_loss``, ``isometry_loss`` and ``rot
 
 Sixteen sampled Gaussians are processed at a time, each with its k-th neighbour. Every pair
 contributes to the gradients of both Gaussians. A fixed number of tasks write to separate
-accumulators, which are then summed in a fixed order. The kernel thus needs no atomics, and the
-result does not depend on the number of threads.
+accumulators, which the backward pass of the deformation sums in a fixed order. The kernel thus
+needs no atomics, and the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -23,9 +23,6 @@ from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
 TASKS = 4
 UNDER_ROOT = np.float32(ROOT_FLOOR)
 """Value added under each square root, so that its derivative stays finite."""
-
-CHUNK = 4096
-"""Number of values that each task sums."""
 
 
 @kernel
@@ -127,8 +124,8 @@ def neighbour_terms(state, sample, neighbours, weights, distances, strengths, ac
         weights: [M, k] weights of the pairs, or 0 if there is no neighbour.
         distances: [M, k] distances of the pairs in frame 0, in metres.
         strengths: [3] float32 weights of rigidity, isometry and rotation, divided by the number of pairs S k.
-        accumulators: [4, M, 8] output. The first accumulator finally contains the gradients, and
-            the others are scratch buffers. See ``deltas`` for the columns.
+        accumulators: [4, M, 8] output. The gradients are their sum; see ``sum_accumulators``, and ``deltas`` for the
+            columns.
         losses: [4, 3] output, unweighted sums of the losses over the pairs of each task.
     """
     size = (sample.shape[0] + TASKS - 1) // TASKS
@@ -138,16 +135,15 @@ def neighbour_terms(state, sample, neighbours, weights, distances, strengths, ac
             state, sample[task * size : (task + 1) * size], neighbours, weights, distances,
             strengths[0], strengths[1], strengths[2], accumulators[task], losses[task],
         )  # fmt: skip
-    numbers = accumulators.shape[1] * TIED
-    for task in prange((numbers + CHUNK - 1) // CHUNK):
-        last = min(numbers, (task + 1) * CHUNK)
-        whole = last - last % lanes.COUNT
-        for k in range(task * CHUNK, whole, lanes.COUNT):
-            one = lanes.load(accumulators, k) + lanes.load(accumulators, numbers + k)
-            two = lanes.load(accumulators, 2 * numbers + k) + lanes.load(accumulators, 3 * numbers + k)
-            lanes.store(accumulators, k, one + two)
-        for k in range(whole, last):
-            i, column = k // TIED, k % TIED
-            accumulators[0, i, column] = (accumulators[0, i, column] + accumulators[1, i, column]) + (
-                accumulators[2, i, column] + accumulators[3, i, column]
-            )
+
+
+@kernel
+def sum_accumulators(accumulators, first, last, sums):
+    """Sums the four accumulators for the Gaussians in the range [first, last), and writes ``sums`` [M, 8]."""
+    numbers, end = accumulators.shape[1] * TIED, last * TIED
+    for k in range(first * TIED, end, lanes.COUNT):
+        one = lanes.load_first(accumulators, k, end - k) + lanes.load_first(accumulators, numbers + k, end - k)
+        two = lanes.load_first(accumulators, 2 * numbers + k, end - k) + lanes.load_first(
+            accumulators, 3 * numbers + k, end - k
+        )
+        lanes.store_first(sums, k, end - k, one + two)

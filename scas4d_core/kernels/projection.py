@@ -272,10 +272,7 @@ def project_backward_group(
         sums: [16, columns] sum of the records of each Gaussian over its pairs, followed by a flag:
             1 if the Gaussian has pairs, otherwise 0. If the gradient of the Gaussian overflows, the
             flag is cleared.
-        g_means, g_factors, g_opacities, g_screen: outputs, starting at row ``first``.
-
-    Returns:
-        Whether a gradient overflowed.
+        g_means, g_factors, g_opacities, g_screen: outputs with sixteen rows.
     """
     margin = limits[5]
     fx, fy = lens[0], lens[1]
@@ -296,11 +293,11 @@ def project_backward_group(
     by_xx, by_xy, by_yy = lanes.gather(sums, 3, columns), lanes.gather(sums, 4, columns), lanes.gather(sums, 5, columns)
     g_depth = lanes.gather(sums, 6 + depth_channel, columns) if depth_channel >= 0 else zero
     opacity = lanes.gather(splats, row + OPACITY, SPLAT_COLUMNS)
-    lanes.store(g_opacities, first, lanes.choose(seen, by_1 / opacity, zero))
+    lanes.store(g_opacities, 0, lanes.choose(seen, by_1 / opacity, zero))
     g_x = lanes.choose(seen, a * by_x + b * by_y, zero)
     g_y = lanes.choose(seen, b * by_x + c * by_y, zero)
-    lanes.scatter(g_screen, 2 * first, 2, g_x)
-    lanes.scatter(g_screen, 2 * first + 1, 2, g_y)
+    lanes.scatter(g_screen, 0, 2, g_x)
+    lanes.scatter(g_screen, 1, 2, g_y)
     # dL/dcov2d = -conic dL/dconic conic, with dL/dconic symmetric: [[ga, gb/2], [gb/2, gc]].
     ga, h, gc = by_xx * -HALF, by_xy * -HALF, by_yy * -HALF
     p00, p01 = a * ga + b * h, a * h + b * gc
@@ -327,7 +324,7 @@ def project_backward_group(
         for j in range(3):
             g = ga0 * pose[0, j] + ga1 * pose[1, j] + ga2 * pose[2, j]
             size = size + lanes.magnitude(g)
-            lanes.scatter(g_factors, 9 * first + 3 * j + k, 9, lanes.choose(seen, g, zero))
+            lanes.scatter(g_factors, 3 * j + k, 9, lanes.choose(seen, g, zero))
     # Clamped tangents are treated as constants, but the projected mean always gets a gradient.
     g_u = lanes.choose(free_u, g_u, zero) * inverse
     g_v = lanes.choose(free_v, g_v, zero) * inverse
@@ -337,25 +334,23 @@ def project_backward_group(
     for k in range(3):
         g = gx * pose[0, k] + gy * pose[1, k] + gz * pose[2, k]
         size = size + lanes.magnitude(g)
-        lanes.scatter(g_means, 3 * first + k, 3, lanes.choose(seen, g, zero))
+        lanes.scatter(g_means, k, 3, lanes.choose(seen, g, zero))
     lost = lanes.choose(size <= STEEPEST, zero, lanes.choose(seen, lanes.fill(ONE), zero))
     if lanes.any_of(lost > ZERO):
         for lane in range(lanes.COUNT):
             steep = np.float32(0.0)
             for k in range(9):
-                steep += abs(g_factors[first + lane, k // 3, k % 3])
+                steep += abs(g_factors[lane, k // 3, k % 3])
             for k in range(3):
-                steep += abs(g_means[first + lane, k])
+                steep += abs(g_means[lane, k])
             if not steep <= STEEPEST:
                 sums[lane, columns - 1] = ZERO
                 for k in range(9):
-                    g_factors[first + lane, k // 3, k % 3] = ZERO
+                    g_factors[lane, k // 3, k % 3] = ZERO
                 for k in range(3):
-                    g_means[first + lane, k] = ZERO
-                g_screen[first + lane, 0] = g_screen[first + lane, 1] = ZERO
-                g_opacities[first + lane] = ZERO
-        return True
-    return False
+                    g_means[lane, k] = ZERO
+                g_screen[lane, 0] = g_screen[lane, 1] = ZERO
+                g_opacities[lane] = ZERO
 
 
 @kernel
@@ -372,7 +367,7 @@ def clear_steep_gradients(sums, counts, first, some, used):
 
 @kernel
 def project_backward_task(
-    task, means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel, g_means, g_factors,
+    task, means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel, rows, g_means, g_factors,
     g_opacities, g_features, g_screen, guard_counts,
 ):  # fmt: skip
     """Backpropagates the gradients of the Gaussians of one task of ``project_backward``."""
@@ -380,6 +375,8 @@ def project_backward_task(
     columns = records.shape[1]
     count = means.shape[0]
     sums = np.empty((lanes.COUNT, columns + 1), np.float32)
+    gm, gf = np.empty((lanes.COUNT, 3), np.float32), np.empty((lanes.COUNT, 3, 3), np.float32)
+    go, gs = np.empty(lanes.COUNT, np.float32), np.empty((lanes.COUNT, 2), np.float32)
     guard_counts[task, 0] = 0
     for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
         some = min(lanes.COUNT, count - first)
@@ -398,34 +395,29 @@ def project_backward_task(
                     total += lanes.load(records, pair * columns + column)
                 lanes.store(sums, k * (columns + 1) + column, total)
                 worst += lanes.magnitude(lanes.only_first(total, 6 + channels - column))
-            for channel in range(channels):
-                g_features[i, channel] = sums[k, 6 + channel]
         steep = not lanes.sum_of(worst) <= STEEPEST
         if steep:
             clear_steep_gradients(sums, counts, first, some, 6 + channels)
-        place, m, f, gm, gf, go, gs = first, means, factors, g_means, g_factors, g_opacities, g_screen
+        place, m, f = first, means, factors
         if some < lanes.COUNT:
-            place = 0
-            m, f = padded_2(means, first), padded_3(factors, first)
-            gm, gf = padded_2(g_means, first), padded_3(g_factors, first)
-            go, gs = padded_1(g_opacities, first), padded_2(g_screen, first)
-        lost = project_backward_group(
+            place, m, f = 0, padded_2(means, first), padded_3(factors, first)
+        project_backward_group(
             place, first, m, f, pose, lens, limits, splats, sums, columns + 1, depth_channel, gm, gf, go, gs
         )
-        if some < lanes.COUNT:
-            for k in range(some):
-                for column in range(9):
-                    g_factors[first + k, column // 3, column % 3] = gf[k, column // 3, column % 3]
-                for column in range(3):
-                    g_means[first + k, column] = gm[k, column]
-                g_opacities[first + k] = go[k]
-                g_screen[first + k, 0], g_screen[first + k, 1] = gs[k, 0], gs[k, 1]
-        if steep or lost:
-            for k in range(some):
-                if counts[first + k] > 0 and sums[k, columns] == ZERO:
-                    for channel in range(channels):
-                        g_features[first + k, channel] = ZERO
-                    guard_counts[task, 0] += 1
+        for k in range(some):
+            if counts[first + k] > 0 and sums[k, columns] == ZERO:
+                for channel in range(channels):
+                    sums[k, 6 + channel] = ZERO
+                guard_counts[task, 0] += 1
+            row = rows[first + k]
+            for column in range(9):
+                g_factors[row, column // 3, column % 3] = gf[k, column // 3, column % 3]
+            for column in range(3):
+                g_means[row, column] = gm[k, column]
+            g_opacities[row] = go[k]
+            for channel in range(channels):
+                g_features[row, channel] = sums[k, 6 + channel]
+            g_screen[row, 0], g_screen[row, 1] = gs[k, 0], gs[k, 1]
 
 
 @parallel_kernel
@@ -440,6 +432,7 @@ def project_backward(
     firsts,
     records,
     depth_channel,
+    rows,
     g_means,
     g_factors,
     g_opacities,
@@ -458,16 +451,17 @@ def project_backward(
         firsts: [N] first pair of each Gaussian.
         records: [pairs, multiple of ``Lanes``] gradient records from ``blend_backward``.
         depth_channel: feature channel that contains the depth of the mean, or -1.
-        g_means: [N, 3] float32 output.
-        g_factors: [N, 3, 3] float32 output.
-        g_opacities: [N] float32 output.
-        g_features: [N, C] float32 output.
-        g_screen: [N, 2] float32 output, gradient of the projected mean per pixel, which density control uses.
+        rows: [N] int64 rows of the outputs that are written. All other rows remain unchanged.
+        g_means: [≥ N, 3] float32 output.
+        g_factors: [≥ N, 3, 3] float32 output.
+        g_opacities: [≥ N] float32 output.
+        g_features: [≥ N, C] float32 output.
+        g_screen: [≥ N, 2] float32 output, gradient of the projected mean per pixel, which density control uses.
         guard_counts: [tasks of ``CHUNK``, 1] int64 output, number of Gaussians that triggered the guard in
             ``COUNTED_GUARDS_BACKWARD``.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_backward_task(
-            np.int64(task), means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel,
+            np.int64(task), means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel, rows,
             g_means, g_factors, g_opacities, g_features, g_screen, guard_counts,
         )  # fmt: skip

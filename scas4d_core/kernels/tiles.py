@@ -32,9 +32,6 @@ DIGITS = 1 << RADIX_BITS
 BLOCK = lanes.ACROSS
 """Side length of a block in pixels."""
 
-SOME = 4096
-"""Number of rows per task."""
-
 AHEAD = 8
 """Prefetch distance in Gaussians. Prefetching pays off because memory accesses in depth order are
 scattered."""
@@ -199,7 +196,7 @@ def cover_tiles(
         Number of pairs in which such a Gaussian extends beyond the rendered blocks.
     """
     tasks = begins.shape[0]
-    left = np.zeros(tasks, np.int64)
+    left = np.empty(tasks, np.int64)  # np.zeros would be a parallel region of its own
     for task in prange(tasks):
         left[task] = cover_tiles_task(
             np.int64(task), splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs,
@@ -246,75 +243,6 @@ def find_meeting(splats, rects, tiles_x, drawn, meets):
                 tile = tile_y * tiles_x + tile_x
                 if drawn[tile] != 0 and (cover(splats[i], tile_x, tile_y) & drawn[tile]) != 0:
                     meets[i] = True
-
-
-@parallel_kernel
-def put_rows(rows, places, part, whole):
-    """Copies rows from one array to another: ``whole[places] = part[rows]``.
-
-    Args:
-        rows: [M] int64 rows to read from ``part``.
-        places: [M] int64 rows to write in ``whole``.
-        part: [P, K] float32 input.
-        whole: [W, K] float32 output.
-    """
-    for task in prange((rows.shape[0] + SOME - 1) // SOME):
-        for k in range(task * SOME, min(rows.shape[0], (task + 1) * SOME)):
-            for column in range(part.shape[1]):
-                whole[places[k], column] = part[rows[k], column]
-
-
-@inline
-def is_marked(blocks, tiles_x, y, x):
-    """Returns whether the block that contains a pixel is marked."""
-    number = x % TILE // BLOCK * (TILE // BLOCK) + y % TILE // BLOCK
-    return (blocks[y // TILE * tiles_x + x // TILE] >> np.uint64(number)) & np.uint64(1) != 0
-
-
-@kernel
-def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
-    """Composes a rectangular part of an image from rendered blocks and a base image.
-
-    Args:
-        planes: [C, rows, stride] float32 rendering, which is used in the given blocks.
-        base: [C, H, W] float32 base image, which is used everywhere else.
-        blocks: [tiles] uint64 mask of the rendered blocks.
-        tiles_x: number of tile columns.
-        box: first row, last row + 1, first column, last column + 1.
-        part: [C, h, w] float32 output, the image inside the box.
-        shifts: [C] float64 output, difference between ``part`` and the base image, summed over the box.
-    """
-    top, bottom, left, right = box
-    for channel in range(part.shape[0]):
-        shifts[channel] = 0.0
-        for y in range(top, bottom):
-            for x in range(left, right):
-                part[channel, y - top, x - left] = base[channel, y, x]
-            shift = 0.0
-            for x in range(left // BLOCK * BLOCK, right, BLOCK):
-                if is_marked(blocks, tiles_x, y, x):
-                    for k in range(max(x, left), min(x + BLOCK, right)):
-                        shift += np.float64(planes[channel, y, k] - base[channel, y, k])
-                        part[channel, y - top, k - left] = planes[channel, y, k]
-            shifts[channel] += shift
-
-
-@kernel
-def write_blocks(part, blocks, tiles_x, box, planes):
-    """Copies the given blocks from a box back to an image. All other blocks remain unchanged.
-
-    Args:
-        part: [C, h, w] float32 input, the image inside the box.
-        blocks, tiles_x, box: see ``compose_box``.
-        planes: [C, rows, stride] float32 output.
-    """
-    top, bottom, left, right = box
-    for channel in range(part.shape[0]):
-        for y in range(top, bottom):
-            for x in range(left // BLOCK * BLOCK, right, BLOCK):
-                if is_marked(blocks, tiles_x, y, x):
-                    for k in range(max(x, left), min(x + BLOCK, right)):
-                        planes[channel, y, k] = part[channel, y - top, k - left]
 
 
 @kernel

@@ -230,7 +230,7 @@ def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agre
         exposure = np.tile(np.array([1, 0], np.float32), (3, 1))
         weights = np.full(3, 1 / 3, np.float32)
         image_loss.image_loss(
-            image, exposure, truth, means, squares, weights, truth[0].size, scratch, image_loss.EVERYWHERE, gradient,
+            1, image, exposure, truth, means, squares, weights, truth[0].size, scratch, image_loss.EVERYWHERE, gradient,
             rows, by_exposure,
         )  # fmt: skip
         return BackendResult({"loss": rows[..., 0].sum(dtype=np.float64)[None]}, {"picture": gradient})

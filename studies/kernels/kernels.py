@@ -5,7 +5,9 @@
    rasterizer renders all views of frame 0, and a cloud of wider Gaussians, in which pairs dominate the cost.
 2. Updates are compared with their own rasterizer passes. The seconds of ``Reconstruction.step``, including decoding and
    committing, are divided by those of its stages "render" and "render backward".
-3. The peak memory of these updates, including the fit of frame 0, is measured in a fresh process.
+3. The parallel regions that an iteration enters are counted, and updates with all threads are compared with updates
+   with one thread, in alternation (``studies.kernels.regions``).
+4. The peak memory of these updates, including the fit of frame 0, is measured in a fresh process.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import compile_in_processes
 from studies.apart import in_a_process
+from studies.kernels import regions
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
@@ -53,7 +56,7 @@ With this width, there are about 145 pixels per Gaussian and 2.9 million pairs p
 def study(
     folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
 ) -> Row:
-    """Makes all three measurements on a capture, prints them, writes them to ``store/kernels.json``, and returns them.
+    """Makes all measurements on a capture, prints them, writes them to ``store/kernels.json``, and returns them.
 
     Args:
         folder: capture folder.
@@ -74,6 +77,9 @@ def study(
     report(f"running {min(frames, capture.frame_count)} frames, starting with frame 0, in a separate process")
     compile_in_processes()
     timed = in_a_process(run_and_time, folder, settings, frames, first_file)
+    report("counting parallel regions, and comparing one thread with all threads")
+    entered = in_a_process(regions.count_regions, folder, settings, 3, first_file)
+    by_threads = in_a_process(regions.compare_threads, folder, settings, frames, first_file)
     kept = load_first_frame(first_file)
     assert kept is not None  # stored by the run
     world = capture.rig.world_frame(settings.scene.metres_per_unit)
@@ -94,6 +100,8 @@ def study(
         "ratio_rasterizer": on_frame_0["ratio"]["median"],
         "ratio_rasterizer_cloud": on_cloud["ratio"]["median"],
         **update_figures(timed["updates"]),
+        "regions": entered,
+        "ratio_threads": spread(np.divide(by_threads["all"], by_threads["one"])[1:]),
         "iterations": settings.update.iterations,
         "frames": timed["frames"],
         "peak_mb": timed["peak_mb"],
@@ -244,6 +252,8 @@ def table(row: Row) -> str:
         line(f"update with {iterations} iterations", row["seconds_update"], "s", digits=3),
         line(f"{iterations} rasterizer passes", row["seconds_passes"], "s", digits=3),
         line("update-to-rasterizer ratio", row["ratio_update_spread"], "×", "ratio_update"),
+        line(f"update, {row['machine']['threads']} threads over one", row["ratio_threads"], "×"),
+        line("parallel regions per iteration", {"median": row["regions"]}, "", digits=1),
         line("peak memory", {"median": row["peak_mb"]}, "MB", "peak_mb", 0),
     ]
     return "\n".join(["| | median | unit | target | |", "|---|---|---|---|---|", *lines])
@@ -271,7 +281,6 @@ Measured with `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernel
   covers the exp and multiply-add operations for the same number of pairs, in cache, with four channels.
 - "Counting all lanes" treats every pixel of the visited 4×4 blocks as a pair.
 - Times are CPU time with one thread and wall-clock time with more. Ratios are medians of alternating runs.
-  Other pages have times of other days on this shared machine.
 - An update is one call of `Reconstruction.step`; its time is the median of {row["updates"]} updates. Peak memory is
   that of a process that fits frame 0 and runs {row["frames"] - 1} updates.
 

@@ -27,8 +27,10 @@ from scas4d_core.engines.renderer import Gradients, Picture, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import image_loss, lanes, tiles
+from scas4d_core.kernels.box_loss import box_loss
 
 Array = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 State = tuple[Array, Array, Array, Array]
 
 MARGIN = 2
@@ -128,12 +130,11 @@ class ChangedPixels(CpuRenderer):
         lap("render")
         self._compare_box(region, view)
         lap("picture loss")
-        gradients = self.rasterizer.backward(*self.rasterizer.gradient_buffers(), self._detached)
         if self._gradients is None or self._gradients.features.shape != features.shape:
             shapes = (means.shape, factors.shape, opacities.shape, features.shape, (len(means), 2))
             self._gradients = Gradients(*(np.zeros(shape, np.float32) for shape in shapes))
-        for whole, part in zip(self._gradients, gradients, strict=True) if len(self._moving) else ():
-            tiles.put_rows(region.moving, self._moving, part.reshape(len(part), -1), whole.reshape(len(whole), -1))
+        within = region.rows, self._gradients  # the gradients of static Gaussians remain 0
+        self.rasterizer.backward(*self.rasterizer.gradient_buffers(), self._detached, within)
         lap("render backward")
         return self._gradients
 
@@ -213,8 +214,7 @@ class ChangedPixels(CpuRenderer):
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         whole = self._moments(view)
         region.moments = np.ascontiguousarray(whole[0][where]), np.ascontiguousarray(whole[1][where])
-        wanted = _outside_region(region.box, region.near, view.camera.height, view.camera.width)
-        region.outside_losses = self._losses(base, view, view.target, whole, wanted, base)
+        region.outside_losses = self._outside_losses(base, view, whole, region)
         forget_moments(view)  # the region has its own crop
 
     def _static_background(self, view: TrainingView) -> Array:
@@ -236,12 +236,16 @@ class ChangedPixels(CpuRenderer):
         base, (rows, columns) = self._static_background(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
-        drawn, tiles_x = self.rasterizer.drawn, tile_grid(view.camera)[0]
-        shifts = np.zeros(len(base))
-        tiles.compose_box(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
-        sums = region.outside_losses + self._losses(part, view, region.target, region.moments, region.near, g_part)
         g_image, _ = self.rasterizer.gradient_buffers()
-        tiles.write_blocks(g_part, drawn, tiles_x, box, g_image)
+        (channels, height, width), shifts = region.target.shape, np.zeros(len(base))
+        losses, g_exposure = (np.empty((channels, height, 2), np.float32) for _ in range(2))
+        box_loss(
+            image_loss.bands_of(len(base), height), self.rasterizer.planes, base, self.rasterizer.drawn,
+            tile_grid(view.camera)[0], box, part, g_part, g_image, view.exposure, region.target, *region.moments,
+            self._weights[:channels], view.camera.height * view.camera.width, self._cleared(channels, height, width),
+            region.near, losses, g_exposure, shifts,
+        )  # fmt: skip
+        sums = region.outside_losses + _totals(losses)
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
         self.psnr = psnr_of(float(sums[2]), pixels)
@@ -255,30 +259,17 @@ class ChangedPixels(CpuRenderer):
         part, g_part = self._planes[:size].reshape(shape)
         return part, g_part
 
-    def _losses(
-        self,
-        planes: Array,
-        view: TrainingView,
-        target: Array,
-        moments: tuple[Array, Array],
-        near: NDArray[np.uint8],
-        gradient: Array,
-    ) -> NDArray[np.float64]:
-        """Returns the image loss, mask loss and squared error of part of an image, and computes requested gradients.
-
-        If ``near`` does not request gradients (``image_loss.GRADIENT``), ``gradient`` may be ``planes`` itself, which
-        then remains unchanged.
-        """
-        channels, height, width = target.shape
-        rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
+    def _outside_losses(self, base: Array, view: TrainingView, moments: tuple[Array, Array], region: Region) -> Doubles:
+        """Returns the sums of ``_totals`` over the part of an image that is constant during a frame."""
+        channels, height, width = view.target.shape
+        losses, g_exposure = (np.empty((channels, height, 2), np.float32) for _ in range(2))
+        wanted = _outside_region(region.box, region.near, height, width)  # requests no gradient
         image_loss.image_loss(
-            planes, view.exposure, target, *moments, self._weights[:channels], view.camera.height * view.camera.width,
-            self._cleared(channels, height, width), near, gradient, rows, g_exposure,
+            image_loss.bands_of(channels, height), base, view.exposure, view.target, *moments,
+            self._weights[:channels], height * width, self._cleared(channels, height, width), wanted, base, losses,
+            g_exposure,
         )  # fmt: skip
-        if gradient is not planes:
-            gradient[channels:] = 0
-        sums = rows.sum(axis=1, dtype=np.float64)
-        return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
+        return _totals(losses)
 
     def _cleared(self, channels: int, height: int, width: int) -> Array:
         """Returns the scratch buffer of the image loss for a box, with its border rows set to zero."""
@@ -290,6 +281,12 @@ class ChangedPixels(CpuRenderer):
         scratch[:, :, : image_loss.REACH] = 0
         scratch[:, :, -image_loss.REACH :] = 0
         return scratch
+
+
+def _totals(losses: Array) -> Doubles:
+    """Returns the image loss, mask loss and squared error of an image, given the losses [C, H, 2] of its rows."""
+    sums = losses.sum(axis=1, dtype=np.float64)
+    return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
 
 
 def take_rows(state: State, rows: NDArray[np.int64]) -> State:

@@ -17,7 +17,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.kernels.cascade import COUNTED_GUARDS, PARAMETERS, RECORD, TABLE
-from scas4d_core.kernels.deform import BLOCKS, CARRIED, block_sums, deform, deform_backward, freeze_layer
+from scas4d_core.kernels.deform import CARRIED, block_sums, deform, deform_backward, freeze_layer
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.structure.hierarchy import Hierarchy
@@ -64,6 +64,7 @@ class CpuDeformation:
         layers = len(hierarchy.sizes)
         blocks = Blocks.of(hierarchy)
         self._offsets, self._ranges, self._clusters_of = blocks.offsets, blocks.ranges, blocks.clusters
+        self._parts = blocks.parts()
         self._entries, self._rows, self._present = blocks.entries, hierarchy.rows[blocks.entries], blocks.present
         self._all_present, self._all_ranges = blocks.present, blocks.ranges
         self._weights = np.zeros((count, 0), np.float32) if neighbours is None else neighbours.weights
@@ -87,12 +88,12 @@ class CpuDeformation:
         self._state = cache_lines(count)
         self.turns = self._state[:, TURN : TURN + 4]
         self._accumulators = np.zeros((neighbour_terms.TASKS, count, TIED), np.float32)
-        self._tied = self._accumulators[0]
+        self._tied = np.zeros((count, TIED), np.float32)
         self._neighbour_sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
         self.means = np.zeros((0, 3), np.float32)
         self.factors = np.zeros((0, 3, 3), np.float32)
         self.guards = GuardCounts(*COUNTED_GUARDS, "held_back", "empty_cluster")
-        self._guard_counts = np.zeros((-(-held // BLOCKS), len(COUNTED_GUARDS)), np.int64)
+        self._guard_counts = np.zeros((len(self._parts) - 1, len(COUNTED_GUARDS)), np.int64)
         self.held_back = np.zeros(0, np.int64)
         self._held: tuple[Array, Array] = self.means, self.factors
 
@@ -152,7 +153,7 @@ class CpuDeformation:
             self._unfreeze_layers()
         for layer in range(self._frozen, layers):
             freeze_layer(
-                layer, self._parameters, self._offsets, self._ranges, self._clusters_of, self._present, self._entering,
+                layer, self._parameters, self._parts, self._ranges, self._clusters_of, self._present, self._entering,
                 self._about_origin, self._separate, self._points, self._sums, self._tables,
             )  # fmt: skip
         self._frozen = layers
@@ -163,7 +164,7 @@ class CpuDeformation:
     def forward(self) -> None:
         """Evaluates equations (5) to (7) and fills ``means``, ``factors`` and ``turns``."""
         deform(
-            self._frozen, self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows,
+            self._frozen, self._parameters, self._parts, self._ranges, self._clusters_of, self._entries, self._rows,
             self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._sums,
             self._tables, self.means, self.factors, self._state, self._guard_counts,
         )  # fmt: skip
@@ -180,7 +181,7 @@ class CpuDeformation:
             weights: weights of the three terms.
         """
         if self.neighbours is None or len(sample) == 0:
-            self._tied[:] = 0
+            self._accumulators[:] = 0
             return np.zeros(3, np.float32)
         pairs = max(1, len(sample) * self.neighbours.index.shape[1])
         neighbour_terms.neighbour_terms(
@@ -203,12 +204,16 @@ class CpuDeformation:
         """
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
-            self._frozen, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
+            self._frozen, self._parts, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
             self._entering, self.deltas, self._about_origin, self._separate, self._points, self._tables,
-            np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._tied, self._records,
-            self._gradients, self.delta_gradients, self._excess,
+            np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._accumulators, self._tied,
+            self._records, self._gradients, self.delta_gradients, self._excess,
         )  # fmt: skip
         return float(self._excess.sum(dtype=np.float64)) / axes
+
+
+PARTS = 64
+"""Maximum number of parts of a deformation, which run in parallel."""
 
 
 def cache_lines(count: int) -> Array:
@@ -256,3 +261,15 @@ class Blocks(NamedTuple):
             of_layer[:, 1] = np.searchsorted(begins, starts[1:])
             of_layer[:, 2] = np.diff(starts)
         return cls(np.ascontiguousarray(entries), (wanted == entries).astype(np.float32), clusters, offsets, ranges)
+
+    def parts(self) -> NDArray[np.int64]:
+        """Returns the boundaries of parts of similar size, as in ``kernels.deform.deform``.
+
+        Each part contains whole clusters of the coarsest layer, and therefore of every layer.
+        """
+        count, layers = self.clusters.shape
+        starts = self.ranges[self.offsets[0] : self.offsets[1], 0] if layers else np.arange(count)
+        wanted = np.linspace(0, count, PARTS, endpoint=False)
+        begins = starts[np.unique(np.searchsorted(starts, wanted, side="right") - 1)] if count else starts[:0]
+        firsts = np.concatenate([begins[:, None], self.clusters[begins]], axis=1)
+        return np.concatenate([firsts, [[count, *self.offsets[1:]][: layers + 1]]])

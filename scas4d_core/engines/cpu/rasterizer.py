@@ -251,13 +251,21 @@ class CpuRasterizer:
             self._gradient_shape = shape
         return g_image, g_alpha
 
-    def backward(self, g_image: Array, g_alpha: Array, detached: int = -1) -> Gradients:
+    def backward(
+        self,
+        g_image: Array,
+        g_alpha: Array,
+        detached: int = -1,
+        within: tuple[NDArray[np.int64], Gradients] | None = None,
+    ) -> Gradients:
         """Backpropagates the gradients of a loss through the last forward pass.
 
         Args:
             g_image, g_alpha: filled buffers from ``gradient_buffers``.
             detached: channel whose gradient propagates to the features but not to the geometry, or −1. This channel of
                 the rendered image is set to zero.
+            within: gradients of more Gaussians to write to, and the rows of the rendered Gaussians there. By default,
+                the gradients are buffers for the rendered Gaussians.
         """
         last = self._last
         features, image = last.features, last.image
@@ -273,21 +281,24 @@ class CpuRasterizer:
             last.covers, last.learnt, last.tile_order, threads(), (last.camera.width, last.camera.height), self.limits,
             image, last.transmittance, g_image, g_alpha, records,
         )  # fmt: skip
-        gradients = Gradients(
+        rows, gradients = within or (np.arange(count), self._gradient_buffers(count, channels))
+        shape = (-(-count // projection.CHUNK), len(projection.COUNTED_GUARDS_BACKWARD))
+        guard_counts = self._buffer("guard_counts_backward", shape, np.int64)
+        projection.project_backward(
+            last.means, last.factors, last.camera.pose, last.camera.lens, self.limits, last.splats,
+            last.counts * last.learnt, last.firsts, records, last.depth_channel, rows, *gradients, guard_counts,
+        )  # fmt: skip
+        self.guards.add(projection.COUNTED_GUARDS_BACKWARD, guard_counts)
+        return gradients
+
+    def _gradient_buffers(self, count: int, channels: int) -> Gradients:
+        return Gradients(
             self._buffer("g_means", (count, 3)),
             self._buffer("g_factors", (count, 3, 3)),
             self._buffer("g_opacities", (count,)),
             self._buffer("g_features", (count, channels)),
             self._buffer("g_screen", (count, 2)),
         )
-        shape = (-(-count // projection.CHUNK), len(projection.COUNTED_GUARDS_BACKWARD))
-        guard_counts = self._buffer("guard_counts_backward", shape, np.int64)
-        projection.project_backward(
-            last.means, last.factors, last.camera.pose, last.camera.lens, self.limits, last.splats,
-            last.counts * last.learnt, last.firsts, records, last.depth_channel, *gradients, guard_counts,
-        )  # fmt: skip
-        self.guards.add(projection.COUNTED_GUARDS_BACKWARD, guard_counts)
-        return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
         """Returns the feature gradients [N, 4] without computing other gradients. The image must have four channels."""

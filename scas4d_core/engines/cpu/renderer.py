@@ -215,9 +215,9 @@ class CpuRenderer:
         rows = np.empty((channels, height, 2), np.float32)
         g_exposure = np.empty((channels, height, 2), np.float32)
         image_loss.image_loss(
-            self.rasterizer.planes, view.exposure, view.target, *self._moments(view), self._weights[:channels],
-            height * width, self._scratch_of(channels, height, width), image_loss.EVERYWHERE, g_image, rows,
-            g_exposure,
+            image_loss.bands_of(channels, height), self.rasterizer.planes, view.exposure, view.target,
+            *self._moments(view), self._weights[:channels], height * width, self._scratch_of(channels, height, width),
+            image_loss.EVERYWHERE, g_image, rows, g_exposure,
         )  # fmt: skip
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)

@@ -87,7 +87,7 @@ def test_cascade_and_deltas_agree_with_the_twin(
     np.testing.assert_allclose(model.factors[rows], twin.factors.detach().numpy(), atol=1e-6)
     np.testing.assert_allclose(model.turns, twin.turns.detach().numpy(), atol=2e-6)
 
-    model._tied[:, 3:7] = g_turns
+    model._accumulators[0, :, 3:7] = g_turns
     excess = model.backward(scattered(g_means, rows), scattered(g_factors, rows), 10.0)
     np.testing.assert_allclose(excess, scale.item(), rtol=1e-5)
     assert_close(model.delta_gradients, own_leaf.grad)

@@ -45,6 +45,7 @@ def test_loss_and_gradients_agree_with_the_twin(height: int, width: int, shown: 
     rows = np.empty((3, height, 2), np.float32)
     g_exposure = np.empty((3, height, 2), np.float32)
     image_loss.image_loss(
+        2,
         image,
         exposure,
         target,
@@ -80,6 +81,7 @@ def test_a_picture_equal_to_its_target_has_no_loss() -> None:
     rows, g_exposure = np.empty((2, 1, 20, 2), np.float32)
     exposure, weights = np.array([[1.0, 0.0]], np.float32), np.ones(1, np.float32)
     image_loss.image_loss(
+        1,
         target,
         exposure,
         target,
@@ -97,8 +99,9 @@ def test_a_picture_equal_to_its_target_has_no_loss() -> None:
     assert np.abs(g_image).max() < 1e-6
 
 
+@pytest.mark.parametrize("bands", [1, 3])
 @pytest.mark.parametrize("black", [False, True])
-def test_a_part_has_the_bits_of_the_whole(black: bool) -> None:
+def test_a_part_has_the_bits_of_the_whole(black: bool, bands: int) -> None:
     """Gradients of the pixels asked for; and the loss that changes with them, as a difference."""
     height, width = 70, 90
     rng = np.random.default_rng(3)
@@ -114,18 +117,19 @@ def test_a_part_has_the_bits_of_the_whole(black: bool) -> None:
     scratch = np.zeros((6, 3, height + 10, image_loss.stride(width)), np.float32)
     image_loss.target_moments(target, scratch, means, squares)
 
-    def found(image: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def found(image: np.ndarray, wanted: np.ndarray, bands: int = 1) -> tuple[np.ndarray, np.ndarray]:
         scratch[:, :, 5:-5] = np.nan  # what another picture left
         gradient, rows = np.full_like(image, np.nan), np.empty((3, height, 2), np.float32)
         image_loss.image_loss(
-            image, exposure, target, means, squares, np.ones(3, np.float32), height * width, scratch, wanted,
+            bands, image, exposure, target, means, squares, np.ones(3, np.float32), height * width, scratch, wanted,
             gradient, rows, np.empty_like(rows),
         )  # fmt: skip
         return gradient, rows.sum(axis=(0, 1), dtype=np.float64)
 
     near = image_loss.near(shown)
-    gradient, losses = found(after, near)
+    gradient, losses = found(after, near, bands)
     wanted, whole = found(after, image_loss.EVERYWHERE)
+    np.testing.assert_array_equal(found(after, image_loss.EVERYWHERE, bands)[0], wanted)
     np.testing.assert_array_equal(gradient[:, shown], wanted[:, shown])
     assert np.isnan(gradient).mean() > 0.5  # little else was computed
     untouched, base = found(before, near & (image_loss.WINDOWS | image_loss.LOSS))

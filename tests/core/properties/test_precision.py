@@ -165,8 +165,9 @@ def motion(found: dict[str, float]) -> None:
     sum(weight * term for weight, term in zip(weights, wanted, strict=True)).backward()
     terms = np.array([term.item() for term in wanted])
     found["neighbour terms: values, relative"] = float(np.abs(values / terms - 1).max())
-    found["neighbour terms: gradient of the means, relative"] = relative(kernel._tied[:, :3], leaves[0].grad.numpy())
-    found["neighbour terms: gradient of the turns, relative"] = relative(kernel._tied[:, 3:7], leaves[1].grad.numpy())
+    tied = kernel._accumulators.sum(axis=0)
+    found["neighbour terms: gradient of the means, relative"] = relative(tied[:, :3], leaves[0].grad.numpy())
+    found["neighbour terms: gradient of the turns, relative"] = relative(tied[:, 3:7], leaves[1].grad.numpy())
 
 
 def columns(table: np.ndarray) -> list[Tensor]:

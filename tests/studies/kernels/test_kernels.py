@@ -117,6 +117,8 @@ def test_the_page_says_what_was_measured():
         "cloud": on_box | {"ratio": {"min": 1.9, "median": 2.01}},
         "iterations": 100,
         "frames": 3,
+        "regions": 12.4,
+        "ratio_threads": {"min": 0.5, "median": 0.55},
         "peak_mb": 1500.0,
         **kernels.update_figures([{"seconds": 3.5, "stages": stages}] * 3),
     }
@@ -124,6 +126,7 @@ def test_the_page_says_what_was_measured():
     assert "| rasterizer-to-arithmetic ratio, frame 0 | 2.00 | × | ≤ 2 × | reached |" in text
     assert "| rasterizer-to-arithmetic ratio, cloud | 2.01 | × | ≤ 2 × | **missed** |" in text
     assert "| update-to-rasterizer ratio | 3.50 | × | ≤ 3 × | **missed** |" in text
+    assert "| parallel regions per iteration | 12.4 |  |  |  |" in text
     assert "| peak memory | 1500 | MB | < 1500 MB | **missed** |" in text
     assert "448 Gaussians, 2 images of 48×48" in text
     assert "(A Processor, 2 cores, 1 thread used; source version of the core: 0123abcd)" in text

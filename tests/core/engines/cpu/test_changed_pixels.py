@@ -199,7 +199,7 @@ def test_losses_of_the_box_and_around_it_are_those_of_the_whole_picture(seed: in
         rows, gradient = np.empty((3, image.shape[1], 2), np.float32), np.full_like(image, np.nan)
         exposure = np.tile(np.array([1.1, 0], np.float32), (3, 1))
         image_loss.image_loss(
-            image, exposure, truth, mean, square, np.ones(3, np.float32), height * width,
+            1, image, exposure, truth, mean, square, np.ones(3, np.float32), height * width,
             scratch_of(*image.shape[1:]), wanted, gradient, rows, np.empty_like(rows),
         )  # fmt: skip
         return rows.sum(axis=(0, 1), dtype=np.float64), gradient

@@ -16,7 +16,7 @@ from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.torch import rasterizer as twin
 from scas4d_core.engines.views import CameraArrays
-from scas4d_core.kernels import tiles
+from scas4d_core.kernels import box_loss
 
 SIZES = [(5, 3), (16, 16), (37, 29), (64, 48), (100, 33)]
 
@@ -394,11 +394,13 @@ def test_a_narrow_drawing_draws_the_blocks_that_are_reached() -> None:
     here = (slice(None), slice(3, 83), slice(10, 99))
     base = np.random.default_rng(1).random((4, 90, 100), np.float32)
     part, shifts = np.empty((4, 80, 89), np.float32), np.zeros(4)
-    tiles.compose_box(rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
+    for channel, y in np.ndindex(4, 80):
+        shifts[channel] += box_loss.compose_row(channel, 3 + y, rasterizer.planes, base, drawn, tiles_x, box, part)
     np.testing.assert_array_equal(part, np.where(shown, planes, base)[here])
     np.testing.assert_allclose(shifts, (part.astype(np.float64) - base[here]).sum(axis=(1, 2)), rtol=1e-5)
     out = np.zeros((4, 96, 128), np.float32)
-    tiles.write_blocks(part, drawn, tiles_x, box, out)
+    for channel, y in np.ndindex(4, 80):
+        box_loss.write_row(channel, 3 + y, part, drawn, tiles_x, box, out)
     box_alone = np.zeros_like(shown)
     box_alone[here[1:]] = shown[here[1:]]
     np.testing.assert_array_equal(out[:, :90, :100], np.where(box_alone, planes, 0))
