@@ -200,10 +200,10 @@ def target_table(verdicts: Sequence[Verdict]) -> str:
             measured += f" ({_plain(target, verdict.parts[0])} vs. {_plain(target, verdict.parts[1])})"
         cells = [target.what, verdict.capture, must, measured, verdict.word, verdict.updates]
         lines.append("| " + " | ".join(cells) + " |")
-    missing: dict[str, dict[str, None]] = {}
+    missing: dict[str, list[str]] = {}
     for verdict in verdicts:
         if verdict.value is None:
-            missing.setdefault(verdict.target.what, {})[verdict.capture] = None
+            missing.setdefault(verdict.target.what, []).append(verdict.capture)
     if missing:
         named = "; ".join(f"{what} ({', '.join(captures)})" for what, captures in missing.items())
         lines += ["", f"Not measured: {named}."]
