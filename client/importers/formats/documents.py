@@ -76,7 +76,7 @@ def read_yaml(path: Path) -> Any:
 
     Loader.add_multi_constructor("", untagged)
     try:
-        return yaml.load(DIRECTIVE.sub("", read_text(path)), Loader)
+        return Loader(DIRECTIVE.sub("", read_text(path))).get_single_data()
     except (yaml.YAMLError, RecursionError) as fault:
         raise CaptureError(f"{path} cannot be read as YAML: {' '.join(str(fault).split())}") from fault
 
