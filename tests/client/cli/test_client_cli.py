@@ -163,7 +163,7 @@ def test_import_makes_a_capture_that_can_be_pushed(service, tmp_path):
             client.delete_scene(status.id)
     broken = scas4d("push", str(studio), "--pictures", "videos")
     assert broken.returncode == 1
-    assert "put each camera's video in videos/<camera>.mp4" in broken.stderr
+    assert "its video in videos/<camera>.mp4" in broken.stderr
 
 
 def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path):
