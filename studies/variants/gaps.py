@@ -24,8 +24,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.metrics.evaluation import Scores, measure_pictures, measure_tracks
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from server.keep_up import with_fewer_iterations
-from server.settings import ServerSettings
+from server.keep_up import frame_to_skip, with_fewer_iterations
 
 TARGET_DB = -0.7
 """Target: smallest mean difference from the run without gaps, in dB."""
@@ -81,15 +80,15 @@ class Queue:
     >>> queue = Queue(9, 4)
     >>> queue.next(), queue.waiting
     (1, 0)
-    >>> queue.spend(5.0)  # frames 2, 3 and 4 wait; frame 5 finds the queue full; frame 6 waits behind it
+    >>> queue.spend(5.0)  # frames 2, 3 and 4 wait; frames 5 and 6 find the queue full, and replace 2 and 4
     >>> queue.next(), queue.waiting
-    (5, 1)
+    (3, 2)
     """
 
-    def __init__(self, count: int, length: int = ServerSettings().queue_frames) -> None:
+    def __init__(self, count: int, length: int) -> None:
         self._count, self._length = count, length
         self._waiting: list[int] = []
-        self._now, self._arrived = 1.0, 0
+        self._now, self._arrived, self._current = 1.0, 0, 0
 
     @property
     def waiting(self) -> int:
@@ -102,7 +101,10 @@ class Queue:
         if not self._waiting and self._arrived + 1 < self._count:
             self._now = self._arrived + 1
             self._arrive(busy=0)
-        return self._waiting.pop(0) if self._waiting else None
+        if not self._waiting:
+            return None
+        self._current = self._waiting.pop(0)
+        return self._current
 
     def spend(self, intervals: float) -> None:
         """Advances the clock by the duration of an update."""
@@ -113,11 +115,13 @@ class Queue:
         while self._arrived + 1 < min(self._count, self._now + 1e-9):
             self._arrived += 1
             if len(self._waiting) + busy >= self._length:
-                self._waiting.clear()
+                self._waiting.remove(frame_to_skip(self._current, self._waiting, self._arrived))
             self._waiting.append(self._arrived)
 
 
-def measure(given: Capture, truth: Capture, settings: Settings, frames: int | None, step: int) -> GapResult:
+def measure(
+    given: Capture, truth: Capture, settings: Settings, frames: int | None, step: int, queue_frames: int
+) -> GapResult:
     """Runs the comparison on one capture.
 
     Args:
@@ -126,6 +130,7 @@ def measure(given: Capture, truth: Capture, settings: Settings, frames: int | No
         settings: settings of the reconstruction.
         frames: number of frames of the capture to use; None for all.
         step: number of frames that arrive during an update.
+        queue_frames: maximum number of unfinished frames.
     """
     count = min(frames or given.frame_count, given.frame_count)
     usual = settings.update.iterations
@@ -146,7 +151,7 @@ def measure(given: Capture, truth: Capture, settings: Settings, frames: int | No
         scores: Scores = {} if truth.ground_truth is None else measure_tracks(scene, truth, [0, *psnr])
         return GapRun(name, psnr, scores.get("parts_lost"), scores.get("track_3d_median"))
 
-    queue = Queue(count)
+    queue = Queue(count, queue_frames)
 
     def shortened() -> int:
         return with_fewer_iterations(Budget(), queue.waiting, usual).iterations or usual
@@ -190,10 +195,16 @@ def _number(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
 
 
-def run(jobs: Sequence[tuple[Capture, Capture, Settings]], frames: int | None, step: int, report: Report) -> str:
+def run(
+    jobs: Sequence[tuple[Capture, Capture, Settings]],
+    frames: int | None,
+    step: int,
+    queue_frames: int,
+    report: Report,
+) -> str:
     """Measures captures one after another, and returns the table."""
     results = []
     for given, truth, settings in jobs:
-        results.append(measure(given, truth, settings, frames, step))
+        results.append(measure(given, truth, settings, frames, step, queue_frames))
         report(page(results[-1:], step))
     return page(results, step)
