@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from client.wire import Budget
 
 SHARE = 0.9
@@ -56,24 +54,3 @@ def with_fewer_iterations(budget: Budget, waiting: int, iterations: int) -> Budg
     if waiting == 0 or any(limit is not None for limit in (budget.iterations, budget.budget_ms, budget.keep_up_fps)):
         return budget
     return budget.model_copy(update={"iterations": max(1, iterations // min(1 + waiting, SHORTEST))})
-
-
-def frame_to_skip(before: int, waiting: Sequence[int], newest: int) -> int:
-    """Returns the waiting frame to skip when the queue is full: the one that leaves the shortest gap.
-
-    Updates follow motion best over short gaps, so the remaining frames are spaced evenly. Of several such frames, the
-    oldest is skipped.
-
-    Args:
-        before: frame that is updated before the waiting ones.
-        waiting: waiting frames that may be skipped, in ascending order; at least one.
-        newest: frame that has arrived; always kept.
-
-    Example:
-        >>> frame_to_skip(0, [1, 2, 3], 4)
-        1
-        >>> frame_to_skip(0, [2, 3, 4], 5)
-        3
-    """
-    ends = [before, *waiting, newest]
-    return waiting[min(range(len(waiting)), key=lambda place: ends[place + 2] - ends[place])]

@@ -88,7 +88,7 @@ def push(
     ] = 1,
     when_full: Annotated[
         WhenFull,
-        typer.Option(help="refuse: wait while the queue is full; skip: replace a queued frame with the newest."),
+        typer.Option(help="refuse: wait while the queue is full; skip: replace the queued frames with the newest."),
     ] = WhenFull.REFUSE,
     outage: Annotated[
         float, typer.Option(min=0, help="Seconds to keep retrying while the service is unreachable.")

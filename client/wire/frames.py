@@ -218,7 +218,7 @@ class FrameReportModel(Model):
         description=(
             "open: cameras are still sending. queued: stored on disk, waiting. updating: being "
             "reconstructed. committed: its state can be read. failed: could not be reconstructed, see "
-            "`error`. missing: declared missing. skipped: dropped in favour of a newer frame, "
+            "`error`. missing: declared missing. skipped: dropped in favour of the newest frame, "
             "because the queue was full."
         )
     )

@@ -86,7 +86,7 @@ class IngestSettings(Model):
     when_full: Literal["refuse", "skip"] = Field(
         default="refuse",
         description=(
-            "refuse: respond with 429 and Retry-After. skip: accept the new frame and skip a queued one. To avoid "
+            "refuse: respond with 429 and Retry-After. skip: accept the new frame and skip the queued ones. To avoid "
             "this, updates run as few as a third of the iterations while frames wait, unless the scene has a budget."
         ),
     )

@@ -12,7 +12,6 @@ from client.wire import FrameHead, FrameReceipt, FrameState, SceneCreate, SceneS
 from scas4d_core.cameras import Rig
 from server import counters
 from server.hub import Publisher
-from server.keep_up import frame_to_skip
 from server.problems import Problem, count_noun
 from server.settings import ServerSettings
 from server.storage.events import FrameAccepted, FramesSkipped, Hashes
@@ -52,7 +51,7 @@ class IngestRules:
         rig: the scene's rig.
         frames_per_second: frame rate used to compute the time of a frame if the client does not send it.
         queue_frames: maximum number of acknowledged but unfinished frames.
-        when_full: whether a full queue refuses the next frame or skips a waiting one.
+        when_full: whether a full queue refuses the next frame or skips the waiting frames.
         minimum_cameras: minimum number of cameras per frame.
         open_frame_seconds: seconds from the first upload until a frame sent camera by camera is closed; None for no
             deadline.
@@ -198,7 +197,7 @@ class Ingest:
         return receipt
 
     async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
-        """Journals a frame and the frame skipped to make room for it; the caller must hold the log's lock.
+        """Journals a frame and any frames skipped to make room for it; the caller must hold the log's lock.
 
         Raises:
             Problem: 507 if the disk is full.
@@ -313,7 +312,7 @@ class Ingest:
             )
 
     def has_room(self) -> bool:
-        """Returns whether the queue accepts another frame, skipping another one if necessary."""
+        """Returns whether the queue accepts another frame, skipping others if necessary."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return True
         return self.rules.when_full == "skip" and bool(self._skippable())
@@ -342,13 +341,10 @@ class Ingest:
         )
 
     def _skip_event(self, index: int) -> list[FramesSkipped]:
-        """Returns the event that skips a waiting frame in favour of frame `index`, or none if the queue has room."""
+        """Returns the event that skips waiting frames in favour of frame `index`, or none if the queue has room."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return []
-        waiting, states = self._skippable(), (FrameState.COMMITTED, FrameState.UPDATING, FrameState.QUEUED)
-        earlier = range(waiting[0] - 1, -1, -1)
-        before = next((other for other in earlier if self.ledger.frames[other].state in states), waiting[0] - 1)
-        return [FramesSkipped(frames=(frame_to_skip(before, waiting, index),), by=index)]
+        return [FramesSkipped(frames=self._skippable(), by=index)]
 
     def _skippable(self) -> tuple[int, ...]:
         """Returns the waiting frames, except the first frame of a reconstruction if it was requested explicitly."""

@@ -24,7 +24,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.metrics.evaluation import Scores, measure_pictures, measure_tracks
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from server.keep_up import frame_to_skip, with_fewer_iterations
+from server.keep_up import with_fewer_iterations
 
 TARGET_DB = -0.7
 """Target: smallest mean difference from the run without gaps, in dB."""
@@ -80,15 +80,15 @@ class Queue:
     >>> queue = Queue(9, 4)
     >>> queue.next(), queue.waiting
     (1, 0)
-    >>> queue.spend(5.0)  # frames 2, 3 and 4 wait; frames 5 and 6 find the queue full, and replace 2 and 4
+    >>> queue.spend(5.0)  # frames 2, 3 and 4 wait; frame 5 finds the queue full; frame 6 waits behind it
     >>> queue.next(), queue.waiting
-    (3, 2)
+    (5, 1)
     """
 
     def __init__(self, count: int, length: int) -> None:
         self._count, self._length = count, length
         self._waiting: list[int] = []
-        self._now, self._arrived, self._current = 1.0, 0, 0
+        self._now, self._arrived = 1.0, 0
 
     @property
     def waiting(self) -> int:
@@ -101,10 +101,7 @@ class Queue:
         if not self._waiting and self._arrived + 1 < self._count:
             self._now = self._arrived + 1
             self._arrive(busy=0)
-        if not self._waiting:
-            return None
-        self._current = self._waiting.pop(0)
-        return self._current
+        return self._waiting.pop(0) if self._waiting else None
 
     def spend(self, intervals: float) -> None:
         """Advances the clock by the duration of an update."""
@@ -115,7 +112,7 @@ class Queue:
         while self._arrived + 1 < min(self._count, self._now + 1e-9):
             self._arrived += 1
             if len(self._waiting) + busy >= self._length:
-                self._waiting.remove(frame_to_skip(self._current, self._waiting, self._arrived))
+                self._waiting.clear()
             self._waiting.append(self._arrived)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import fakes
 import httpx
 import pytest
@@ -13,7 +11,7 @@ from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import FRAME_MEDIA_TYPE, Budget
-from server.keep_up import SHORTEST, frame_to_skip, with_fewer_iterations, with_time_limit
+from server.keep_up import SHORTEST, with_fewer_iterations, with_time_limit
 
 
 def test_the_limit_follows_the_rate_and_the_queue():
@@ -30,16 +28,6 @@ def test_updates_are_shortened_to_a_third_and_only_while_frames_wait():
     assert with_fewer_iterations(Budget(), 9, 2).iterations == 1
     for own in (Budget(iterations=30), Budget(budget_ms=70.0), Budget(keep_up_fps=25.0)):
         assert with_fewer_iterations(own, 5, 100) == own
-
-
-def test_skipping_spaces_the_waiting_frames_evenly():
-    waiting = [1, 2, 3]
-    for newest in range(4, 13):
-        waiting.remove(frame_to_skip(0, waiting, newest))
-        waiting.append(newest)
-    assert waiting[-1] == 12
-    assert max(after - before for before, after in pairwise([0, *waiting])) <= 5
-    assert frame_to_skip(5, [8], 9) == 8
 
 
 @pytest.fixture
