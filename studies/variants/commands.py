@@ -74,6 +74,7 @@ def gaps(
     captures: Captures,
     options: CaptureOptions,
     step: Annotated[int, typer.Option(min=2, help="Update only every this many frames.")] = 3,
+    queue: Annotated[int, typer.Option(min=1, help="Maximum number of unfinished frames.")] = 4,
     frames: Annotated[int | None, typer.Option(min=4, help="Maximum number of frames of each capture.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of frame 0 and the updates.")] = 0,
     page: Page = None,
@@ -90,6 +91,6 @@ def gaps(
     settings = settings_of("scas4d", None, seed, changes or ())
     scale = settings.scene.image_scale
     jobs = [(options.open(path), open_measured(path, options, image_scale=scale), settings) for path in captures]
-    text = run(jobs, frames, step, typer.echo)
+    text = run(jobs, frames, step, queue, typer.echo)
     typer.echo(text)
     write_page(page, text)

@@ -25,7 +25,6 @@ from scas4d_core.metrics.evaluation import Scores, measure_pictures, measure_tra
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from server.keep_up import with_fewer_iterations
-from server.settings import ServerSettings
 
 TARGET_DB = -0.7
 """Target: smallest mean difference from the run without gaps, in dB."""
@@ -86,7 +85,7 @@ class Queue:
     (5, 1)
     """
 
-    def __init__(self, count: int, length: int = ServerSettings().queue_frames) -> None:
+    def __init__(self, count: int, length: int) -> None:
         self._count, self._length = count, length
         self._waiting: list[int] = []
         self._now, self._arrived = 1.0, 0
@@ -117,7 +116,9 @@ class Queue:
             self._waiting.append(self._arrived)
 
 
-def measure(given: Capture, truth: Capture, settings: Settings, frames: int | None, step: int) -> GapResult:
+def measure(
+    given: Capture, truth: Capture, settings: Settings, frames: int | None, step: int, queue_frames: int
+) -> GapResult:
     """Runs the comparison on one capture.
 
     Args:
@@ -126,6 +127,7 @@ def measure(given: Capture, truth: Capture, settings: Settings, frames: int | No
         settings: settings of the reconstruction.
         frames: number of frames of the capture to use; None for all.
         step: number of frames that arrive during an update.
+        queue_frames: maximum number of unfinished frames.
     """
     count = min(frames or given.frame_count, given.frame_count)
     usual = settings.update.iterations
@@ -146,7 +148,7 @@ def measure(given: Capture, truth: Capture, settings: Settings, frames: int | No
         scores: Scores = {} if truth.ground_truth is None else measure_tracks(scene, truth, [0, *psnr])
         return GapRun(name, psnr, scores.get("parts_lost"), scores.get("track_3d_median"))
 
-    queue = Queue(count)
+    queue = Queue(count, queue_frames)
 
     def shortened() -> int:
         return with_fewer_iterations(Budget(), queue.waiting, usual).iterations or usual
@@ -190,10 +192,16 @@ def _number(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
 
 
-def run(jobs: Sequence[tuple[Capture, Capture, Settings]], frames: int | None, step: int, report: Report) -> str:
+def run(
+    jobs: Sequence[tuple[Capture, Capture, Settings]],
+    frames: int | None,
+    step: int,
+    queue_frames: int,
+    report: Report,
+) -> str:
     """Measures captures one after another, and returns the table."""
     results = []
     for given, truth, settings in jobs:
-        results.append(measure(given, truth, settings, frames, step))
+        results.append(measure(given, truth, settings, frames, step, queue_frames))
         report(page(results[-1:], step))
     return page(results, step)

@@ -19,7 +19,7 @@ CHANGES = ("scene.image_scale=0.125", "static.iterations=100", "static.max_gauss
 def test_every_run_is_compared_on_the_frames_that_it_commits():
     capture, settings = open_measured(SAMPLE), settings_of("scas4d", changes=CHANGES)
     truth = open_measured(SAMPLE, image_scale=settings.scene.image_scale)
-    result = measure(capture, truth, settings, frames=6, step=2)
+    result = measure(capture, truth, settings, frames=6, step=2, queue_frames=4)
     gaps, shorter, policy = result.runs
     assert list(result.full.psnr) == list(shorter.psnr) == [1, 2, 3, 4, 5]
     assert list(gaps.psnr) == [2, 4]
@@ -29,7 +29,7 @@ def test_every_run_is_compared_on_the_frames_that_it_commits():
 
 @pytest.mark.parametrize("intervals", [0.5, 1.0])
 def test_a_scene_that_keeps_up_skips_nothing(intervals):
-    queue, committed = Queue(9), []
+    queue, committed = Queue(9, length=4), []
     while (index := queue.next()) is not None:
         assert queue.waiting == 0
         committed.append(index)
