@@ -95,7 +95,7 @@ class Calibration:
 
 def natural(text: str) -> list[tuple[int, int, str]]:
     """Returns a sort key for natural order, in which cam2 precedes cam10."""
-    parts = re.split(r"(\d+)", text)
+    parts = re.split(r"(\d{1,4000})", text)  # int() rejects more than 4300 digits
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts if part]
 
 

@@ -607,3 +607,9 @@ def test_an_image_name_that_is_too_long_is_not_found(tmp_path):
     assert read_calibration(tmp_path).names == NAMES  # the size is that of another image of the folder
     with pytest.raises(CaptureError, match="no such file, although"):
         open_source(tmp_path, pictures="named")
+
+
+def test_an_image_name_of_thousands_of_digits_is_a_name(tmp_path):
+    opensfm("brown")(tmp_path)
+    change(tmp_path / "reconstruction.json", '"cam1.jpg"', f'"{"9" * 5000}.jpg"')
+    assert read_calibration(tmp_path).label("9" * 60) == "9" * 5000
