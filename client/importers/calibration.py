@@ -95,8 +95,13 @@ class Calibration:
 
 def natural(text: str) -> list[tuple[int, int, str]]:
     """Returns a sort key for natural order, in which cam2 precedes cam10."""
-    parts = re.split(r"(\d+)", text)
+    parts = re.split(r"(\d{1,4000})", text)  # int() rejects more than 4300 digits
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts if part]
+
+
+def composed(name: str) -> str:
+    """Returns a name with composed accents. macOS stores file names with separate accents."""
+    return unicodedata.normalize("NFC", name)
 
 
 def listed(names: Sequence[str]) -> str:
@@ -123,8 +128,8 @@ def calibration(
     """Builds a calibration by grouping images by camera.
 
     A camera is named after the folder of its images or, if all images are in one folder, after its image file, without
-    the number at its end if the images have different times. If
-    cameras named after folders would move, and each folder has an image of every camera, each folder is a frame.
+    the number at its end if the images have different times. If cameras named after folders would move, and each folder
+    has an image of every camera, each folder is a frame.
 
     Args:
         source: file or folder from which the calibration was read.
@@ -184,7 +189,7 @@ def _by_label(
     """Returns the images of each camera in temporal order, keyed by the camera's name in the file."""
     by_label: dict[str, list[CalibratedImage]] = {}
     for view in views:
-        by_label.setdefault(unicodedata.normalize("NFC", label_of(view.path)), []).append(view)
+        by_label.setdefault(composed(label_of(view.path)), []).append(view)
     for of in by_label.values():
         of.sort(key=lambda view: (view.time is not None, view.time or 0.0, natural(str(view.path))))
     return {label: tuple(of) for label, of in by_label.items()}
@@ -242,14 +247,14 @@ def _named(
     why: str,
 ) -> Calibration:
     """Returns a calibration whose cameras have names that the service accepts, with remarks on what was changed."""
-    names = service_names(unicodedata.normalize("NFC", camera.name) for camera in cameras)
-    renamed = [replace(camera, name=names[unicodedata.normalize("NFC", camera.name)]) for camera in cameras]
+    names = service_names(composed(camera.name) for camera in cameras)
+    renamed = [replace(camera, name=names[composed(camera.name)]) for camera in cameras]
     ordered = tuple(sorted(renamed, key=lambda camera: natural(camera.name)))
     labels = {name: label for label, name in names.items() if name != label}
     changes = [f"{label!r} is now {name!r}" for name, label in labels.items()]
     remarks = [f"renamed cameras, because {NAMES}: {listed(changes)}"] if changes else []
     remarks += [f"{why}: {listed(left_out)}"] if left_out else []
-    by_name = {names[unicodedata.normalize("NFC", label)]: of for label, of in views.items()}
+    by_name = {names[composed(label)]: of for label, of in views.items()}
     return Calibration(source, ordered, by_name, remarks=tuple(remarks), left_out=tuple(left_out), labels=labels)
 
 

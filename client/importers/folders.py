@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from client.importers.calibration import Calibration, listed, natural, stem
+from client.importers.calibration import Calibration, composed, listed, natural, stem
 from client.importers.pictures import READ
 from client.importers.video.reader import Video
 from client.importers.videos import ENDS
@@ -45,7 +44,7 @@ class PictureSource:
 
     def find(self, *names: str) -> str | None:
         """Returns the name on disk of a camera with one of several names, or None."""
-        for name in map(_normal, names):
+        for name in map(composed, names):
             for prefix in ("", *PANOPTIC):
                 if prefix + name in self.entries:
                     return prefix + name
@@ -62,7 +61,7 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
     for place in IMAGES:
         root, own = capture / place, place != "."
         folders = {
-            _normal(path.name): path
+            composed(path.name): path
             for path in sorted(root.iterdir() if root.is_dir() else (), key=lambda path: natural(path.name))
             if path.is_dir() and not path.name.startswith(".") and (own or path.name not in NOT_CAMERAS)
         }
@@ -71,13 +70,13 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
             yield PictureSource("images", root, {name: [folders[name]] for name in (folders if own else pictured)}, own)
         if pictured:
             first = pictures_in(folders[pictured[0]])
-            yield PictureSource("frames", root, {_normal(stem(_pure(path))): [path] for path in first}, own)
+            yield PictureSource("frames", root, {composed(stem(_pure(path))): [path] for path in first}, own)
     for place in VIDEOS:
         root = capture / place
         videos: dict[str, list[Path]] = {}
         for path in sorted(root.iterdir() if root.is_dir() else ()):
             if path.suffix.lower() in ENDS and path.is_file() and not path.name.startswith("."):
-                videos.setdefault(_normal(path.stem), []).append(path)
+                videos.setdefault(composed(path.stem), []).append(path)
         if videos:
             yield PictureSource("videos", root, videos, own=True)
 
@@ -178,7 +177,7 @@ def size_of_pictures(capture: Path, camera: str, where: str) -> tuple[int, int]:
             return image_size(files[0])
     for place in IMAGES:
         for path in pictures_in(capture / place):
-            if _normal(path.stem) == _normal(camera):
+            if composed(path.stem) == composed(camera):
                 return image_size(path)
     raise CaptureError(
         f"{where} has no image size, and {capture} contains no images or video of the camera to read it from; put them "
@@ -196,11 +195,6 @@ def image_size(path: Path) -> tuple[int, int]:
         return picture_size(path)
     except ImageError as fault:
         raise CaptureError(str(fault)) from fault
-
-
-def _normal(name: str) -> str:
-    """Returns a name with composed accents. macOS stores file names with separate accents."""
-    return unicodedata.normalize("NFC", name)
 
 
 def _pure(path: Path) -> PurePosixPath:

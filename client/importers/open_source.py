@@ -170,7 +170,7 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
     files = {camera: source.entries[name] for camera, name in on_disk.items()}
     if source.kind == "images":
         folders = {camera: paths[0] for camera, paths in files.items()}
-        return calibration, PictureFiles(calibration, frames_of_cameras(source.root, folders))
+        return calibration, PictureFiles(calibration, frames_of_cameras(folders))
     for paths in files.values():
         if len(paths) > 1:
             raise CaptureError(

@@ -6,11 +6,11 @@ name, but may have different extensions, and may start with the name of their ca
 
 from __future__ import annotations
 
-import unicodedata
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from client.importers.calibration import PICTURE_SUFFIXES, Calibration, listed, natural
+from client.importers.calibration import PICTURE_SUFFIXES, Calibration, composed, listed, natural
 from client.importers.source import Picture
 from scas4d_core.captures import CaptureError, ImageError, decode_image
 from scas4d_core.captures.images import describe_pictures, picture_size
@@ -89,11 +89,10 @@ class PictureFiles:
                 )
 
 
-def frames_of_cameras(root: Path, folders: Mapping[str, Path], *, what: str = "images") -> dict[str, dict[str, Path]]:
+def frames_of_cameras(folders: Mapping[str, Path], *, what: str = "images") -> dict[str, dict[str, Path]]:
     """Returns the files in one folder per camera, keyed by the name of the frame and by camera name.
 
     Args:
-        root: folder that contains the folders.
         folders: folder of each camera, keyed by camera name.
         what: kind of the files, for messages.
 
@@ -140,7 +139,7 @@ def frame_folders(root: Path, stems: Mapping[str, str]) -> dict[str, dict[str, P
     """Returns the images of the given cameras in each folder that contains any, in natural order of the folders."""
     frames = {}
     for folder in sorted((path for path in root.iterdir() if path.is_dir()), key=lambda path: natural(path.name)):
-        files = {_normal(path.stem): path for path in _pictures_in(folder).values()}
+        files = {composed(path.stem): path for path in _pictures_in(folder).values()}
         there = {camera: files[name] for camera, name in stems.items() if name in files}
         if there:
             frames[folder.name] = there
@@ -153,7 +152,7 @@ def masks_of(root: Path, calibration: Calibration) -> dict[str, dict[str, Path]]
     Raises:
         CaptureError: if a camera has no folder, or a frame is missing from some of the folders.
     """
-    there = {_normal(path.name): path for path in sorted(root.iterdir()) if path.is_dir()}
+    there = {composed(path.name): path for path in sorted(root.iterdir()) if path.is_dir()}
     folders = {}
     for camera in calibration.names:
         folder = there.get(calibration.label(camera), there.get(camera))
@@ -163,7 +162,7 @@ def masks_of(root: Path, calibration: Calibration) -> dict[str, dict[str, Path]]
                 f"{listed(sorted(there, key=natural)) or 'no folders'}; add masks of every camera, or use --no-masks"
             )
         folders[camera] = folder
-    return frames_of_cameras(root, folders, what="masks")
+    return frames_of_cameras(folders, what="masks")
 
 
 def _pictures_in(folder: Path) -> dict[str, Path]:
@@ -259,13 +258,10 @@ def find_picture(folder: Path, source: Path, name: str) -> Path | None:
         for root in (folder, folder / "images", here, here / "images"):
             for suffix in added:
                 file = root / f"{end}{suffix}"
-                if file.is_file() and file.resolve().is_relative_to(folder.resolve()):
+                # Unlike Path.is_file, os.path.isfile returns False for names that are too long.
+                if os.path.isfile(file) and file.resolve().is_relative_to(folder.resolve()):
                     return file
     return None
-
-
-def _normal(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
 
 
 def _some(names: Sequence[str]) -> str:

@@ -42,7 +42,7 @@ def read_json_value(path: Path) -> Any:
     """
     try:
         return json.loads(read_text(path))
-    except (json.JSONDecodeError, RecursionError) as fault:
+    except (ValueError, RecursionError) as fault:  # numbers of thousands of digits are a ValueError
         raise CaptureError(f"{path} is not valid JSON ({fault})") from fault
 
 

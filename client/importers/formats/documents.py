@@ -100,7 +100,7 @@ def read_xml(path: Path) -> ElementTree.Element:
     parser.StartDoctypeDeclHandler = declared
     try:
         parser.Parse(path.read_bytes().removeprefix(codecs.BOM_UTF8), True)
-    except (OSError, expat.ExpatError, LookupError) as fault:
+    except (OSError, expat.ExpatError, LookupError, ValueError) as fault:  # of encodings that expat does not support
         raise CaptureError(f"{path} cannot be read as XML ({fault}); export the calibration again") from fault
     return builder.close()
 
@@ -122,11 +122,23 @@ def number(where: str, given: Mapping[str, Any], key: str, default: float | None
         return default
     try:
         parsed = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         parsed = math.nan
     if not math.isfinite(parsed):
-        raise CaptureError(f"{where}: {key} must be a finite number; got {'nothing' if value is None else repr(value)}")
+        raise CaptureError(f"{where}: {key} must be a finite number; got {short(value)}")
     return parsed
+
+
+def positive(where: str, given: Mapping[str, Any], key: str, default: float | None = None) -> float:
+    """Returns a finite number above 0, as `number` does.
+
+    Raises:
+        CaptureError: if the field is missing or is not such a number.
+    """
+    value = number(where, given, key, default)
+    if value <= 0:
+        raise CaptureError(f"{where}: {key} must be positive; got {value:g}")
+    return value
 
 
 def whole(where: str, given: Mapping[str, Any], key: str, most: int = 1 << 16) -> int:
@@ -139,6 +151,12 @@ def whole(where: str, given: Mapping[str, Any], key: str, most: int = 1 << 16) -
     if value != round(value) or not 1 <= value <= most:
         raise CaptureError(f"{where}: {key} must be a whole number from 1 to {most}; got {value:g}")
     return int(value)
+
+
+def short(given: Any) -> str:
+    """Returns a value for a message, at most 80 characters of it."""
+    text = "nothing" if given is None else repr(given)
+    return text if len(text) <= 80 else f"{text[:79]}…"
 
 
 def table(where: str, given: Any, what: str) -> Mapping[str, Any]:

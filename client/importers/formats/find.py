@@ -75,7 +75,7 @@ def _is_metashape_file(path: Path) -> bool:
 def _read_toml(path: Path, _: Path) -> Calibration:
     try:
         document: dict[str, Any] = tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as fault:
+    except (ValueError, RecursionError) as fault:  # numbers of thousands of digits are a ValueError
         raise CaptureError(f"{path} cannot be read as TOML: {fault}") from fault
     if is_caliscope(document):
         return read_caliscope(path, document)

@@ -27,6 +27,8 @@ DISTORTIONS = ("radtan", "equidistant", "none")
 
 def is_kalibr(path: Path) -> bool:
     """Returns whether a YAML file has a field that only Kalibr uses. The file is not parsed."""
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        return False
     try:
         with path.open("rb") as file:
             text = file.read(1 << 16)

@@ -45,7 +45,8 @@ def read_llff(path: Path, capture: Path) -> Calibration:
     counts = []
     for source in picture_sources(capture):
         if len(source.entries) == len(rows):
-            return _of_names(path, rows, list(source.entries))
+            names = sorted(source.entries, key=lambda name: source.entries[name][0].name)
+            return _of_names(path, rows, names)
         counts.append(f"{len(source.entries)} {source.kind} in {source.root}")
     for place in IMAGES:
         pictures = pictures_in(capture / place)
@@ -66,18 +67,17 @@ def read_llff(path: Path, capture: Path) -> Calibration:
 
 
 def _of_names(path: Path, rows: NDArray[np.float64], names: list[str]) -> Calibration:
-    ordered = sorted(names)
-    cameras = [_camera(path, row, index, name) for index, (row, name) in enumerate(zip(rows, ordered, strict=True))]
-    remark = f"{path.name}: its rows are assigned to the cameras in alphabetical order: {listed(ordered)}"
-    return calibration_of_cameras(path, cameras, remarks=[remark] if ordered != sorted(names, key=natural) else [])
+    cameras = [_camera(path, row, index, name) for index, (row, name) in enumerate(zip(rows, names, strict=True))]
+    remark = f"{path.name}: its rows are assigned to the cameras in alphabetical order: {listed(names)}"
+    return calibration_of_cameras(path, cameras, remarks=[remark] if names != sorted(names, key=natural) else [])
 
 
 def _rows(path: Path) -> NDArray[np.float64]:
     try:
         with path.open("rb") as file:
             rows = np.asarray(np.load(file, allow_pickle=False), np.float64)
-    except (OSError, ValueError, EOFError) as fault:
-        raise CaptureError(f"{path} cannot be read as a NumPy array of numbers: {fault}") from fault
+    except Exception as fault:  # NumPy raises different exceptions, such as MemoryError for a damaged shape
+        raise CaptureError(f"{path} cannot be read as a NumPy array of numbers: {fault}; copy it again") from fault
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or not len(rows):
         raise CaptureError(f"{path} must be an array [cameras, {COLUMNS}]; got shape {list(rows.shape)}")
     return rows

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.importers.calibration import CalibratedImage, Calibration, calibration
-from client.importers.formats.documents import number, table, whole
+from client.importers.formats.documents import number, positive, short, table, whole
 from client.importers.formats.opencv_camera import HALF, numbers
 from client.importers.lens import FISHEYE, LensCamera, lens_camera
 from scas4d_core.captures import CaptureError, InitialPoints
@@ -96,9 +96,9 @@ def _lens(
 ) -> LensCamera:
     kind = lens.get("type")
     kind = lens.get("distortionType", kind) if kind == "pinhole" else kind
-    if kind not in DISTORTIONS or lens.get("undistortionType", "none") != "none":
+    if not isinstance(kind, str) or kind not in DISTORTIONS or lens.get("undistortionType", "none") != "none":
         raise CaptureError(
-            f"{where}: unsupported distortion {kind!r} (or an undistortion); calibrate with one of "
+            f"{where}: unsupported distortion {short(kind)} (or an undistortion); calibrate with one of "
             f"{', '.join(DISTORTIONS)}"
         )
     model, order = DISTORTIONS[kind]
@@ -120,8 +120,8 @@ def _focal(where: str, lens: Mapping[str, Any], width: int, version: tuple[int, 
     if version < (1, 2, 2):
         fx, fy = numbers(where, "pxFocalLength", lens.get("pxFocalLength"), (2,))
         return float(fx), float(fy)
-    fx = number(where, lens, "focalLength") / number(where, lens, "sensorWidth", 36.0) * width
-    ratio = number(where, lens, "pixelRatio", 1.0)
+    fx = number(where, lens, "focalLength") / positive(where, lens, "sensorWidth", 36.0) * width
+    ratio = positive(where, lens, "pixelRatio", 1.0)
     return fx, fx / ratio if version < (1, 2, 5) else fx * ratio
 
 

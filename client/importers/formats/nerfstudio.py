@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from client.importers.calibration import CalibratedImage, Calibration, calibration, listed, stem
 from client.importers.folders import image_size, size_of_pictures
-from client.importers.formats.documents import json_value, number, whole
+from client.importers.formats.documents import json_value, number, positive, whole
 from client.importers.lens import MODELS, lens_camera
 from client.importers.pictures import find_picture
 from scas4d_core.captures import CaptureError
@@ -54,7 +54,10 @@ def is_transforms(path: Path) -> bool:
     """Returns whether a file is named like a `transforms.json`, or is a JSON file that lists frames."""
     if path.suffix.lower() != ".json":
         return False
-    return path.name.startswith("transforms") or "frames" in (json_value(path) or ())
+    if path.name.startswith("transforms"):
+        return True
+    document = json_value(path)
+    return isinstance(document, dict) and "frames" in document
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,7 @@ def read_transforms(paths: Sequence[Path], capture: Path) -> Calibration:
         if path == paths[0]:
             training = [*(view.path for view in views.values()), *unposed]
         if fps is None and "fps" in file.meta:
-            fps = number(str(path), file.meta, "fps")
-            if fps <= 0:
-                raise CaptureError(f"{path}: fps must be positive; got {fps:g}")
+            fps = positive(str(path), file.meta, "fps")
     found = calibration(paths[0], list(views.values()), fps=fps, unposed=unposed, training=training)
     remarks = [f"read {', '.join(path.name for path in paths)}"] if len(paths) > 1 else []
     if found.test:
@@ -110,7 +111,7 @@ def _open(path: Path, capture: Path) -> _File:
         raise CaptureError(
             f"{path} has no frames; `frames` must list entries with file_path and transform_matrix, one per camera"
         )
-    return _File(path, capture, meta, _undo_world(path, meta), number(str(path), meta, "applied_scale", 1.0))
+    return _File(path, capture, meta, _undo_world(path, meta), positive(str(path), meta, "applied_scale", 1.0))
 
 
 def _view(file: _File, where: str, frame: Any) -> CalibratedImage | PurePosixPath:
@@ -176,8 +177,6 @@ def _default_model(given: Mapping[str, Any]) -> str:
 
 
 def _undo_world(path: Path, meta: Mapping[str, Any]) -> Float:
-    if number(str(path), meta, "applied_scale", 1.0) <= 0:
-        raise CaptureError(f"{path}: applied_scale must be positive; got {meta['applied_scale']!r}")
     if meta.get("applied_transform") is None:
         return np.eye(4)
     applied = _matrix(str(path), meta, "applied_transform")
@@ -190,10 +189,7 @@ def _undo_world(path: Path, meta: Mapping[str, Any]) -> Float:
 def _focal(where: str, given: Mapping[str, Any], axis: str, pixels: int) -> float | None:
     """Returns the focal length along an axis in pixels, or None if the file has none."""
     if given.get(f"fl_{axis}") is not None:
-        focal = _number(where, given, f"fl_{axis}")
-        if focal <= 0:
-            raise CaptureError(f"{where}: focal lengths must be positive, got fl_{axis} = {focal:g}")
-        return focal
+        return positive(where, given, f"fl_{axis}")
     for key, unit, name in ((f"camera_angle_{axis}", 1.0, "radians"), (f"{axis}_fov", math.pi / 180, "degrees")):
         if given.get(key) is not None:
             angle = _number(where, given, key)
@@ -206,7 +202,7 @@ def _focal(where: str, given: Mapping[str, Any], axis: str, pixels: int) -> floa
 def _matrix(where: str, given: Mapping[str, Any], key: str) -> Float:
     try:
         rows = np.array(given[key], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rows = np.empty(0)
     if rows.shape not in ((3, 4), (4, 4)) or not np.isfinite(rows).all():
         raise CaptureError(f"{where}: {key} must be a 4x4 or 3x4 matrix of finite numbers")

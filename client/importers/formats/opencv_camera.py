@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from client.importers.formats.documents import short
 from client.importers.lens import FISHEYE, PERSPECTIVE, LensCamera, lens_camera
 from scas4d_core.captures import CaptureError
 
@@ -126,15 +127,15 @@ def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
         CaptureError: if a value is not a finite number, or the number of values is not in `counts`.
     """
     try:
-        rows = given.tolist() if isinstance(given, np.ndarray) else given
+        rows = given.tolist() if isinstance(given, np.ndarray) else [] if isinstance(given, str) else given
         rows = [value for row in rows[:MOST] for value in (row[:MOST] if isinstance(row, list | tuple) else [row])]
         values = np.array([np.nan if isinstance(value, bool) else float(value) for value in rows], np.float64)
-    except (TypeError, ValueError, KeyError):
+    except (TypeError, ValueError, KeyError, OverflowError):
         values = np.empty(0)
         counts = [count for count in counts if count] or counts
     if values.size not in counts or not np.isfinite(values).all():
         listed = " or ".join(str(count) for count in counts if count or len(counts) == 1)
-        raise CaptureError(f"{where}: {field} must be {listed} finite numbers; got {_short(given)}")
+        raise CaptureError(f"{where}: {field} must be {listed} finite numbers; got {short(given)}")
     return values
 
 
@@ -146,10 +147,5 @@ def picture_size(where: str, given: Any) -> tuple[int, int]:
     """
     values = numbers(where, "size", given, (2,))
     if (values != np.round(values)).any() or values.min() < 1 or values.max() > LARGEST_SIDE:
-        raise CaptureError(f"{where}: size must be a width and height in whole pixels; got {_short(given)}")
+        raise CaptureError(f"{where}: size must be a width and height in whole pixels; got {short(given)}")
     return int(values[0]), int(values[1])
-
-
-def _short(given: Any) -> str:
-    text = "nothing" if given is None else repr(given)
-    return text if len(text) <= 80 else f"{text[:79]}…"

@@ -30,7 +30,10 @@ def read_storage(path: Path) -> dict[str, Any]:
     if path.suffix.lower() == JSON:
         document: Any = read_json(path)
     elif path.suffix.lower() == XML:
-        document = {child.tag: _element(child) for child in read_xml(path)}
+        try:
+            document = {child.tag: _element(child) for child in read_xml(path)}
+        except RecursionError as fault:
+            raise CaptureError(f"{path}: its elements are nested too deeply; export the calibration again") from fault
     else:
         document = read_yaml(path)
     if not isinstance(document, dict):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from client.importers.calibration import CalibratedImage, Calibration, calibration
-from client.importers.formats.documents import number, table, whole
+from client.importers.formats.documents import number, short, table, whole
 from client.importers.formats.opencv_camera import numbers, rodrigues
 from client.importers.lens import FISHEYE, LensCamera, lens_camera
 from scas4d_core.captures import CaptureError, InitialPoints
@@ -65,20 +65,21 @@ def read_opensfm(path: Path) -> Calibration:
 
 def _view(where: str, lenses: Mapping[str, Any], name: str, shot: Mapping[str, Any]) -> CalibratedImage:
     where = f"{where}: shot {name!r}"
-    if shot.get("camera") not in lenses:
-        raise CaptureError(f"{where}: camera {shot.get('camera')!r} is not in cameras")
+    camera = shot.get("camera")
+    if not isinstance(camera, str) or camera not in lenses:
+        raise CaptureError(f"{where}: camera {short(camera)} is not in cameras; export the reconstruction again")
     pose = np.eye(4)
     pose[:3, :3] = rodrigues(numbers(where, "rotation", shot.get("rotation"), (3,)))
     pose[:3, 3] = numbers(where, "translation", shot.get("translation"), (3,))
-    return CalibratedImage(PurePosixPath(name.replace("\\", "/")), _lens(where, name, lenses[shot["camera"]], pose))
+    return CalibratedImage(PurePosixPath(name.replace("\\", "/")), _lens(where, name, lenses[camera], pose))
 
 
 def _lens(where: str, name: str, given: Any, pose: Any) -> LensCamera:
     lens = table(where, given, "its camera")
     projection = lens.get("projection_type", "perspective")
-    if projection not in PROJECTIONS:
+    if not isinstance(projection, str) or projection not in PROJECTIONS:
         raise CaptureError(
-            f"{where}: unsupported projection_type {projection!r}; calibrate with one of {', '.join(PROJECTIONS)}"
+            f"{where}: unsupported projection_type {short(projection)}; calibrate with one of {', '.join(PROJECTIONS)}"
         )
     width, height = whole(where, lens, "width"), whole(where, lens, "height")
     side = max(width, height)

@@ -32,7 +32,8 @@ class VideoStream:
         self.path = path
         self._av = pyav()
         try:
-            self._container = self._av.open(str(path))
+            # In a relative path, FFmpeg takes what precedes a colon for a protocol.
+            self._container = self._av.open(str(path.absolute()))
         except self._av.FFmpegError as fault:
             raise unreadable(path, fault) from fault
         streams = [stream for stream in self._container.streams.video if not stream.disposition & ATTACHED_PICTURE]

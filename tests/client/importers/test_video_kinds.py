@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from films import FRAMES, SIZE, X265, barcode, check, encode, number
@@ -257,7 +261,22 @@ def test_the_index_is_made_once(tmp_path, monkeypatch, video_cache):
     (cached,) = video_cache.iterdir()
     cached.write_bytes(cached.read_bytes()[:100])
     assert len(Video(path)) == FRAMES
+    np.save(cached.with_suffix(".npy"), np.zeros(3))
+    cached.with_suffix(".npy").replace(cached)  # a NumPy file that is no archive
+    assert len(Video(path)) == FRAMES
     encode(path, "libx264", range(FRAMES + 5))
     assert len(Video(path)) == FRAMES + 5
     monkeypatch.setattr(video_index, "cache_folder", lambda: path / "no folder")
     assert len(Video(path)) == FRAMES + 5
+
+
+def test_a_colon_in_a_relative_path_is_no_protocol(tmp_path, monkeypatch):
+    encode(tmp_path / "day:1" / "a.mp4", "libx264")
+    monkeypatch.chdir(tmp_path)
+    assert number(Video(Path("day:1/a.mp4")).frame(3)) == 3
+
+
+def test_frames_without_a_timestamp_at_the_end_are_spaced_evenly():
+    stream = SimpleNamespace(average_rate=25, guessed_rate=25, time_base=Fraction(1, 100))
+    seconds, spaced, rate = video_index._times(np.array([0, 4, 8, video_index.NO_STAMP]), stream)
+    assert (seconds.tolist(), spaced, rate) == ([0, 1 / 25, 2 / 25, 3 / 25], True, 25)

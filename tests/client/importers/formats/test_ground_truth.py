@@ -395,6 +395,9 @@ def change(path, old, new):
 
 PANOPTIC = "calibration_160422_haggling1.json"
 METASHAPE, MESHROOM = ("metashape frame", "cameras.xml"), ("meshroom brown", "cameras.sfm")
+OPENSFM = ("opensfm fisheye", "reconstruction.json")
+SECOND = '"points": {}}, {"cameras": {"v2 x": {"projection_type": '
+HUGE = "1" + "0" * 400
 KALIBR = ("kalibr radtan", "camchain-rig.yaml")
 
 
@@ -422,7 +425,17 @@ KALIBR = ("kalibr radtan", "camchain-rig.yaml")
         ),
         (*MESHROOM, '"focalLength": "', '"focalLength": "x', "focalLength must be a finite number"),
         (*MESHROOM, "]}", "]", "cameras.sfm is not valid JSON"),
+        (*MESHROOM, '"sensorWidth": "36"', '"sensorWidth": "0"', "sensorWidth must be positive; got 0"),
+        (*MESHROOM, '"type": "brown"', '"type": ["brown"]', r"unsupported distortion \['brown'\]"),
+        ("meshroom (1, 2, 4)", "cameras.sfm", 'Ratio": "', 'Ratio": "-', "pixelRatio must be positive; got -"),
         ("opensfm brown", "reconstruction.json", '"projection_type": "brown"', '"projection_type": "dual"', None),
+        (*OPENSFM, f'{SECOND}"fisheye"', f"{SECOND}[]", r"unsupported projection_type \[\]"),
+        (*OPENSFM, f'{SECOND}"fisheye", "width": 320', f'{SECOND}"fisheye", "width": {HUGE}', "width must be a finite"),
+        (*OPENSFM, 'cam1.jpg": {"camera": "v2 x"', 'cam1.jpg": {"camera": ["v2 x"]', r"camera \['v2 x'\] is not in"),
+        (*OPENSFM, '"width": 320', f'"width": {HUGE * 20}', "is not valid JSON"),
+        ("panoptic", PANOPTIC, '"resolution": [320', f'"resolution": [{HUGE}', "size must be 2 finite numbers"),
+        ("panoptic", PANOPTIC, '"resolution": [320, 240]', '"resolution": "64"', "size must be 2 finite .*got '64'"),
+        ("instant-ngp", "transforms.json", '"transform_matrix": [[', f'"transform_matrix": [[{HUGE}, ', "4x4 or 3x4"),
         (*MESHROOM, '"brown"', '"3deradial4"', "unsupported distortion '3deradial4'"),
         (*MESHROOM, '"version": ["1"', '"version": ["x"', "version must be 3 finite numbers"),
         (*MESHROOM, '"intrinsicId": "7", "path"', '"intrinsicId": "8", "path"', "intrinsicId '8' is not"),
@@ -461,6 +474,26 @@ def test_rows_of_llff_must_be_as_many_as_cameras(tmp_path):
     (tmp_path / "poses_bounds.npy").write_bytes(b"no array")
     with pytest.raises(CaptureError, match="cannot be read as a NumPy array"):
         read_calibration(tmp_path)
+
+
+@pytest.mark.parametrize("shape", ["(10000000000000, 17)", "(3, 17"])
+def test_a_damaged_header_of_llff_is_named(tmp_path, shape):
+    llff(tmp_path)
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    (tmp_path / "poses_bounds.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00" + header.encode())
+    with pytest.raises(CaptureError, match="cannot be read as a NumPy array"):
+        read_calibration(tmp_path)
+
+
+def test_rows_of_llff_belong_to_sorted_file_names(tmp_path):
+    """Of `cam.mp4` and `cam-2.mp4`, the second comes first, unlike their names without extension."""
+    llff(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "other")
+    for name in ("cam.mp4", "cam-2.mp4", "dam.mp4"):
+        (tmp_path / name).write_bytes(b"")
+    by_name = {lens.name: lens.world_to_camera for lens in read_calibration(tmp_path).cameras}
+    for name, (rotation, _) in zip(("cam-2", "cam", "dam"), poses().values(), strict=True):
+        assert np.allclose(by_name[name][:3, :3], rotation)
 
 
 def test_rows_of_llff_belong_to_sorted_videos(tmp_path):
@@ -548,3 +581,35 @@ def test_of_several_reconstructions_the_largest_is_read_and_all_are_named(tmp_pa
         "cameras.xml: found 2 chunks or components (chunk 'rig', component 0 with 2 cameras, chunk 'rig', component 1 "
         "with 1 cameras); using chunk 'rig', component 0, the largest"
     )
+
+
+def test_unreadable_documents_are_named(tmp_path):
+    file = tmp_path / "cam0.xml"
+    file.write_text('<?xml version="1.0" encoding="gbk"?><document><chunk/></document>')
+    with pytest.raises(CaptureError, match=r"cam0.xml cannot be read as XML \(multi-byte encodings"):
+        read_calibration(tmp_path)
+    deep = 5000
+    file.write_text(f"<opencv_storage><K >{'<a>' * deep}{'</a>' * deep}</K></opencv_storage>")
+    with pytest.raises(CaptureError, match=r"cam0.xml: its elements are nested too deeply"):
+        read_calibration(tmp_path)
+    file.unlink()
+    (tmp_path / "calibration.toml").write_text(f"[a]\nmatrix = {'9' * 5000}\n")
+    with pytest.raises(CaptureError, match=r"calibration.toml cannot be read as TOML"):
+        read_calibration(tmp_path)
+    (tmp_path / "rig.json").write_text("5")
+    with pytest.raises(CaptureError, match=r"rig.json is no calibration in a known format"):
+        read_calibration(tmp_path, tmp_path / "rig.json")
+
+
+def test_an_image_name_that_is_too_long_is_not_found(tmp_path):
+    transforms_with_angle(tmp_path)
+    change(tmp_path / "transforms.json", "images/cam0/000000", f"images/cam0/{'x' * 5000}")
+    assert read_calibration(tmp_path).names == NAMES  # the size is that of another image of the folder
+    with pytest.raises(CaptureError, match="no such file, although"):
+        open_source(tmp_path, pictures="named")
+
+
+def test_an_image_name_of_thousands_of_digits_is_a_name(tmp_path):
+    opensfm("brown")(tmp_path)
+    change(tmp_path / "reconstruction.json", '"cam1.jpg"', f'"{"9" * 5000}.jpg"')
+    assert read_calibration(tmp_path).label("9" * 60) == "9" * 5000

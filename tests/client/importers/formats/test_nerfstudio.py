@@ -122,7 +122,7 @@ def change(document, path, value):
         (("frames", 1, "time"), "now", "time must be a finite number; got 'now'"),
         (("w",), None, "w must be a finite number; got nothing"),
         (("h",), 240.5, "h must be a whole number from 1 to 65536; got 240.5"),
-        (("fl_x",), -210, "focal lengths must be positive, got fl_x = -210"),
+        (("fl_x",), -210, "fl_x must be positive; got -210"),
         (("cx",), None, "missing cx"),
         (("cy",), "middle", "cy must be a finite number; got 'middle'"),
         (("k1",), "much", "k1 must be a finite number; got 'much'"),
