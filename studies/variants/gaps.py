@@ -151,11 +151,12 @@ def measure(given: Capture, truth: Capture, settings: Settings, frames: int | No
     def shortened() -> int:
         return with_fewer_iterations(Budget(), queue.waiting, usual).iterations or usual
 
-    first = [True]
+    warm = False
 
     def spend(iterations: int) -> None:
-        queue.spend(0 if first.pop() else step * iterations / usual)
-        first.append(False)
+        nonlocal warm
+        queue.spend(step * iterations / usual if warm else 0)
+        warm = True
 
     full = run("all frames", iter(range(1, count)), lambda: usual, lambda _: None)
     gaps = run("gaps", iter(with_gaps), lambda: usual, lambda _: None)
