@@ -26,18 +26,22 @@ def is_marked(blocks, tiles_x, y, x):
 def compose_row(channel, y, planes, base, blocks, tiles_x, box, part):
     """Composes row y of the image, inside a box, from rendered blocks and a base image; see ``box_loss``.
 
+    Each pixel is written once, because another band may be reading the same row.
+
     Returns:
         Sum of the differences from the base image.
     """
     top, _, left, right = box
-    for x in range(left, right):
-        part[channel, y - top, x - left] = base[channel, y, x]
     shift = 0.0
     for x in range(left // BLOCK * BLOCK, right, BLOCK):
+        begin, end = max(x, left), min(x + BLOCK, right)
         if is_marked(blocks, tiles_x, y, x):
-            for k in range(max(x, left), min(x + BLOCK, right)):
+            for k in range(begin, end):
                 shift += np.float64(planes[channel, y, k] - base[channel, y, k])
                 part[channel, y - top, k - left] = planes[channel, y, k]
+        else:
+            for k in range(begin, end):
+                part[channel, y - top, k - left] = base[channel, y, k]
     return shift
 
 

@@ -153,11 +153,12 @@ def measure(
     def shortened() -> int:
         return with_fewer_iterations(Budget(), queue.waiting, usual).iterations or usual
 
-    first = [True]
+    warm = False
 
     def spend(iterations: int) -> None:
-        queue.spend(0 if first.pop() else step * iterations / usual)
-        first.append(False)
+        nonlocal warm
+        queue.spend(step * iterations / usual if warm else 0)
+        warm = True
 
     full = run("all frames", iter(range(1, count)), lambda: usual, lambda _: None)
     gaps = run("gaps", iter(with_gaps), lambda: usual, lambda _: None)

@@ -208,6 +208,24 @@ def test_after_a_broken_connection_live_states_start_anew(page, service):
     assert [fault for fault in page.faults if "404" not in fault] == []
 
 
+def test_a_live_state_that_does_not_continue_the_last_one_is_ignored(page, service):
+    page.goto(service.url)
+    taken = page.evaluate(
+        """async () => {
+          const { Here } = await import('/viewer/view/here.js');
+          const here = new Here(document.createElement('canvas'), { drawn() {}, arrived() {}, parts() {} });
+          const taken = [];
+          here.splats = { addLive: () => taken.push(here.live.frame) };
+          here.receive({ frame: 4, after: 3 });  // of a subscription that has ended
+          here.receive({ frame: 5 });
+          here.receive({ frame: 7, after: 5 });
+          here.receive({ frame: 8, after: 6 });
+          return [...taken, here.live.frame];
+        }"""
+    )
+    assert taken == [None, 5, 7]
+
+
 def test_the_motion_between_live_states_ends_when_the_next_is_expected(page, service):
     page.goto(service.url)
     moments = page.evaluate(

@@ -94,6 +94,7 @@ export class Here {
   receive(head, bytes) {
     const { live } = this;
     const starts = head.after === undefined;
+    if (!starts && head.after !== live.frame) return; // sent before the page unsubscribed; the new subscription starts anew
     const now = performance.now();
     const gap = now - live.at;
     this.begin().addLive(bytes, starts, this.opened);
