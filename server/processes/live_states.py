@@ -34,18 +34,16 @@ class LiveStateEncoder:
         """
         encoder = self._encoder
         if encoder is None or not encoder.last_frame <= query.frame <= encoder.last_frame + MAX_GAP:
-            encoder = self._new(history)
+            encoder = LiveEncoder(compact_head(self._spec, history))
         if query.frame > encoder.last_frame:
             state, time = history.gaussians(query.frame), history.time(query.frame)
+            self._encoder = None  # an encoder that fails may have registered a part of the frame
             try:
                 encoder.add(query.frame, time, state)
             except FileError:  # for example, if opacities were refitted in a recomputed state
-                encoder = self._new(history)
+                encoder = LiveEncoder(compact_head(self._spec, history))
                 encoder.add(query.frame, time, state)
+            self._encoder = encoder
         after = query.after if query.encoder == encoder.name else None
         headers = {"X-Encoder": encoder.name} | ({} if after is None else {"X-After": str(after)})
         return encoder.records_after(after), headers
-
-    def _new(self, history: History) -> LiveEncoder:
-        self._encoder = LiveEncoder(compact_head(self._spec, history))
-        return self._encoder

@@ -190,8 +190,9 @@ def test_a_history_that_cannot_be_written_leaves_no_trace(monkeypatch: pytest.Mo
 def test_a_camera_may_be_missing() -> None:
     scene = start(shortened())
     some = {name: FRAMES[1].images[name] for name in ("c1", "c4")}
-    assert scene.step(replace(FRAMES[1], images=some, masks={})).iterations == 3
+    report = scene.step(replace(FRAMES[1], images=some, masks={}))
     assert scene.history.indices == [10, 12]
+    assert report.iterations == 6  # twice as many, because frame 11 is missing
 
 
 def test_pictures_are_scaled_and_views_are_not() -> None:
