@@ -17,7 +17,8 @@ class Frame:
     """The images and masks of a rig's cameras at one time step.
 
     Attributes:
-        index: position in temporal order, starting at 0.
+        index: position in temporal order, starting at 0. Frames between two indices count as missing, and
+            lengthen the update after them.
         time: time since the first frame, in seconds.
         images: maps each camera name to its image, [H, W, 3] uint8, sRGB values as in the file.
             Images may be decoded lazily, on access.
