@@ -75,7 +75,7 @@ def test_no_clamp_of_the_kernels_has_a_number_of_its_own() -> None:
     for path in [*(mutate.CORE / "kernels").glob("*.py"), *others]:
         code = re.sub(r'(?s:""".*?""")|#.*', "", path.read_text())
         tiny = [m.group() for m in numbers.finditer(code) if int(m.group(1)) >= 4 and len(m.group()) < 9]
-        # A row outside every tile; when a neighbourhood counts as flat, and when Jacobi sweeps end: none of them clamps.
+        # A row outside every tile; when a neighbourhood is flat, and when Jacobi sweeps end. None of them clamps.
         allowed = {"tiles.py": ["1e4"], "turns.py": ["1e-24", "1e-34"]}.get(path.name, [])
         assert tiny == allowed, path.name
 
