@@ -28,11 +28,11 @@ from server.processes.queries import (
     Query,
     QueryRefused,
     RenderQuery,
-    StatesQuery,
     TracksQuery,
     refused_field,
 )
 from server.processes.query_executor import OnDamage, QueryExecutor
+from server.processes.shared_queries import lane
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 """Time in seconds that a process may spend on a cancelled query; starting a new process takes 1 to 2 s."""
@@ -107,15 +107,12 @@ class Readers:
     async def _answer(self, query: Query) -> Answer:
         if isinstance(query, TracksQuery):
             return await self._tracks(query)
-        if isinstance(query, StatesQuery):
-            return _check_answer(await self.views.ask(query), query)
-        if not isinstance(query, RenderQuery):
-            return _check_answer(await self.bulk.ask(query), query)
-        if "parts" not in query.kinds:
-            return _check_answer(await self.views.ask(query), query)
-        labels = await self._labels_of(query.parts)
-        answer = _check_answer(await self.views.ask(replace(query, labels=labels.labels)), query)
-        return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
+        if isinstance(query, RenderQuery) and "parts" in query.kinds:
+            labels = await self._labels_of(query.parts)
+            answer = _check_answer(await self.views.ask(replace(query, labels=labels.labels)), query)
+            return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
+        reader = self.views if lane(query) == "views" else self.bulk
+        return _check_answer(await reader.ask(query), query)
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
         """Records that `frames` were committed, deleted or rolled back; None means that any frame may have changed."""
