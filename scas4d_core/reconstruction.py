@@ -256,7 +256,7 @@ class Reconstruction(CommittedScene):
             Whether the checkpoint was written. It is not written for any commit except the newest
             one, or if the history is not on disk.
         """
-        if self._checkpoints is None or index != self.history.indices[-1]:
+        if self._checkpoints is None or index != self.history.newest_index:
             return False
         self._checkpoints.save(index, self._prepared.carried)
         return True
@@ -364,7 +364,7 @@ class Reconstruction(CommittedScene):
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else observed.seconds,
             step=observed.seconds,
-            gap=frame.index - self.history.indices[-1],
+            gap=frame.index - self.history.newest_index,
             views=believed,
             suspects=[view for view in observed.views if past.is_left_out(view.name)],
             brightness=observed.bright,
@@ -460,7 +460,7 @@ class Reconstruction(CommittedScene):
         Raises:
             StepError: if the frame is not later than the last committed one.
         """
-        last = self.history.indices[-1]
+        last = self.history.newest_index
         if frame.index <= last:
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
         seconds = frame.time - self.history.time(last)

@@ -235,7 +235,7 @@ class FramesReader:
 
     def _events(self) -> Int:
         """Returns the event log [E, 4] of the newest readable frame."""
-        while (newest := self._newest()) >= 0:
+        while (newest := self.newest_index) >= 0:
             known, log = self._log
             if known > newest or (known >= 0 and self._files is None):  # frames have since been truncated
                 log = log[log[:, 0] <= newest]
@@ -285,11 +285,12 @@ class FramesReader:
             return
         if index in self.damaged:
             raise DamagedFrameError(f"frame {index} cannot be read: {self.damaged[index]}")
-        held = f"{next(iter(self._times))} to {self._newest()}" if self._times else "none yet"
+        held = f"{next(iter(self._times))} to {self.newest_index}" if self._times else "none yet"
         raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
-    def _newest(self) -> int:
-        """Returns the index of the newest frame, or −1 if there is none, without copying all indices."""
+    @property
+    def newest_index(self) -> int:
+        """Index of the newest frame, or −1 if there is none. Unlike ``indices``, it copies nothing."""
         return next(reversed(self._times), -1)
 
     def _from_file(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
@@ -322,7 +323,7 @@ class FramesReader:
     def _keep(self, index: int, frame: Arrays) -> None:
         self._frames[index] = frame
         if self._files is not None:
-            newest = self._newest()
+            newest = self.newest_index
             for old in [i for i in self._frames if i != newest][: max(0, len(self._frames) - FRAMES_KEPT)]:
                 del self._frames[old]
                 self._texts.pop(old, None)

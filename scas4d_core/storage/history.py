@@ -157,8 +157,10 @@ class History(HistoryReader):
             HistoryError: if the index is not greater than the last index, Gaussians are missing, ids or opacities
                 differ, or the report is not valid JSON.
         """
-        if index <= self._newest():
-            raise HistoryError(f"frame {index} is not after frame {self._newest()}; append frames in ascending order")
+        if index <= self.newest_index:
+            raise HistoryError(
+                f"frame {index} is not after frame {self.newest_index}; append frames in ascending order"
+            )
         began = perf_counter()
         try:
             text = json.dumps(dict(report or {}), allow_nan=False)
@@ -386,7 +388,7 @@ class History(HistoryReader):
         """
         assert self._files is not None
         log = self.log_at(index)
-        if index >= self._newest() or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
+        if index >= self.newest_index or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
             raise HistoryError(
                 f"frame {index} cannot be replaced: it is the newest frame, or the number of rows differs"
             )
