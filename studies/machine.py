@@ -7,6 +7,7 @@ import hashlib
 import math
 import os
 import platform
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,11 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def browser_path() -> str | None:
+    """Returns the path of Chromium, or of Chrome; None if neither is installed."""
+    return os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
 
 
 def resident_mb(pid: int | None = None) -> float:

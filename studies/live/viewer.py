@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
 import threading
 import time
@@ -24,7 +23,7 @@ from client.wire import FrameState
 from client.wire.stream import unpack
 from scas4d_core.cameras import Rig
 from scas4d_core.compact import CompactReader
-from studies.machine import in_words, machine
+from studies.machine import browser_path, in_words, machine
 from studies.running.process import Service, StudyError
 
 CAMERAS = 4
@@ -120,11 +119,6 @@ def measure(service: Service, folder: Path, frames: int, fps: float) -> ViewerRe
     return ViewerResult(sum(received) / frames, _delays(first, commits), _delays(whole, commits), stages, frames)
 
 
-def browser_path() -> str | None:
-    """Returns the path of Chromium, or None for Playwright's own."""
-    return os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
-
-
 def _black(width: int, height: int) -> bytes:
     file = io.BytesIO()
     Image.new("RGB", (width, height)).save(file, "JPEG")
@@ -163,10 +157,10 @@ def run(folder: Path, frames: int, fps: float, work: Path) -> ViewerResult:
 def report(result: ViewerResult, fps: float) -> str:
     """Returns the result as a Markdown table."""
 
-    def quantiles(found: list[float]) -> str:
-        if not found:
+    def quantiles(delays: list[float]) -> str:
+        if not delays:
             return "–"
-        return f"{np.quantile(found, 0.5):.0f} / {np.quantile(found, 0.95):.0f} ms ({len(found)} frames)"
+        return f"{np.quantile(delays, 0.5):.0f} / {np.quantile(delays, 0.95):.0f} ms ({len(delays)} frames)"
 
     stages = " / ".join(f"{value:.0f} ms" for value in np.median(result.stages_ms, axis=0)) if result.stages_ms else "–"
     return "\n".join(

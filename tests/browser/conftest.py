@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-
 import browser_engine
 import pytest
 from browser_page import FRAMES, SIZES, push, start_scene
@@ -12,12 +9,9 @@ from running import Running, fake_settings
 from waiting import HANG_S
 
 from client.sdk import Client
+from studies.machine import browser_path
 
 SIZE = {"width": 1280, "height": 800}
-
-
-def browser_path():
-    return os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")  # its event loop must not outlive these tests: others run their own

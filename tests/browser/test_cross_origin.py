@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -15,6 +13,7 @@ from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire.stream import STREAM_PROTOCOL
+from studies.machine import browser_path
 
 TOKEN = "a-token-of-thirty-two-characters"
 
@@ -93,8 +92,7 @@ def test_the_service_s_own_page_gets_everything(chromium, service, finished):
 def test_a_name_that_was_pointed_at_this_machine_gets_nothing(chromium, service, finished):
     """DNS rebinding: for the browser, the page and the service are one site."""
     rules = "--host-resolver-rules=MAP evil.example 127.0.0.1"
-    path = os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
-    browser = chromium.browser_type.launch(executable_path=path, args=["--no-sandbox", rules])
+    browser = chromium.browser_type.launch(executable_path=browser_path(), args=["--no-sandbox", rules])
     try:
         rebound = f"http://evil.example:{service.port}"
         found = tried(browser, rebound + "/viewer/", rebound, finished)
