@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from client.exports.sources import Source, frame_range, opened
 from client.exports.video.overlay import moving_rows
 from client.exports.video.rig_view import RigView
+from client.pictures import eight_bit
 from client.progress import Bars, console
 from client.wire import part_colour
 from scas4d_core.cameras import Rig
@@ -156,7 +157,7 @@ def _log_points(
         known = min(len(labels), len(state))
         classes[:known] = labels[:known] + 1
     size = np.sqrt(np.square(state.factors[shown]).sum(axis=(1, 2)) / 3) / world.metres_per_unit
-    colours = np.rint(255 * np.clip(state.colours[shown], 0, 1)).astype(np.uint8)
+    colours = eight_bit(state.colours[shown])
     points = rerun.Points3D(
         world.to_user(state.means[shown]).astype(np.float32),
         radii=size.astype(np.float32),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from client.pictures import eight_bit
 from client.rig.sequence import ping_pong
 from scas4d_core.captures import Capture, Frame
 from scas4d_core.gaussians import Gaussians
@@ -76,7 +77,7 @@ def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterat
             number += 1
             mixed = _between(before, after, part / factor)
             drawn.history.append(number, capture.frame(0).time + number * step, mixed)
-            images = {c.name: _levels(drawn.render(c).colour) for c in capture.rig.cameras}
+            images = {c.name: eight_bit(drawn.render(c).colour) for c in capture.rig.cameras}
             cameras = capture.test_rig.cameras if capture.test_rig is not None else ()
             truth = {c.name: drawn.render(c).colour for c in cameras}
             yield Shown(Frame(number, capture.frame(0).time + number * step, images, {}), truth)
@@ -84,12 +85,6 @@ def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterat
 
 def _truth(capture: Capture, index: int) -> dict[str, NDArray[np.float32]]:
     return {key: image.astype(np.float32) / np.float32(255) for key, image in capture.test_frame(index).images.items()}
-
-
-def _levels(colour: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Converts a render to 8 bits, as a camera would store it."""
-    levels: NDArray[np.uint8] = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
-    return levels
 
 
 def _between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
