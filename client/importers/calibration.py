@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 
@@ -110,7 +110,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:LISTED]) + more
 
 
-def stem(path: PurePosixPath) -> str:
+def stem(path: PurePath) -> str:
     """Returns the file name without the extension of an image format. Some tools omit the extension."""
     return path.stem if path.suffix.lower() in PICTURE_SUFFIXES else path.name
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 from client.importers.calibration import Calibration, composed, listed, natural, stem
@@ -52,8 +52,8 @@ class PictureSource:
 
     def names_of(self, calibration: Calibration) -> dict[str, str]:
         """Returns the names on disk of the cameras that are here, keyed by camera name."""
-        found = {name: self.find(calibration.label(name), name) for name in calibration.names}
-        return {name: on_disk for name, on_disk in found.items() if on_disk is not None}
+        names = ((name, self.find(calibration.label(name), name)) for name in calibration.names)
+        return {name: on_disk for name, on_disk in names if on_disk is not None}
 
 
 def picture_sources(capture: Path) -> Iterator[PictureSource]:
@@ -70,7 +70,7 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
             yield PictureSource("images", root, {name: [folders[name]] for name in (folders if own else pictured)}, own)
         if pictured:
             first = pictures_in(folders[pictured[0]])
-            yield PictureSource("frames", root, {composed(stem(_pure(path))): [path] for path in first}, own)
+            yield PictureSource("frames", root, {composed(stem(path)): [path] for path in first}, own)
     for place in VIDEOS:
         root = capture / place
         videos: dict[str, list[Path]] = {}
@@ -103,12 +103,12 @@ def find_source(capture: Path, calibration: Calibration, wanted: str | None) -> 
     Raises:
         CaptureError: if there are both images and videos, and `wanted` is None.
     """
-    found = [(source, len(source.names_of(calibration))) for source in picture_sources(capture)]
-    found = [(source, count) for source, count in found if count and (wanted is None or _is(source, wanted))]
-    if not found:
+    sources = [source for source in picture_sources(capture) if wanted is None or _is(source, wanted)]
+    counts = [(source, count) for source in sources if (count := len(source.names_of(calibration)))]
+    if not counts:
         return None
-    best = max(found, key=lambda pair: pair[1])[0]
-    other = next((source for source, _ in found if (source.kind == "videos") != (best.kind == "videos")), None)
+    best = max(counts, key=lambda pair: pair[1])[0]
+    other = next((source for source, _ in counts if not _is(source, best.kind)), None)
     if other is not None:
         images, videos = (other, best) if best.kind == "videos" else (best, other)
         raise CaptureError(
@@ -195,7 +195,3 @@ def image_size(path: Path) -> tuple[int, int]:
         return picture_size(path)
     except ImageError as fault:
         raise CaptureError(str(fault)) from fault
-
-
-def _pure(path: Path) -> PurePosixPath:
-    return PurePosixPath(path.as_posix())

@@ -111,10 +111,10 @@ def open_source(
             )
         given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, size_mismatch=size_mismatch)
     else:
-        found = read_calibration(folder, calibration)
-        given = _imported(folder, found, pictures, fps, encoding, use_masks, size_mismatch)
+        read = read_calibration(folder, calibration)
+        given = _imported(folder, read, pictures, fps, encoding, use_masks, size_mismatch)
         given = given if use_points else replace(given, points=None)
-        names = {label: name for name, label in found.labels.items()}
+        names = {label: name for name, label in read.labels.items()}
         test = tuple(names.get(name, name) for name in test)
     suspicions = pose_warnings(given.full_rig, None if given.points is None else given.points.positions)
     given = replace(given, remarks=(*given.remarks, *suspicions))

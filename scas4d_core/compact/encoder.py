@@ -110,9 +110,9 @@ class FrameEncoder:
             decoded, errors = coded.decoded, coded.errors
         if note is not None:
             records.insert(0, (RecordKind.NOTE, note_bytes({**note, ERRORS: dict(errors)})))
-        found = [record_bytes(kind, body, index, time) for kind, body in records]
-        self._record, self._last = parse_head(found[-1], 0, self._name), decoded
-        return found, errors
+        encoded = [record_bytes(kind, body, index, time) for kind, body in records]
+        self._record, self._last = parse_head(encoded[-1], 0, self._name), decoded
+        return encoded, errors
 
     def _check(self, index: int, state: Gaussians) -> None:
         """Rejects a state that cannot follow the previous ones, before anything is written."""

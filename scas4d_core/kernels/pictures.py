@@ -40,7 +40,7 @@ def mark_changes(before, now, most, reach, changed):
     """
     height, width = changed.shape
     earlier, later = before.reshape(height, CHANNELS * width), now.reshape(height, CHANNELS * width)
-    found = False
+    differs = False
     changed[:] = 0
     marks, wide = np.zeros(width + 2 * reach, np.uint8), np.zeros(width, np.uint8)
     for row in range(height):
@@ -49,7 +49,7 @@ def mark_changes(before, now, most, reach, changed):
             worst = max(worst, abs(np.int32(earlier[row, k]) - np.int32(later[row, k])))
         if worst <= most:
             continue
-        found = True
+        differs = True
         marks[:], wide[:] = 0, 0
         for column in range(width):
             worst = np.int32(0)
@@ -62,4 +62,4 @@ def mark_changes(before, now, most, reach, changed):
         for near in range(max(0, row - reach), min(height, row + reach + 1)):
             for column in range(width):
                 changed[near, column] = max(changed[near, column], np.float32(wide[column]))
-    return found
+    return differs

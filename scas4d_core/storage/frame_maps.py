@@ -46,24 +46,24 @@ class FrameMap(MutableMapping[int, Value], Generic[Value]):
         return place, place < len(self._indices) and self._indices[place] == index
 
     def __getitem__(self, index: int) -> Value:
-        place, found = self._find(index)
-        if not found:
+        place, known = self._find(index)
+        if not known:
             raise KeyError(index)
         return self._row(place)
 
     def __setitem__(self, index: int, value: Value) -> None:
-        place, found = self._find(index)
-        if not found:
+        place, known = self._find(index)
+        if not known:
             self._indices.insert(place, index)
         for column, number in zip(self._columns, self._numbers(value), strict=True):
-            if found:
+            if known:
                 column[place] = number
             else:
                 column.insert(place, number)
 
     def __delitem__(self, index: int) -> None:
-        place, found = self._find(index)
-        if not found:
+        place, known = self._find(index)
+        if not known:
             raise KeyError(index)
         for column in (self._indices, *self._columns):
             del column[place]

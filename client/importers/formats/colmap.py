@@ -92,8 +92,8 @@ def read_largest(models: list[Path]) -> Calibration:
         f"found {len(models)} COLMAP models ({sizes}); using {largest.parent.name}/{largest.name}, which has the most "
         "images; choose another with --calibration"
     )
-    found = read_colmap(largest)
-    return replace(found, remarks=(remark, *found.remarks))
+    read = read_colmap(largest)
+    return replace(read, remarks=(remark, *read.remarks))
 
 
 def _image_count(folder: Path) -> int:

@@ -177,15 +177,15 @@ def _other_files(folder: Path) -> str:
     return f": none of its files is a known calibration ({', '.join(files[:5])})" if files else ": it contains no files"
 
 
-def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) -> Calibration:
+def _with_unread_remark(others: list[Path], folder: Path, read: Calibration) -> Calibration:
     """Returns the calibration with a remark that lists the other calibrations in the folder, which are not read."""
     if not others:
-        return found
+        return read
     listed = ", ".join(str(path.relative_to(folder)) for path in others)
     remark = (
-        f"using calibration {found.source.relative_to(folder)}, not {listed}; choose another with --calibration FILE"
+        f"using calibration {read.source.relative_to(folder)}, not {listed}; choose another with --calibration FILE"
     )
-    return replace(found, remarks=(*found.remarks, remark))
+    return replace(read, remarks=(*read.remarks, remark))
 
 
 def find_calibrations(capture: Path) -> list[Path]:

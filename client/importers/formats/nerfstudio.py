@@ -98,11 +98,11 @@ def read_transforms(paths: Sequence[Path], capture: Path) -> Calibration:
             training = [*(view.path for view in views.values()), *unposed]
         if fps is None and "fps" in file.meta:
             fps = positive(str(path), file.meta, "fps")
-    found = calibration(paths[0], list(views.values()), fps=fps, unposed=unposed, training=training)
+    read = calibration(paths[0], list(views.values()), fps=fps, unposed=unposed, training=training)
     remarks = [f"read {', '.join(path.name for path in paths)}"] if len(paths) > 1 else []
-    if found.test:
-        remarks.append(f"held out for evaluation, as they are not in {paths[0].name}: {listed(found.test)}")
-    return replace(found, remarks=(*remarks, *found.remarks))
+    if read.test:
+        remarks.append(f"held out for evaluation, as they are not in {paths[0].name}: {listed(read.test)}")
+    return replace(read, remarks=(*remarks, *read.remarks))
 
 
 def _open(path: Path, capture: Path) -> _File:
