@@ -83,7 +83,7 @@ def blend_task(
     covers,
     wanted,
     tile_order,
-    tasks,
+    shares,
     size,
     background,
     limits,
@@ -99,7 +99,7 @@ def blend_task(
     step = lanes.COUNT * (1 + channels)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
-    for turn in range(task, tile_order.shape[0], tasks):
+    for turn in range(shares[task], shares[task + 1]):
         tile = tile_order[turn]
         x_first = (tile % tiles_x) * TILE
         y_first = (tile // tiles_x) * TILE
@@ -187,7 +187,7 @@ def blend(
     covers,
     wanted,
     tile_order,
-    tasks,
+    shares,
     size,
     background,
     limits,
@@ -206,16 +206,15 @@ def blend(
             effect are cleared from the mask.
         wanted: [tiles] uint64 mask of the blocks to render. All other blocks are filled with the
             background.
-        tile_order: int64 tiles to render, which are distributed to tasks in this order. All other
-            tiles remain unchanged.
-        tasks: number of parallel tasks.
+        tile_order: int64 tiles to render, grouped by task. All other tiles remain unchanged.
+        shares: [tasks + 1] int64 start of each task's tiles; see ``balance.distribute``.
         size: image size (width, height) in pixels.
         background: [C] background features.
         limits: [6] rasterizer constants, in the order of the ``Limits`` fields.
         image: [C, rows, stride] float32 output, padded to whole tiles.
         transmittance: [rows, stride] output, remaining transmittance.
     """
-    for task in prange(tasks):
+    for task in prange(shares.shape[0] - 1):
         blend_task(
             np.int64(task),
             splats,
@@ -226,7 +225,7 @@ def blend(
             covers,
             wanted,
             tile_order,
-            tasks,
+            shares,
             size,
             background,
             limits,
@@ -247,7 +246,7 @@ def blend_backward_task(
     covers,
     learnt,
     tile_order,
-    tasks,
+    shares,
     size,
     limits,
     image,
@@ -268,7 +267,7 @@ def blend_backward_task(
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
     weights = np.empty((BLOCKS + 1) * lanes.COUNT, np.float32)
-    for turn in range(task, tile_order.shape[0], tasks):
+    for turn in range(shares[task], shares[task + 1]):
         tile = tile_order[turn]
         y_first = (tile // tiles_x) * TILE
         x_first = (tile % tiles_x) * TILE
@@ -400,7 +399,7 @@ def blend_backward(
     covers,
     learnt,
     tile_order,
-    tasks,
+    shares,
     size,
     limits,
     image,
@@ -417,7 +416,7 @@ def blend_backward(
     far.
 
     Args:
-        splats, features, groups, starts, items, tile_order, tasks, size, limits: see ``blend``.
+        splats, features, groups, starts, items, tile_order, shares, size, limits: see ``blend``.
         slots: [entries] pair of each entry, i.e. its row in ``records``.
         covers: [entries] block masks, as updated by ``blend``.
         learnt: [N] uint8 mask. If the value is 0, the Gaussian needs no gradient, and its records
@@ -427,7 +426,7 @@ def blend_backward(
         g_alpha: [rows, stride] dL/dalpha, where alpha = 1 - transmittance.
         records: [pairs, multiple of ``Lanes``] float32 output; see the column constants above.
     """
-    for task in prange(tasks):
+    for task in prange(shares.shape[0] - 1):
         blend_backward_task(
             np.int64(task),
             splats,
@@ -439,7 +438,7 @@ def blend_backward(
             covers,
             learnt,
             tile_order,
-            tasks,
+            shares,
             size,
             limits,
             image,

@@ -110,7 +110,8 @@ def freeze_part(
 
 @parallel_kernel
 def freeze_layer(
-    layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
+    order, shares, layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate, points,
+    sums, tables,
 ):  # fmt: skip
     """Freezes a layer by applying the layer to its input.
 
@@ -122,11 +123,12 @@ def freeze_layer(
         entering: [B, 13 · 16] factors and rotations before this layer, replaced by factors and
             rotations before the next layer.
     """
-    for part in prange(parts.shape[0] - 1):
-        freeze_part(
-            np.int64(part), layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate,
-            points, sums, tables,
-        )  # fmt: skip
+    for task in prange(shares.shape[0] - 1):
+        for part in order[shares[task] : shares[task + 1]]:
+            freeze_part(
+                part, layer, parameters, parts, ranges, clusters, present, entering, about_origin, separate, points,
+                sums, tables,
+            )  # fmt: skip
 
 
 @inline
@@ -185,12 +187,14 @@ def deform_part(
 
 @parallel_kernel
 def deform(
-    first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
-    points, sums, tables, means, factors, state, guard_counts,
+    order, shares, first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin,
+    separate, points, sums, tables, means, factors, state, guard_counts,
 ):  # fmt: skip
     """Deforms M of N Gaussians, grouped into B blocks, with L layers that have K clusters in total.
 
     Args:
+        order: [P] int64 parts, grouped by task.
+        shares: [tasks + 1] int64 start of each task's parts in ``order``; see ``balance.distribute``.
         first: first layer that is not frozen. Points, sums and tables of frozen layers are reused.
         parameters: [K, 10] parameters of all clusters, ordered by layer from coarse to fine.
         parts: [P + 1, 1 + L] int64 first block of each of the P parts, and its first cluster in each layer. The last
@@ -216,11 +220,12 @@ def deform(
         state: [M, 16] output. Only means and rotations are written. See ``deltas`` for the columns.
         guard_counts: [P, 3] int64 output, number of times each guard in ``cascade.COUNTED_GUARDS`` was triggered.
     """
-    for part in prange(parts.shape[0] - 1):
-        deform_part(
-            np.int64(part), first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas,
-            about_origin, separate, points, sums, tables, means, factors, state, guard_counts,
-        )  # fmt: skip
+    for task in prange(shares.shape[0] - 1):
+        for part in order[shares[task] : shares[task + 1]]:
+            deform_part(
+                part, first, parameters, parts, ranges, clusters, entries, rows, present, entering, deltas,
+                about_origin, separate, points, sums, tables, means, factors, state, guard_counts,
+            )  # fmt: skip
 
 
 @kernel
@@ -264,13 +269,14 @@ def deform_backward_part(
 
 @parallel_kernel
 def deform_backward(
-    first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate, points, tables,
-    scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records, gradients, g_deltas, losses,
+    order, shares, first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
+    points, tables, scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records, gradients, g_deltas,
+    losses,
 ):  # fmt: skip
     """Backpropagates through ``deform``, and adds the gradient of the scale loss.
 
     Args:
-        first … tables: see ``deform``, which must have been called first. Frozen layers receive no gradient.
+        order … tables: see ``deform``, which must have been called first. Frozen layers receive no gradient.
         scale_weight: weight of the scale loss, divided by the number of averaged values, 3M. If the
             weight is 0, the loss has no gradient.
         bounds: [M, 3] axis lengths above which the scale loss applies, in metres.
@@ -283,9 +289,10 @@ def deform_backward(
         g_deltas: [M, 9] output, gradients of the deltas.
         losses: [B] output, total length by which the axes in each block exceed their bounds, in metres.
     """
-    for part in prange(parts.shape[0] - 1):
-        deform_backward_part(
-            np.int64(part), first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin,
-            separate, points, tables, scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records,
-            gradients, g_deltas, losses,
-        )  # fmt: skip
+    for task in prange(shares.shape[0] - 1):
+        for part in order[shares[task] : shares[task + 1]]:
+            deform_backward_part(
+                part, first, parts, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
+                points, tables, scale_weight, bounds, g_means, g_factors, accumulators, g_tied, records, gradients,
+                g_deltas, losses,
+            )  # fmt: skip

@@ -40,7 +40,7 @@ from scas4d_core.kernels.projection import (
 
 @kernel
 def blend_features_task(
-    task, splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records
+    task, splats, starts, items, slots, covers, learnt, tile_order, shares, size, limits, g_image, records
 ):
     """Processes the tiles of one task of ``blend_features``."""
     cap, stop = limits[1], limits[2]
@@ -50,7 +50,7 @@ def blend_features_task(
     step = lanes.COUNT * (1 + GROUP)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
-    for turn in range(task, tile_order.shape[0], tasks):
+    for turn in range(shares[task], shares[task + 1]):
         tile = tile_order[turn]
         y_first = (tile // tiles_x) * TILE
         x_first = (tile % tiles_x) * TILE
@@ -98,17 +98,17 @@ def blend_features_task(
 
 
 @parallel_kernel
-def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records):
+def blend_features(splats, starts, items, slots, covers, learnt, tile_order, shares, size, limits, g_image, records):
     """Computes the feature gradients of every entry, i.e. of every Gaussian–tile pair.
 
     Args:
-        splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits: see ``blend.blend_backward``.
+        splats, starts, items, slots, covers, learnt, tile_order, shares, size, limits: see ``blend.blend_backward``.
         g_image: [4, rows, stride] dL/dimage.
         records: [pairs, 16] float32 output, four sums followed by zeros.
     """
-    for task in prange(tasks):
+    for task in prange(shares.shape[0] - 1):
         blend_features_task(
-            np.int64(task), splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image,
+            np.int64(task), splats, starts, items, slots, covers, learnt, tile_order, shares, size, limits, g_image,
             records,
         )  # fmt: skip
 

@@ -117,35 +117,43 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
 
 
 @kernel
-def share_pairs(order, visible, counts, begins):
-    """Computes the first pair of each task, ``begins`` [tasks] int64.
+def share_pairs(order, visible, counts, shares, begins):
+    """Divides the Gaussians among tasks so that all tasks process similar numbers of pairs.
 
-    Each task processes an equal share of the Gaussians.
+    Args:
+        order, visible: outputs of ``depth_order``.
+        counts: [N] number of tiles in each bounding box.
+        shares: [tasks + 1] int64 output, first Gaussian of each task in depth order.
+        begins: [tasks] int64 output, first pair of each task.
 
     Returns:
         Upper bound on the number of Gaussian–tile pairs: the number of tiles in all bounding boxes.
     """
     tasks = begins.shape[0]
     total = 0
-    for task in range(tasks):
-        begins[task] = total
-        for k in range(visible * task // tasks, visible * (task + 1) // tasks):
-            total += counts[order[k]]
+    for i in range(counts.shape[0]):
+        total += counts[i]
+    task = before = 0
+    for k in range(visible):
+        while task < tasks and before * tasks >= total * task:
+            shares[task], begins[task] = k, before
+            task += 1
+        before += counts[order[k]]
+    shares[task:], begins[task:] = visible, before
     return total
 
 
 @kernel
 def cover_tiles_task(
-    task, splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers,
+    task, splats, rects, order, visible, tiles_x, drawn, learnt, shares, begins, ends, counts, firsts, pairs, covers,
     tile_counts,
 ):  # fmt: skip
     """Processes the Gaussians of one task of ``cover_tiles``."""
-    tasks = begins.shape[0]
     for tile in range(tile_counts.shape[1]):
         tile_counts[task, tile] = 0
     pair = begins[task]
     outside = 0
-    for k in range(visible * task // tasks, visible * (task + 1) // tasks):
+    for k in range(shares[task], shares[task + 1]):
         i = order[k]
         ahead = order[min(k + AHEAD, visible - 1)]
         lanes.prefetch_row(splats, ahead)
@@ -174,8 +182,9 @@ def cover_tiles_task(
 
 @parallel_kernel
 def cover_tiles(
-    splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers, tile_counts
-):
+    splats, rects, order, visible, tiles_x, drawn, learnt, shares, begins, ends, counts, firsts, pairs, covers,
+    tile_counts,
+):  # fmt: skip
     """Lists the Gaussian–tile pairs whose supports and tiles intersect, in depth order.
 
     Args:
@@ -184,6 +193,7 @@ def cover_tiles(
         tiles_x: number of tile columns.
         drawn: [tiles] uint64 mask of the blocks to render. Other blocks are ignored.
         learnt: [N] uint8 mask of the Gaussians that should stay within the rendered blocks.
+        shares: [tasks + 1] first Gaussian of each task in depth order, from ``share_pairs``.
         begins: [tasks] first pair of each task, from ``share_pairs``.
         ends: [tasks] int64 output, end of each task's pairs.
         counts: [N] number of tiles in each bounding box, replaced by the number of pairs of each Gaussian.
@@ -199,8 +209,8 @@ def cover_tiles(
     left = np.empty(tasks, np.int64)  # np.zeros would be a parallel region of its own
     for task in prange(tasks):
         left[task] = cover_tiles_task(
-            np.int64(task), splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs,
-            covers, tile_counts,
+            np.int64(task), splats, rects, order, visible, tiles_x, drawn, learnt, shares, begins, ends, counts,
+            firsts, pairs, covers, tile_counts,
         )  # fmt: skip
     outside = 0
     for task in range(tasks):

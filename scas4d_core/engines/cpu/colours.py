@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.engines.cpu.adam import Adam
 from scas4d_core.engines.engine import AttemptStart
+from scas4d_core.kernels.soft_colour import soft_colour
 
 Array = NDArray[np.float32]
 
@@ -41,42 +42,35 @@ class Colours:
         self._weight = np.float32(weight / max(colours.size, 1))
         self._whole = static or len(rows) > MOST * count
         if self._whole:
-            self._before, self._table = before, colours
+            self._before, self._table, self._table_rows = before, colours, rows[:0]
             by_row = np.full(count, start.static_colour if static else 0, np.float32)
             by_row[rows] = start.colour
         else:
-            self._before, self._table = before[rows], colours[rows]
+            self._before, self._table, self._table_rows = before[rows], colours[rows], rows
             by_row = np.full(len(rows), start.colour, np.float32)
         self._adam = Adam(self._table, [1.0] * 3, (start.beta1, start.beta2), by_row=by_row)
         self.guards = self._adam.guards
-        self._change: Array
+        self._gradients = np.zeros_like(self._table)
 
-    def loss(self, curve: bool) -> float:
-        """Returns the weighted soft-colour loss, or 0 if ``curve`` is false. Call before ``gradient`` and ``step``."""
-        self._change = self._table - self._before
-        return float(self._weight * np.abs(self._change).sum(dtype=np.float64)) if curve else 0.0
-
-    def gradient(self, g_features: Array) -> Array:
-        """Returns the gradient [table rows, 3] of the rendering losses and the soft-colour loss.
+    def loss(self, g_features: Array) -> float:
+        """Returns the weighted soft-colour loss, and computes the gradients for ``step``.
 
         Args:
             g_features: [N, 4] gradients of the rendering losses with respect to the features.
         """
-        pull: Array = self._weight * np.sign(self._change)
-        chosen = g_features if self._whole else g_features[self._rows]
-        total: Array = chosen[:, :3] + pull
-        return total
+        change = soft_colour(self._table, self._before, self._table_rows, g_features, self._weight, self._gradients)
+        return float(self._weight * change)
 
-    def all_gradients(self, g_features: Array) -> Array:
-        """Returns the last iteration's gradient [N, 3], which is 0 for Gaussians that are not in the table."""
+    def gradients(self) -> Array:
+        """Returns the last iteration's gradients [N, 3], which are 0 for Gaussians that are not in the table."""
         if self._whole:
-            return self.gradient(g_features)
+            return self._gradients.copy()
         total = np.zeros_like(self._colours)
-        total[self._rows] = self.gradient(g_features)
+        total[self._rows] = self._gradients
         return total
 
-    def step(self, g_features: Array, factor: float) -> None:
+    def step(self, factor: float) -> None:
         """Performs one optimization step, with all learning rates scaled by ``factor``."""
-        self._adam.step(self.gradient(g_features), factor)
+        self._adam.step(self._gradients, factor)
         if not self._whole:
             self._colours[self._rows] = self._table

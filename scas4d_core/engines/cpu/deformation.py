@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import GuardCounts
-from scas4d_core.kernels import neighbour_terms
+from scas4d_core.kernels import balance, neighbour_terms
 from scas4d_core.kernels.cascade import COUNTED_GUARDS, PARAMETERS, RECORD, TABLE
 from scas4d_core.kernels.deform import CARRIED, block_sums, deform, deform_backward, freeze_layer
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
+from scas4d_core.kernels.jit import threads
 from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
@@ -65,6 +66,7 @@ class CpuDeformation:
         blocks = Blocks.of(hierarchy)
         self._offsets, self._ranges, self._clusters_of = blocks.offsets, blocks.ranges, blocks.clusters
         self._parts = blocks.parts()
+        self._part_shares = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._entries, self._rows, self._present = blocks.entries, hierarchy.rows[blocks.entries], blocks.present
         self._all_present, self._all_ranges = blocks.present, blocks.ranges
         self._weights = np.zeros((count, 0), np.float32) if neighbours is None else neighbours.weights
@@ -153,20 +155,28 @@ class CpuDeformation:
             self._unfreeze_layers()
         for layer in range(self._frozen, layers):
             freeze_layer(
-                layer, self._parameters, self._parts, self._ranges, self._clusters_of, self._present, self._entering,
-                self._about_origin, self._separate, self._points, self._sums, self._tables,
+                *self._shares(), layer, self._parameters, self._parts, self._ranges, self._clusters_of, self._present,
+                self._entering, self._about_origin, self._separate, self._points, self._sums, self._tables,
             )  # fmt: skip
         self._frozen = layers
 
     def _unfreeze_layers(self) -> None:
         self._entering[:], self._frozen = self._before, 0
 
+    def _shares(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Returns the parts that each thread processes; see ``balance.distribute``. Parts differ in size."""
+        tasks = threads()
+        if len(self._part_shares[1]) != tasks + 1:
+            order, shares = balance.distribute(np.diff(self._parts[:, 0]), tasks)
+            self._part_shares = order, shares
+        return self._part_shares
+
     def forward(self) -> None:
         """Evaluates equations (5) to (7) and fills ``means``, ``factors`` and ``turns``."""
         deform(
-            self._frozen, self._parameters, self._parts, self._ranges, self._clusters_of, self._entries, self._rows,
-            self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._sums,
-            self._tables, self.means, self.factors, self._state, self._guard_counts,
+            *self._shares(), self._frozen, self._parameters, self._parts, self._ranges, self._clusters_of,
+            self._entries, self._rows, self._present, self._entering, self.deltas, self._about_origin, self._separate,
+            self._points, self._sums, self._tables, self.means, self.factors, self._state, self._guard_counts,
         )  # fmt: skip
         self.means[self.held_back], self.factors[self.held_back] = self._held
         self.guards.add(COUNTED_GUARDS, self._guard_counts)
@@ -204,8 +214,8 @@ class CpuDeformation:
         """
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
-            self._frozen, self._parts, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
-            self._entering, self.deltas, self._about_origin, self._separate, self._points, self._tables,
+            *self._shares(), self._frozen, self._parts, self._ranges, self._clusters_of, self._entries, self._rows,
+            self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._tables,
             np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._accumulators, self._tied,
             self._records, self._gradients, self.delta_gradients, self._excess,
         )  # fmt: skip

@@ -125,13 +125,12 @@ class CpuEngine:
         self._features[:, :3] = self._colours
         lap("cascade")
         loss, gradients = self._pictures(views, step)
-        self._gradients = gradients
         loss += self._terms(gradients, step)
         lap("effects")
         length = self._plan.axis_length
         loss += length * deformation.backward(gradients.means, gradients.factors, length)
         lap("cascade backward")
-        self._step(gradients, step)
+        self._step(step)
         self._deformed = False
         lap("adam")
         self._log.losses.append(loss)
@@ -192,10 +191,10 @@ class CpuEngine:
         if plan.floor is not None:
             loss += floor_term(plan.floor, deformation.means, self._rows, plan.floor_weight, gradients.means)
         if self._colour_table is not None:
-            loss += self._colour_table.loss(self._start.curve)
+            loss += self._colour_table.loss(gradients.features)
         return loss
 
-    def _step(self, gradients: Gradients, step: StepScalars) -> None:
+    def _step(self, step: StepScalars) -> None:
         """Takes an Adam step for all free parameters."""
         deformation = self._deformation
         for columns, gradient, factor in zip(
@@ -206,7 +205,7 @@ class CpuEngine:
         if self._own_columns is not None:
             self._own_columns.step(deformation.delta_gradients, step.own)
         if self._colour_table is not None:
-            self._colour_table.step(gradients.features, step.colour)
+            self._colour_table.step(step.colour)
         if self._gloss is not None:
             self._gloss.step(step.gloss, step.smooth_gloss)
 
@@ -281,7 +280,7 @@ class CpuEngine:
         tables = {f"cluster {layer}": g.copy() for layer, g in enumerate(deformation.cluster_gradients)}
         tables["deltas"] = deformation.delta_gradients.copy()
         if self._colour_table is not None:
-            tables["colours"] = self._colour_table.all_gradients(self._gradients.features)
+            tables["colours"] = self._colour_table.gradients()
         if self._gloss is not None:
             tables["gloss"], tables["environment"] = (gradient.copy() for gradient in self._gloss.gradients)
         return tables

@@ -20,12 +20,15 @@ from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import Gradients, Picture
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import GuardCounts
+from scas4d_core.kernels import balance, feature_gradients, projection, tiles
 from scas4d_core.kernels import blend as blend_kernels
-from scas4d_core.kernels import feature_gradients, projection, tiles
 from scas4d_core.kernels.jit import threads
 from scas4d_core.kernels.projection import TILE
 
 Array = NDArray[np.float32]
+
+TILE_COST = 20
+"""Cost of a tile with an empty list, relative to that of a list entry."""
 
 
 class Drawing(NamedTuple):
@@ -61,6 +64,7 @@ class ForwardPass(NamedTuple):
     covers: NDArray[np.uint64]
     learnt: NDArray[np.uint8]
     tile_order: NDArray[np.int64]
+    shares: NDArray[np.int64]
     image: Array
     transmittance: Array
     pairs: int
@@ -195,14 +199,15 @@ class CpuRasterizer:
         )  # fmt: skip
         tasks = threads()
         begins, ends = self._buffer("begins", (2, tasks), np.int64)
+        shares = self._buffer("shares", (tasks + 1,), np.int64)
         # One extra element, because pairs that do not intersect are also written, and then overwritten.
-        most = tiles.share_pairs(order, visible, counts, begins) + 1
+        most = tiles.share_pairs(order, visible, counts, shares, begins) + 1
         firsts = self._buffer("firsts", (count,), np.int64)
         pairs = self._buffer("pairs", (most, 2), np.int32)
         pair_covers = self._buffer("pair_covers", (most,), np.uint64)
         tile_counts = self._buffer("tile_counts", (tasks, tiles_x * tiles_y), np.int32)
         left = tiles.cover_tiles(
-            splats, rects, order, visible, tiles_x, self.drawn, learnt, begins, ends, counts, firsts, pairs,
+            splats, rects, order, visible, tiles_x, self.drawn, learnt, shares, begins, ends, counts, firsts, pairs,
             pair_covers, tile_counts,
         )  # fmt: skip
         self.outside_region |= left > 0
@@ -213,18 +218,18 @@ class CpuRasterizer:
         slots = self._buffer("slots", (entries,), np.int32)
         covers = self._buffer("covers", (entries,), np.uint64)
         tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
-        # Tiles are distributed round-robin, longest lists first, so that all tasks finish at about the same time.
-        tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
-        tile_order = tile_order[self.drawn[tile_order] != 0]
+        drawn = np.flatnonzero(self.drawn)
+        order_of_drawn, tile_shares = balance.distribute(starts[drawn + 1] - starts[drawn] + TILE_COST, tasks)
+        tile_order = drawn[order_of_drawn]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
         transmittance = self._buffer("transmittance", (tiles_y * TILE, tiles_x * TILE))
         blend_kernels.blend(
             splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, self.drawn,
-            tile_order, tasks, (width, height), background, self.limits, image, transmittance,
+            tile_order, tile_shares, (width, height), background, self.limits, image, transmittance,
         )  # fmt: skip
         self._last = ForwardPass(
             means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
-            learnt, tile_order, image, transmittance, most,
+            learnt, tile_order, tile_shares, image, transmittance, most,
         )  # fmt: skip
         return self.picture
 
@@ -278,8 +283,8 @@ class CpuRasterizer:
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(channels)))
         blend_kernels.blend_backward(
             last.splats, features, (0,) * (channels // blend_kernels.GROUP), last.starts, last.items, last.slots,
-            last.covers, last.learnt, last.tile_order, threads(), (last.camera.width, last.camera.height), self.limits,
-            image, last.transmittance, g_image, g_alpha, records,
+            last.covers, last.learnt, last.tile_order, last.shares, (last.camera.width, last.camera.height),
+            self.limits, image, last.transmittance, g_image, g_alpha, records,
         )  # fmt: skip
         rows, gradients = within or (np.arange(count), self._gradient_buffers(count, channels))
         shape = (-(-count // projection.CHUNK), len(projection.COUNTED_GUARDS_BACKWARD))
@@ -305,7 +310,7 @@ class CpuRasterizer:
         last, count = self._last, len(self._last.features)
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
         feature_gradients.blend_features(
-            last.splats, last.starts, last.items, last.slots, last.covers, last.learnt, last.tile_order, threads(),
+            last.splats, last.starts, last.items, last.slots, last.covers, last.learnt, last.tile_order, last.shares,
             (last.camera.width, last.camera.height), self.limits, g_image, records,
         )  # fmt: skip
         gradients = self._buffer("g_features", (count, blend_kernels.GROUP))
