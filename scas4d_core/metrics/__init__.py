@@ -1,5 +1,13 @@
 """Metrics that compare images, tracks and parts with ground truth."""
 
+from scas4d_core.metrics.benchmarks import (
+    BenchmarkScores,
+    benchmark_scores,
+    mean_trajectory_error,
+    scaled_thresholds,
+    survival,
+    tapvid_thresholds,
+)
 from scas4d_core.metrics.image import Score, flip, lpips, psnr, ssim
 from scas4d_core.metrics.parts import adjusted_rand_index
 from scas4d_core.metrics.tracks import (
@@ -13,17 +21,23 @@ from scas4d_core.metrics.tracks import (
 )
 
 __all__ = [
+    "BenchmarkScores",
     "Score",
     "TrackError",
     "adjusted_rand_index",
+    "benchmark_scores",
     "error_by_confidence",
     "flip",
     "lost_parts",
     "lpips",
+    "mean_trajectory_error",
     "median_trajectory_error",
     "oracle_tracks",
     "psnr",
+    "scaled_thresholds",
     "ssim",
+    "survival",
+    "tapvid_thresholds",
     "track_error_3d",
     "visibility_accuracy",
 ]

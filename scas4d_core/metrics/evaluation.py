@@ -7,6 +7,9 @@ These definitions complement those in ``scas4d_core.metrics``:
   channel from the ground-truth image of frame 0.
 - 3D tracks start at the ground-truth points in frame 0. 2D tracks start at the pixels of the moving points that are
   visible in a test camera in frame 0. Each track is evaluated only in frames in which its point is visible.
+- Scores of the benchmarks TAPVid-3D and MVTracker (``metrics.benchmarks``) are limited to moving points. TAPVid-3D
+  queries pixels, and its scores are averaged over test cameras. MVTracker queries points that are visible in any test
+  camera; its thresholds are scaled to the extent.
 - Parts are rendered with as many labels as the scene has foreground parts. The labels are compared at the pixels that
   show a part in the ground truth.
 - *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +84,7 @@ def measure_pictures(
 
 
 def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Computes the track scores over the given frames: 3D and 2D errors, oracle error and visibility accuracy.
+    """Computes the track scores over the given frames: errors, oracle error, visibility and benchmark scores.
 
     Args:
         reconstruction: reconstruction in which the frames are already committed.
@@ -103,16 +107,21 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
     sorted_errors = metrics.error_by_confidence(tracks.positions, points, tracks.confidence, moving, extent)
     at_last = metrics.track_error_3d(tracks.positions[[0, -1]], points[[0, -1]], moving, extent)
 
-    def depth(camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        view = reconstruction.render(camera, index)
-        return view.depth, view.alpha
-
     tolerance = depth_tolerance(reconstruction.history, reconstruction.world, indices[0])
     centroids = reconstruction.world.to_user(reconstruction.history.stacked("means", list(indices)))
     by_camera: list[Scores] = []
+    seen_anywhere, visible_anywhere = np.zeros((2, *points.shape[:2]), bool)
     for camera in rig.cameras:
-        true_uv, visible = camera.project(points)[0], truth.visible_in(camera.name)[list(indices)]
+
+        @cache  # two sets of tracks need the depth of each frame
+        def depth(camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
+            view = reconstruction.render(camera, index)
+            return view.depth, view.alpha
+
+        (true_uv, true_depth), visible = camera.project(points), truth.visible_in(camera.name)[list(indices)]
         seen = tracks.with_visibility(camera, depth, tolerance).visibility[camera.name]
+        seen_anywhere |= seen
+        visible_anywhere |= visible
         scores: Scores = {"visibility_accuracy": metrics.visibility_accuracy(seen, visible)}
         asked = moving & visible[0]
         if asked.any():
@@ -124,7 +133,14 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
                 metrics.median_trajectory_error(measured_tracks.pixels(camera), uv, counted, diagonal)
             )
             scores["mte_2d_oracle"] = _finite(metrics.median_trajectory_error(oracle, uv, counted, diagonal))
+            measured_tracks = measured_tracks.with_visibility(camera, depth, tolerance)
+            distances = np.linalg.norm(measured_tracks.positions - points[:, asked], axis=-1)
+            thresholds = metrics.tapvid_thresholds(true_depth[:, asked], (camera.fx, camera.fy))
+            scores |= _benchmark("tapvid", distances, measured_tracks.visibility[camera.name], counted, thresholds)
         by_camera.append(scores)
+    asked = moving & visible_anywhere[0]
+    distances = np.linalg.norm(tracks.positions - points, axis=-1)[:, asked]
+    seen, visible = seen_anywhere[:, asked], visible_anywhere[:, asked]
     return {
         "track_3d_median": _finite(error.median),
         "track_3d_p90": _finite(error.percentile_90),
@@ -132,8 +148,23 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
         "track_points": float(moving.sum()),
         "parts_lost": float(len(metrics.lost_parts(tracks.positions, points, truth.part_id, moving, extent))),
         **{f"track_3d_confidence_{k}": _finite(error) for k, error in enumerate(sorted_errors, 1)},
+        **_benchmark("mvtracker", distances, seen, visible, metrics.scaled_thresholds(extent)),
+        "mvtracker_mte": _finite(100 / extent * metrics.mean_trajectory_error(distances, visible)),
+        "survival": _finite(metrics.survival(distances, extent)),
         **mean_scores(by_camera),
     }
+
+
+def _benchmark(
+    name: str,
+    distances: NDArray[Any],
+    seen: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
+    thresholds: NDArray[Any],
+) -> Scores:
+    """Returns the benchmark scores of tracks, named after the benchmark; see ``metrics.benchmark_scores``."""
+    jaccard, within, occlusion = map(_finite, metrics.benchmark_scores(distances, seen, visible, thresholds))
+    return {f"{name}_aj": jaccard, f"{name}_within": within, f"{name}_oa": occlusion}
 
 
 def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
