@@ -17,8 +17,14 @@ class FrameReceipt(Model):
 
     scene: str
     index: int
-    time: float = Field(description="Timestamp of the frame in seconds.")
+    time: float = Field(
+        description="Time of the frame in seconds, later than the previous frame; `warnings` name another sent time."
+    )
     identity: str = Field(description="BLAKE3 hash of the sorted (camera, kind, file BLAKE3) entries and the time.")
+    warnings: list[str] = Field(
+        default_factory=list,
+        description="Sentences on a time that was not used as sent, or on times that are probably not seconds.",
+    )
 
 
 class CameraReceipt(Model):

@@ -140,7 +140,7 @@ class SceneCreate(Model):
     )
     frames_per_second: float = Field(
         default=30.0,
-        gt=0,
+        ge=1e-4,
         le=10_000,
         description="Frame rate. Frame n has the time n / frames_per_second unless it is sent with a timestamp.",
     )
