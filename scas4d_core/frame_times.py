@@ -56,7 +56,8 @@ def time_after(previous: FrameTime | None, index: int, sent: float, fps: float) 
 
     The sent time is used if it is later than the previous frame by ``SHORTEST_STEP`` to ``LONGEST_STEP``. Otherwise,
     the frame follows the previous one by the difference of their sent times or, if that is no such step either, by the
-    interval at the frame rate. A single wrong timestamp thus affects one frame, and a clock that was set shifts later times.
+    interval at the frame rate. Thus, a single wrong timestamp affects one frame, and a clock that was set shifts all
+    later times.
 
     Args:
         previous: the previous frame that has a time, or None.

@@ -467,8 +467,8 @@ class Reconstruction(CommittedScene):
         seconds = frame.time - self.history.time(last)
         if not (seconds > 0 and frame.time <= MAX_TIME):
             raise StepError(
-                f"frame {frame.index}: time {frame.time} s is above {MAX_TIME} s, or not after the last frame, at "
-                f"{self.history.time(last)} s"
+                f"frame {frame.index}: time {frame.time} s must be after that of the last frame, "
+                f"{self.history.time(last)} s, and at most {MAX_TIME} s"
             )
         return seconds
 

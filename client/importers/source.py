@@ -21,6 +21,7 @@ from scas4d_core.captures import CaptureError, SizeMismatch, decode_mask
 from scas4d_core.captures.images import Size, eight_bit_file
 from scas4d_core.captures.reader import read_bytes
 from scas4d_core.captures.size_mismatch import adapt_intrinsics
+from scas4d_core.errors import exact
 from scas4d_core.frame_times import MAX_TIME, ROWS, FrameTime, time_warnings
 
 Picture = NDArray[np.uint8]
@@ -177,8 +178,8 @@ def check_times(name: str, times: Sequence[float]) -> None:
     for index, (before, now) in enumerate(pairwise(times), 1):
         if now <= before:
             raise CaptureError(
-                f"{name}: frame {index} is at {now!r} s, not later than the previous one at {before!r} s; correct the "
-                "times, or omit them"
+                f"{name}: frame {index} is at {exact(now)} s, not later than the previous one at {exact(before)} s; "
+                "correct the times, or omit them"
             )
 
 

@@ -24,8 +24,8 @@ def scene_of(sent: list[float], fps: float = FPS, indices: list[int] | None = No
     return frames
 
 
-def times(sent: list[float], **more: float) -> list[float]:
-    return [frame.time for frame in scene_of(sent, **more)]
+def times(sent: list[float]) -> list[float]:
+    return [frame.time for frame in scene_of(sent)]
 
 
 def warnings(sent: list[float], fps: float = FPS) -> list[str]:
@@ -44,7 +44,9 @@ SENT = st.floats(0, MAX_TIME) | st.floats(0, 100) | st.sampled_from([0.0, 5e-324
 
 
 @given(st.lists(st.tuples(st.integers(1, 10**6), SENT), max_size=20), st.floats(1e-4, 1e4))
-def test_times_always_increase_and_never_by_more_than_a_day_or_the_missing_frames(rows, fps) -> None:
+def test_times_always_increase_and_never_by_more_than_a_day_or_the_missing_frames(
+    rows: list[tuple[int, float]], fps: float
+) -> None:
     indices = [sum(step for step, _ in rows[: place + 1]) for place in range(len(rows))]
     frames = scene_of([sent for _, sent in rows], fps, indices)
     for before, after in pairwise(frames):
