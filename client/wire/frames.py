@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from client.wire.base import Model
+from client.wire.base import DisplayText, Model
 from client.wire.budgets import Budget
 from scas4d_core.frame_outcome import AlarmKind, FrameOutcome
 
@@ -57,7 +57,7 @@ FINISHED = frozenset({FrameState.COMMITTED, FrameState.FAILED, FrameState.MISSIN
 class MissingRequest(Model):
     """A request to declare a frame permanently missing."""
 
-    reason: str = Field(default="", max_length=500, description="Human-readable reason.")
+    reason: DisplayText = Field(default="", max_length=500, description="Human-readable reason.")
 
 
 class FrameLatency(Model):

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import pytest
 from browser_page import FRAMES, shown
+from waiting import HANG_S
+
+from client.sdk import Client
+from client.stream import Stream, scene_changes
 
 PREFIX = "/studio/4d"
 
@@ -35,6 +39,14 @@ def test_the_viewer_shows_a_live_scene_under_a_prefix(page, prefixed, finished):
     assert any(url.endswith("/stream") for url in asked)
     assert [url for url in asked if not url.startswith((f"{prefixed}/", "data:", "blob:"))] == []
     assert page.faults == []
+
+
+def test_the_sdk_works_under_a_prefix(prefixed, finished):
+    with Client(f"{prefixed}/", busy_timeout=HANG_S) as sdk:
+        assert sdk.scene(finished).committed == FRAMES
+        with Stream(f"{prefixed}/", finished) as stream:
+            stream.subscribe("scene", scene_changes())
+            assert next(iter(stream)).status.committed == FRAMES
 
 
 def test_the_reference_sends_its_requests_under_a_prefix(page, prefixed, finished):
