@@ -117,10 +117,12 @@ def time_warnings(frames: Sequence[FrameTime], fps: float) -> list[str]:
             f"the times are probably {what}: frame {newest.index} has the time {newest.sent!r}{apart}; {remedy}"
         )
     if newest.time != newest.sent:
+        fault = f"above {LATEST_FIRST:.0f} s"
+        if len(frames) > 1:
+            fault = f"not 1 µs to 1 day after frame {frames[-2].index} at {frames[-2].time!r} s"
         warnings.append(
-            f"frame {newest.index} has the time {newest.time!r} s instead of the sent {newest.sent!r}, because sent "
-            f"times must increase by at most {LONGEST_STEP:.0f} s per frame and start below {LATEST_FIRST:.0f} s; take "
-            "them from a clock that is never set, or omit them"
+            f"frame {newest.index} has the time {newest.time!r} s instead of the sent {newest.sent!r} s, which is "
+            f"{fault}; take the times from a clock that is never set, or omit them"
         )
     return warnings
 

@@ -277,9 +277,17 @@ class Ledger:
         return newest[::-1]
 
     def accepted_event(
-        self, index: int, sent: float, hashes: Hashes, files: tuple[str, ...], fps: float, closed_by: ClosedBy
+        self,
+        index: int,
+        sent: float,
+        hashes: Hashes,
+        files: tuple[str, ...],
+        fps: float,
+        closed_by: ClosedBy,
+        *,
+        time: float | None = None,
     ) -> FrameAccepted:
-        """Returns the event that acknowledges a frame, with the time that follows from the sent time.
+        """Returns the event that acknowledges a frame.
 
         Args:
             index: frame index; earlier frames are closed.
@@ -288,9 +296,11 @@ class Ledger:
             files: names of the frame's records in the frame log.
             fps: frame rate of the scene.
             closed_by: reason why the frame is closed.
+            time: time of the frame in seconds; None to compute it from the sent time.
         """
-        previous = self.times_before(index)
-        time = time_after(previous[0] if previous else None, index, sent, fps)
+        if time is None:
+            previous = self.times_before(index)
+            time = time_after(previous[0] if previous else None, index, sent, fps)
         return FrameAccepted(
             index=index,
             time=time,

@@ -252,7 +252,7 @@ def _events_of(
     whole = [name for name, events in pictures.items() if not events.part]
     parts = {name: events for name, events in pictures.items() if events.part}
     if len(names) == len(whole) == 1:
-        accepted = _frame_event(index, whole[0], pictures[whole[0]], ledger, fps)
+        accepted = _frame_event(index, whole[0], pictures[whole[0]], ledger, states.times.get(index), fps)
     elif index < ledger.next_frame:
         accepted = _close_event(index, parts, states.times.get(index))
     else:
@@ -281,10 +281,13 @@ def _fault_of(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     return None
 
 
-def _frame_event(index: int, name: str, pictures: StoredPictures, ledger: Ledger, fps: float) -> FrameAccepted | None:
+def _frame_event(
+    index: int, name: str, pictures: StoredPictures, ledger: Ledger, time: float | None, fps: float
+) -> FrameAccepted | None:
+    """Returns the event of a frame that was uploaded as a whole; `time` is that of its committed state, if any."""
     if pictures.time is None:
         return None
-    return ledger.accepted_event(index, pictures.time, pictures.hashes, (name,), fps, "found")
+    return ledger.accepted_event(index, pictures.time, pictures.hashes, (name,), fps, "found", time=time)
 
 
 def _close_event(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:

@@ -84,7 +84,7 @@ def test_a_clock_that_was_set_back_shifts_all_later_times(second: float) -> None
     scene = times(sent)
     assert scene[:5] == sent[:5]
     assert steps(scene) == pytest.approx([1 / FPS] * 9, abs=1e-6)
-    assert f"frame 9 has the time {scene[9]!r} s instead of the sent {sent[9]!r}" in warnings(sent)[-1]
+    assert f"frame 9 has the time {scene[9]!r} s instead of the sent {sent[9]!r} s, " in warnings(sent)[-1]
 
 
 def test_the_same_time_for_every_frame_gives_the_frame_rate() -> None:

@@ -122,13 +122,26 @@ def test_no_time_that_is_accepted_ends_a_scene_and_receipts_stay_the_same(tmp_pa
         assert again[0]["time"] == pytest.approx(times[-1] + 0.1, rel=1e-9)
 
 
+def test_times_are_recovered_without_the_journal(tmp_path):
+    sent = [5.0, 1.0, 1.1]
+    with serving(tmp_path) as (http, _):
+        scene = create(http)
+        receipts = send_all(http, scene, sent)
+        settled(http, scene)
+    next(tmp_path.rglob("journal.log")).unlink()
+    with serving(tmp_path) as (http, _):
+        assert [put_framed(http, scene, index, time=time).json() for index, time in enumerate(sent)] == receipts
+        assert send_all(http, scene, [1.2], first=3)[0]["time"] == pytest.approx(5.3)
+
+
 def test_a_clock_that_was_set_back_is_named_with_exact_numbers(http, make):
     scene = make()
     sent = [123456.7890123, 123456.8890123, 5.0]
     receipts = send_all(http, scene, sent)
     assert receipts[2]["time"] == 123456.8890123 + 0.1
     [text] = receipts[2]["warnings"]
-    assert f"frame 2 has the time {receipts[2]['time']!r} s instead of the sent 5.0" in text
+    assert f"frame 2 has the time {receipts[2]['time']!r} s instead of the sent 5.0 s" in text
+    assert "after frame 1 at 123456.8890123 s" in text
 
 
 def test_milliseconds_are_named_in_the_receipt_and_in_the_status(http, make):
