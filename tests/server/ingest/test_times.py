@@ -177,3 +177,9 @@ def test_frames_numbered_by_the_service_go_on_after_a_clock_was_set_back(http, m
             assert answer.json()["answers"][0]["receipt"]["index"] == index
         finished(http, scene, index)
     assert status(http, scene)["next_frame"] == 4
+    again = http.post(
+        f"/v1/scenes/{scene}/frames", content=framed(9, pictures(7), time=3.1), headers=FRAMED, params=query
+    )
+    [answer] = again.json()["answers"]
+    assert (answer["status"], answer["problem"]["field"], answer["problem"]["value"]) == (409, "time", "3.1")
+    assert "numbering=given" in answer["problem"]["remedy"]
