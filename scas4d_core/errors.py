@@ -27,6 +27,18 @@ class InputError(ValueError):
         self.fault, self.remedy = fault, remedy
 
 
+def exact(number: float) -> str:
+    """Returns a number in the shortest decimal form that gives the same number when it is entered.
+
+    >>> exact(30.0), exact(1e-05), exact(1048576), exact(1764363600.25)
+    ('30', '1e-05', '1048576', '1764363600.25')
+    """
+    short = f"{number:g}"
+    if float(short) == number and "e+" not in short:
+        return short
+    return repr(number).removesuffix(".0")
+
+
 def without_paths(text: str) -> str:
     """Replaces each absolute path in a text by the last component of the path.
 

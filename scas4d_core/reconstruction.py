@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
-from math import inf, isfinite
+from math import isfinite
 from time import perf_counter
 from typing import Any
 
@@ -42,6 +42,7 @@ from scas4d_core.first_frame.fit_first_frame import (
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_context import FrameContext, FrameInput
 from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
+from scas4d_core.frame_times import MAX_TIME
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, PreparedUpdate, room_for_births
 from scas4d_core.progress import Progress
@@ -167,11 +168,11 @@ class Reconstruction(CommittedScene):
 
         Raises:
             RigError: if the rig is unusable with these settings.
-            ValueError: if the time of the frame is not finite, or an image does not have the size
-                of its camera.
+            ValueError: if the time of the frame is not within ±``MAX_TIME``, or an image does not
+                have the size of its camera.
         """
-        if not isfinite(frame.time):
-            raise ValueError(f"frame {frame.index}: time must be finite; got {frame.time} s")
+        if not abs(frame.time) <= MAX_TIME:
+            raise ValueError(f"frame {frame.index}: time must be within ±{MAX_TIME} s; got {frame.time} s")
         if static is None:
             check_rig(rig, settings.scene, None if points is None else points.positions)
         began, on_progress = perf_counter(), progress or (lambda _: None)
@@ -458,15 +459,16 @@ class Reconstruction(CommittedScene):
         """Returns the time in seconds from the last committed frame to a later frame.
 
         Raises:
-            StepError: if the frame is not later than the last committed one.
+            StepError: if the frame is not later than the last committed one, or its time exceeds ``MAX_TIME``.
         """
         last = self.history.newest_index
         if frame.index <= last:
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
         seconds = frame.time - self.history.time(last)
-        if not 0 < seconds < inf:
+        if not (seconds > 0 and frame.time <= MAX_TIME):
             raise StepError(
-                f"frame {frame.index}: time {frame.time} s is not after the last frame, at {self.history.time(last)} s"
+                f"frame {frame.index}: time {frame.time} s must be after that of the last frame, "
+                f"{self.history.time(last)} s, and at most {MAX_TIME} s"
             )
         return seconds
 

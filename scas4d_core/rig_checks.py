@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import ONE_PLACE, Camera, CameraError, Rig
+from scas4d_core.errors import exact
 from scas4d_core.settings import SceneSettings
 
 Float = NDArray[np.float64]
@@ -100,12 +101,13 @@ def check_scene(rig: Rig, scene: SceneSettings) -> None:
     """
     for number, camera in enumerate(rig.cameras):
         longer = max(camera.width, camera.height)
+        least, most = (exact(bound * longer) for bound in FOCAL_LENGTHS)
         for focal in (camera.fx, camera.fy):
             if not FOCAL_LENGTHS[0] <= focal / longer <= FOCAL_LENGTHS[1]:
                 raise RigError(
                     f"camera {camera.name!r}: focal length {focal:g} px is {focal / longer:.3g} times the longer image "
                     f"side of {longer} px",
-                    f"use focal lengths in pixels, {FOCAL_LENGTHS[0] * longer:g} to {FOCAL_LENGTHS[1] * longer:g}",
+                    f"use focal lengths in pixels, {least} to {most}",
                     f"rig.cameras.{number}.intrinsics",
                     focal,
                 )
@@ -127,7 +129,7 @@ def _too_small(camera: Camera, small: Camera, number: int, scale: float) -> None
     raise RigError(
         f"image_scale {scale:g} reduces camera {camera.name!r} from {camera.width}x{camera.height} to "
         f"{small.width}x{small.height} pixels",
-        f"use at least {np.ceil(100 * least) / 100:g}",
+        f"use at least {exact(np.ceil(100 * least) / 100)}",
         "settings.scene.image_scale",
         scale,
     )

@@ -14,6 +14,7 @@ HEAVY = ("torch", "numba", "scipy", "sklearn", "pycolmap", "fastapi", "uvicorn")
 LIGHT_ROOMS = (
     "scas4d_core.errors",
     "scas4d_core.frame_outcome",
+    "scas4d_core.frame_times",
     "scas4d_core.cameras",
     "scas4d_core.captures",
     "scas4d_core.settings",

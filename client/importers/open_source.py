@@ -17,7 +17,7 @@ from client.importers.pictures import (
     masks_of,
     named_files,
 )
-from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fit_to_pictures
+from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fit_to_pictures, unit_remarks
 from client.importers.videos import Videos
 from scas4d_core.captures import Capture, CaptureError, SizeMismatch, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
@@ -151,8 +151,9 @@ def _imported(
         points=found.points,
         remarks=(*found.remarks, *resized, *reader.remarks),
     )
-    check_times(capture.name, [capture.time(index) for index in range(capture.frame_count)])
-    return capture.with_held_out(found.test)
+    times = [capture.time(index) for index in range(capture.frame_count)]
+    check_times(capture.name, times)
+    return replace(capture, remarks=(*capture.remarks, *unit_remarks(times, capture.fps))).with_held_out(found.test)
 
 
 def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> tuple[Calibration, RawReader]:

@@ -21,6 +21,8 @@ from scas4d_core.captures import CaptureError, SizeMismatch, decode_mask
 from scas4d_core.captures.images import Size, eight_bit_file
 from scas4d_core.captures.reader import read_bytes
 from scas4d_core.captures.size_mismatch import adapt_intrinsics
+from scas4d_core.errors import exact
+from scas4d_core.frame_times import MAX_TIME, ROWS, FrameTime, time_warnings
 
 Picture = NDArray[np.uint8]
 Encoding = Literal["jpeg", "png"]
@@ -164,16 +166,27 @@ def fit_to_pictures(
 
 
 def check_times(name: str, times: Sequence[float]) -> None:
-    """Checks that the frame times [T] are strictly increasing.
+    """Checks that the frame times [T] are finite and strictly increasing.
 
     Raises:
-        CaptureError: if a frame is not later than the previous one. The message names the frame.
+        CaptureError: if a time is not within ±`MAX_TIME`, or not later than the previous one. The message names the
+            frame.
     """
+    for index, now in enumerate(times):
+        if not abs(now) <= MAX_TIME:
+            raise CaptureError(f"{name}: frame {index} is at {now!r} s; give the times in seconds, or omit them")
     for index, (before, now) in enumerate(pairwise(times), 1):
         if now <= before:
             raise CaptureError(
-                f"{name}: frame {index} is at {now:g} s, not later than the previous one at {before:g} s"
+                f"{name}: frame {index} is at {exact(now)} s, not later than the previous one at {exact(before)} s; "
+                "correct the times, or omit them"
             )
+
+
+def unit_remarks(times: Sequence[float], fps: float) -> list[str]:
+    """Returns a remark if the frame times [T] are probably not seconds."""
+    frames = [FrameTime(index, time, time) for index, time in enumerate(times[:ROWS])]
+    return time_warnings(frames, fps)
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:

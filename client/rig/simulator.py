@@ -15,6 +15,7 @@ from client.rig.sender import OnMessage, Requests, Sender, Sockets
 from client.rig.sequence import Sequence
 from client.sdk import Client
 from client.wire import IngestSettings, SceneStatus
+from client.wire.base import MAX_NAME, escaped
 from scas4d_core.captures import Capture
 
 OnProgress = Callable[[str, int, int], None]
@@ -93,7 +94,7 @@ def push(
         if scene is None:
             status = client.create_scene(
                 source.full_rig,
-                name=source.name if name is None else name,
+                name=escaped(source.name)[:MAX_NAME] if name is None else name,
                 preset=preset,
                 settings=settings,
                 frames_per_second=source.fps,

@@ -13,6 +13,8 @@ from scas4d_core.errors import InputError
 MAX_CAMERAS = 512
 MAX_PIXELS_A_SIDE = 16_384
 MAX_LABELS = 16
+MAX_NAME = 200
+"""Maximum number of characters of a scene's name."""
 LABEL_WORD = r"[A-Za-z0-9](?:[A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?"
 """Pattern for a label's value and for both parts of its name around the slash, as accepted by Ray and Kubernetes."""
 
@@ -37,6 +39,30 @@ def check_labels(labels: dict[str, str]) -> dict[str, str]:
                 )
     return labels
 
+
+CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that control a terminal, break lines, reverse the order of text or are not Unicode text."""
+
+
+def escaped(text: str) -> str:
+    """Returns the text with its control characters as escape sequences.
+
+    >>> escaped("studio\\n4")
+    'studio\\\\n4'
+    """
+    return CONTROL.sub(lambda control: ascii(control[0])[1:-1], text)
+
+
+def check_text(text: str) -> str:
+    """Returns the text unchanged, or raises an `InputError` if it contains a control character."""
+    if (control := CONTROL.search(text)) is not None:
+        fault = f"contains the control character {control[0]!a} at position {control.start()}"
+        raise InputError(fault, "use printable text without line breaks")
+    return text
+
+
+DisplayText = Annotated[str, AfterValidator(check_text)]
+"""Text that other users see in terminals, logs and the viewer."""
 
 Labels = Annotated[dict[str, str], Field(max_length=MAX_LABELS), AfterValidator(check_labels)]
 """Node labels: values keyed by name."""

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from client.wire.base import Model
+from client.wire.base import DisplayText, Model
 from client.wire.budgets import Budget
 from scas4d_core.frame_outcome import AlarmKind, FrameOutcome
 
@@ -17,8 +17,14 @@ class FrameReceipt(Model):
 
     scene: str
     index: int
-    time: float = Field(description="Timestamp of the frame in seconds.")
+    time: float = Field(
+        description="Time of the frame in seconds, later than the previous frame; `warnings` name another sent time."
+    )
     identity: str = Field(description="BLAKE3 hash of the sorted (camera, kind, file BLAKE3) entries and the time.")
+    warnings: list[str] = Field(
+        default_factory=list,
+        description="Sentences on a time that was not used as sent, or on times that are probably not seconds.",
+    )
 
 
 class CameraReceipt(Model):
@@ -51,7 +57,7 @@ FINISHED = frozenset({FrameState.COMMITTED, FrameState.FAILED, FrameState.MISSIN
 class MissingRequest(Model):
     """A request to declare a frame permanently missing."""
 
-    reason: str = Field(default="", max_length=500, description="Human-readable reason.")
+    reason: DisplayText = Field(default="", max_length=500, description="Human-readable reason.")
 
 
 class FrameLatency(Model):

@@ -18,12 +18,13 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from client.wire.base import MAX_CAMERAS, CameraName, Model
 from client.wire.frames import CameraReceipt, FrameReceipt
 from client.wire.service import ProblemDetails
 from scas4d_core.errors import InputError
+from scas4d_core.frame_times import check_time
 
 FRAME_MEDIA_TYPE = "application/vnd.scas4d.frame"
 MAGIC = b"S4DF"
@@ -33,8 +34,21 @@ MAX_HEAD = 1 << 20
 MAX_INDEX = 1_000_000_000
 
 
+FrameSeconds = Annotated[float, AfterValidator(check_time)]
+"""Time of a frame as sent, in seconds."""
+
+
 class FramingError(InputError):
-    """Raised for invalid frame bytes. The message states the problem and the remedy."""
+    """Raised for invalid frame bytes. The message states the problem and the remedy.
+
+    Attributes:
+        field: invalid field: `body`, or `time` in the header.
+        value: invalid value.
+    """
+
+    def __init__(self, fault: str, remedy: str, *, field: str = "body", value: object = None) -> None:
+        super().__init__(fault, remedy)
+        self.field, self.value = field, fault if value is None else value
 
 
 class FileKind(StrEnum):
@@ -56,7 +70,7 @@ class FrameHead(Model):
     """The header of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
-    time: FiniteFloat | None = Field(
+    time: FrameSeconds | None = Field(
         default=None, description="Timestamp in seconds; default: the index divided by the scene's frame rate."
     )
     files: Annotated[list[FrameFile], Field(min_length=1, max_length=2 * MAX_CAMERAS)]
@@ -145,6 +159,9 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
         return FrameHead.model_validate_json(bytes(data))
     except ValidationError as error:
         first = error.errors()[0]
+        if isinstance(wrong := first.get("ctx", {}).get("error"), InputError) and first["loc"] == ("time",):
+            fault = f"has an invalid time: {wrong.fault}"
+            raise FramingError(fault, wrong.remedy, field="time", value=first["input"]) from None
         field = ".".join(str(part) for part in first["loc"])
         raise FramingError(
             f"has an invalid header{' field ' + field if field else ''}: {first['msg']}", "correct the header"

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from client.wire.base import MAX_CAMERAS, Labels, Model
+from client.wire.base import MAX_CAMERAS, MAX_NAME, DisplayText, Labels, Model
 from client.wire.budgets import Budget
 from client.wire.frames import EffectModel
 from client.wire.rigs import RigModel
@@ -131,7 +131,9 @@ class SceneCreate(Model):
     """A request to create a scene from a rig and settings."""
 
     rig: RigModel
-    name: str = Field(default="", max_length=200, description="Display name; the service generates the id.")
+    name: DisplayText = Field(
+        default="", max_length=MAX_NAME, description="Display name; the service generates the id."
+    )
     preset: str = Field(
         default="scas4d", max_length=64, description="Name of the preset that provides the default settings."
     )
@@ -140,7 +142,7 @@ class SceneCreate(Model):
     )
     frames_per_second: float = Field(
         default=30.0,
-        gt=0,
+        ge=1e-4,
         le=10_000,
         description="Frame rate. Frame n has the time n / frames_per_second unless it is sent with a timestamp.",
     )
@@ -156,7 +158,7 @@ class SceneCreate(Model):
 class SceneEdit(Model):
     """Changes to a scene. Omitted and null fields stay unchanged."""
 
-    name: str | None = Field(default=None, max_length=200, description="New name.")
+    name: DisplayText | None = Field(default=None, max_length=MAX_NAME, description="New name.")
     archived: bool | None = Field(
         default=None,
         strict=True,

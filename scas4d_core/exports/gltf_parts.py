@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.errors import InputError
+from scas4d_core.errors import InputError, exact
 from scas4d_core.exports.atomic_files import check_writable
 from scas4d_core.exports.cloud import HALF_TURN, Cloud, cloud_of
 from scas4d_core.exports.glb import Binary
@@ -109,7 +109,7 @@ class PartAsset:
             self._keys = {part: _Keyframes() for part in self._motion.parts}
         elif not time > self._latest:
             raise InputError(
-                f"time {time:g} s of frame {index} is not later than that of the previous frame, {self._latest:g} s",
+                f"time {exact(time)} s of frame {index} is not later than the previous frame, {exact(self._latest)} s",
                 "add frames in chronological order",
             )
         self._latest = time

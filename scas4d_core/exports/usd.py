@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame
-from scas4d_core.errors import InputError
+from scas4d_core.errors import InputError, exact
 from scas4d_core.exports.atomic_files import atomic_path, import_optional, translate_write_errors
 from scas4d_core.exports.cloud import Cloud, cloud_of, linear_light
 from scas4d_core.exports.part_motion import PartMotion, part_labels, quaternion_of
@@ -135,7 +135,7 @@ class UsdSequence:
         """
         if self._first_index is not None and not time > self._latest:
             raise InputError(
-                f"time {time:g} s of frame {index} is not later than that of the previous frame, {self._latest:g} s",
+                f"time {exact(time)} s of frame {index} is not later than the previous frame, {exact(self._latest)} s",
                 "add frames in chronological order",
             )
         cloud = cloud_of(gaussians, self._world, retired=True).half_turned()

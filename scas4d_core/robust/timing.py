@@ -45,6 +45,8 @@ USUAL = 0.1
 """Variation of a camera's measurements in fast motion, in frames, caused by tracking lag and curved motion."""
 FARTHEST = 0.75
 """Limit to which a measured offset is clamped, in frames. Motion that reverses has no measurable shift."""
+LONG_GAP = 3.0
+"""Duration of a frame, in multiples of the mean duration, above which the weight of a measurement decreases."""
 KEEPS = 0.95
 """Factor by which each new measurement multiplies the weights of earlier ones. Effectively, the last forty count."""
 ENOUGH = 2.5
@@ -101,12 +103,15 @@ class CameraTimingSums:
             frame: time since the previous frame, in seconds.
         """
         weight = 1 / (NEIGHBOURS * look.variance + USUAL**2)
+        usual = self.frame / self.weight if self.weight > 0 else frame
+        if frame > LONG_GAP * usual:  # otherwise, a gap would count as much as all frames that it replaces
+            weight *= (usual / frame) * (usual / frame)
         seconds = way * min(FARTHEST, max(-FARTHEST, look.offset))
         return CameraTimingSums(
             KEEPS * self.weight + weight,
             KEEPS**2 * self.squares + weight**2,
             KEEPS * self.offset + weight * seconds,
-            KEEPS * self.spread + weight * seconds**2,
+            KEEPS * self.spread + weight * seconds * seconds,
             KEEPS * self.frame + weight * frame,
             self.last,
         )

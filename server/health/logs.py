@@ -12,6 +12,8 @@ import sys
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from client.wire.base import escaped
+
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.(?:ticket|read)\.|(?:token|ticket)=)[^\s\"',;&]+")
 """Pattern of secrets and the text before them. Secrets are masked in all messages, since any may quote a request."""
 
@@ -42,10 +44,17 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Formatter for human readers, with the time of day, the message and, for warnings and above, the level."""
+    """Formatter for human readers, with the time of day, the message and, for warnings and above, the level.
+
+    Control characters of the message are escaped, because it may quote a request.
+    """
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Returns the time and the message as one line."""
+        return escaped(super().formatMessage(record))
 
     def format(self, record: logging.LogRecord) -> str:
         """Returns the record as one line, or several lines if it has a traceback."""

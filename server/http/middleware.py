@@ -75,7 +75,7 @@ class AccessLog:
 
 
 class BodyLimit:
-    """Middleware that responds with 413 to bodies of more than `limit` bytes.
+    """Middleware that responds with 413 to bodies of more than `limit` bytes, and with 415 to compressed bodies.
 
     A body with a Content-Length is rejected immediately; any other body is rejected while it is being read.
     """
@@ -89,7 +89,12 @@ class BodyLimit:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        announced = dict(scope["headers"]).get(b"content-length", b"0")
+        headers = dict(scope["headers"])
+        coding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip()
+        if coding.lower() not in ("", "identity"):
+            await problems.refuse(_coding_problem(coding), scope, receive, send)
+            return
+        announced = headers.get(b"content-length", b"0")
         if not announced.isdigit() or int(announced) > self.limit:
             await problems.problem_response(self._problem(announced.decode("latin-1")).document)(scope, receive, send)
             return
@@ -113,6 +118,17 @@ class BodyLimit:
             value=value,
             remedy="send smaller or more strongly compressed images, or raise SCAS4D_MAX_BODY_MB",
         )
+
+
+def _coding_problem(coding: str) -> Problem:
+    return Problem(
+        415,
+        f"the body has the content coding {coding!r}, but only bodies without one are read",
+        field="Content-Encoding",
+        value=coding,
+        remedy="send the body uncompressed, without Content-Encoding; images are compressed already",
+        headers={"Accept-Encoding": "identity"},
+    )
 
 
 def compress_responses(app: ASGIApp) -> GZipMiddleware:

@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from scas4d_core.errors import InputError
+from scas4d_core.errors import InputError, exact
 from server.problems import Problem, count_noun
 
 MISSING = "nothing"
@@ -136,7 +136,7 @@ def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str)
         near = difflib.get_close_matches(name, known, 1)
         meant = f"did you mean {near[0]!r}? " if near else ""
         return f"{meant}omit it, or use one of {', '.join(known)}" if known else f"omit it; {schema}"
-    if bounds := [f"{words} {context[bound]:g}" for bound, words in BOUNDS.items() if bound in context]:
+    if bounds := [f"{words} {exact(context[bound])}" for bound, words in BOUNDS.items() if bound in context]:
         return f"use a number that is {' and '.join(bounds)}"
     if kind in ("literal_error", "enum"):
         return f"use one of {context['expected']}"

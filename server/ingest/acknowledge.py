@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
@@ -10,16 +11,19 @@ from typing import Any, Literal, TypeVar
 
 from client.wire import FrameHead, FrameReceipt, FrameState, SceneCreate, SceneState
 from scas4d_core.cameras import Rig
+from scas4d_core.frame_times import ROWS, time_warnings
 from server import counters
 from server.hub import Publisher
 from server.problems import Problem, count_noun
 from server.settings import ServerSettings
-from server.storage.events import FrameAccepted, FramesSkipped, Hashes
+from server.storage.events import ClosedBy, FramesSkipped, Hashes
 from server.storage.frame_table import RECORD_LOST
 from server.storage.ledger import SceneLog, frame_identity
 from server.updates.updates import Updates
 
 T = TypeVar("T")
+
+log = logging.getLogger("scas4d.server")
 
 MAX_SOCKETS = 64
 """Maximum number of WebSockets that send frames to one scene; clients may use one per camera."""
@@ -106,6 +110,7 @@ class Ingest:
         self._publisher = publisher
         self._can_begin = can_begin
         self._sockets = 0
+        self._warns_of_times = False
         self._receiving: dict[int, asyncio.Event] = {}
         """Complete frames that are being received, each with an event that is set at the end of the transfer.
 
@@ -148,7 +153,7 @@ class Ingest:
         while awaited in self._receiving:
             awaited += 1
         if head.index == next_frame:
-            self.admit(head.index, self.time_of(head.index, head.time))
+            self.admit(head.index)
         elif head.index > awaited:
             raise self.gap_problem(head.index)
         else:  # earlier frames are still arriving; this frame is checked after them
@@ -172,8 +177,8 @@ class Ingest:
         """Acknowledges and queues a frame whose images are on disk; a known frame gets the same receipt again.
 
         Raises:
-            Problem: 409 for a gap, different content under a known index, or a failed scene; 422 for a time that is not
-                later than the previous one; 429 if the queue is full; 507 if the disk is full.
+            Problem: 409 for a gap, different content under a known index, or a failed scene; 429 if the queue is full;
+                507 if the disk is full.
         """
         while (before := self._receiving.get(head.index - 1)) is not None and head.index > self.ledger.next_frame:
             await before.wait()
@@ -181,38 +186,57 @@ class Ingest:
 
     async def _accept(self, head: FrameHead, received: ReceivedFiles) -> FrameReceipt:
         seconds = self.time_of(head.index, head.time)
-        identity = frame_identity(received.hashes, seconds)
         async with self.log.lock:
             if head.index < self.ledger.next_frame:
-                return self._existing_receipt(head.index, identity)
-            self.admit(head.index, seconds)
+                return self._existing_receipt(head.index, received.hashes, seconds)
+            self.admit(head.index)
             if received.file is None:  # only known frames have no file, and a scene never forgets them
                 raise AssertionError(f"frame {head.index} was not written")
-            event = FrameAccepted(index=head.index, time=seconds, identity=identity, files=(received.file,))
-            receipt = await self.acknowledge(event)
+            receipt = await self.acknowledge(head.index, seconds, received.hashes, (received.file,), "whole")
             self.log.pictures.add(received.file, received.size)
             received.kept = True
             counters.INGEST_BYTES.inc(received.size)
         self.updates.begin()
         return receipt
 
-    async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
+    async def acknowledge(
+        self, index: int, sent: float, hashes: Hashes, files: tuple[str, ...], closed_by: ClosedBy
+    ) -> FrameReceipt:
         """Journals a frame and any frames skipped to make room for it; the caller must hold the log's lock.
+
+        Args:
+            index: index of the frame.
+            sent: time of the frame in seconds, as returned by `time_of`.
+            hashes: digests of its files.
+            files: names of its records in the frame log.
+            closed_by: reason why the frame is closed.
 
         Raises:
             Problem: 507 if the disk is full.
         """
-        skipped = self._skip_event(event.index)
+        event = self.ledger.accepted_event(index, sent, hashes, files, self.rules.frames_per_second, closed_by)
+        skipped = self._skip_event(index)
         await self.log.append(*skipped, event)
-        for index in (index for one in skipped for index in one.frames):
-            self.publish_ended(index)
+        for ended in (ended for one in skipped for ended in one.frames):
+            self.publish_ended(ended)
         counters.FRAMES.labels("acknowledged").inc()
-        self.updates.latencies.receive(event.index)
-        if self.ledger.frames[event.index].finished:  # the frame precedes the first frame of the reconstruction
-            self.publish_ended(event.index)
-        receipt = self.ledger.frames[event.index].receipt
+        self.updates.latencies.receive(index)
+        if self.ledger.frames[index].finished:  # the frame precedes the first frame of the reconstruction
+            self.publish_ended(index)
+        receipt = self.receipt_of(index)
         assert receipt is not None
+        if receipt.warnings and not self._warns_of_times:
+            log.warning("scene %s: %s", self.ledger.scene, "; ".join(receipt.warnings))
+        self._warns_of_times = bool(receipt.warnings)
         return receipt
+
+    def receipt_of(self, index: int) -> FrameReceipt | None:
+        """Returns the receipt of a closed frame with the warnings about its time, or None if it has no receipt."""
+        receipt = self.ledger.frames[index].receipt
+        if receipt is None:
+            return None
+        warnings = time_warnings(self.ledger.times_before(index + 1, ROWS), self.rules.frames_per_second)
+        return receipt.model_copy(update={"warnings": warnings})
 
     def publish_ended(self, index: int) -> None:
         """Publishes a frame that ended without an update: skipped, missing, or before the first reconstructed frame."""
@@ -221,11 +245,11 @@ class Ingest:
     # Rules. These methods do not change any state.
 
     def time_of(self, index: int, time: float | None) -> float:
-        """Returns `time` if given, otherwise the frame's time in seconds computed from the scene's frame rate."""
+        """Returns the sent time if there is one, otherwise the time in seconds that follows from the frame rate."""
         return index / self.rules.frames_per_second if time is None else time
 
     def index_at(self, time: float | None) -> int:
-        """Returns the index of the known frame with this time, or the next free index.
+        """Returns the index of the known frame that was sent with this time, or the next free index.
 
         Raises:
             Problem: 422 if there is no time, without which a repeated frame cannot be recognised.
@@ -238,10 +262,10 @@ class Ingest:
                 value="null",
                 remedy="send the time of every frame in seconds, or use numbering=given",
             )
-        known = self.ledger.index_at(time)
+        known = self.ledger.frames.index_at(time)
         return self.ledger.next_frame if known is None else known
 
-    def admit(self, index: int, seconds: float) -> None:
+    def admit(self, index: int) -> None:
         """Raises `Problem` if a frame cannot be accepted as the next one."""
         self.refuse_if_stopped()
         if index != self.ledger.next_frame:
@@ -256,7 +280,6 @@ class Ingest:
                 f"POST /v1/scenes/{self.ledger.scene}/frames/{index}/close",
                 received=self.ledger.open[index].cameras,
             )
-        self.check_time(index, seconds)
         if not self.has_room():
             raise self.queue_full_problem(index)
 
@@ -299,18 +322,6 @@ class Ingest:
             expected=expected,
         )
 
-    def check_time(self, index: int, seconds: float) -> None:
-        """Raises `Problem` (422) if the time of a frame is not later than that of the previous frame."""
-        before = self.ledger.last_time()
-        if not (math.isfinite(seconds) and (before is None or seconds > before)):
-            raise Problem(
-                422,
-                f"the time of frame {index} must be finite and later than that of the previous frame",
-                field="time",
-                value=seconds,
-                remedy="use a finite time" if before is None else f"use a time after {before:g} s",
-            )
-
     def has_room(self) -> bool:
         """Returns whether the queue accepts another frame, skipping others if necessary."""
         if self.ledger.unfinished < self.rules.queue_frames:
@@ -352,15 +363,16 @@ class Ingest:
         asked_for = None if ledger.begun is None or ledger.committed else ledger.begun.index
         return tuple(index for index in ledger.waiting() if index != asked_for)
 
-    def _existing_receipt(self, index: int, identity: str) -> FrameReceipt:
-        """Returns the receipt of a known frame with the same content.
+    def _existing_receipt(self, index: int, hashes: Hashes, sent: float) -> FrameReceipt:
+        """Returns the receipt of a known frame with the same content and the same sent time.
 
         Raises:
             Problem: 409 if the content differs or the frame has no receipt.
         """
         entry = self.ledger.frames[index]
-        receipt = entry.receipt
-        if receipt is not None and receipt.identity == identity:
+        receipt, times = self.receipt_of(index), entry.times
+        same = times is not None and times.sent == sent and entry.identity == frame_identity(hashes, times.time)
+        if receipt is not None and same:
             return receipt
         known = "already stored with different content or a different time"
         if receipt is None:

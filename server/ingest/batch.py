@@ -118,6 +118,8 @@ class Batch:
                 await self._skip_refused(head.index)
             receipt = await receive(head)
         except Problem as problem:
+            if self._numbering is Numbering.NEXT and head.index < self._ingest.ledger.next_frame:
+                problem = _known_time_problem(head, problem)
             self.refuse(head.index, problem)
         except Exception as error:
             log.exception("scene %s: receiving a frame of a batch failed", self._ingest.ledger.scene)
@@ -142,6 +144,19 @@ class Batch:
             reason = f"refused in a batch: {before.problem.detail}"[:LONGEST_REASON]
             await self._frames.declare_missing(before.index, reason)
             self.answers[-1] = before.model_copy(update={"missing": True})
+
+
+def _known_time_problem(head: FrameHead, problem: Problem) -> Problem:
+    """Returns the problem for a frame whose time is that of a known frame, but whose content is not."""
+    if problem.status_code != 409:
+        return problem
+    return Problem(
+        409,
+        f"{problem.detail}; it was sent with the same time, which identifies repeated frames",
+        field="time",
+        value=head.time,
+        remedy="give every frame its own time, or send the frames with their indices (numbering=given)",
+    )
 
 
 def refusal(index: int | None, problem: Problem) -> IngestAnswer:

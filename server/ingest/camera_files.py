@@ -10,6 +10,8 @@ from starlette.datastructures import UploadFile
 
 from client.wire import CameraReceipt, FileKind, FrameFile, FrameHead, FrameReceipt
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.errors import InputError
+from scas4d_core.frame_times import check_time
 from server.ingest.acknowledge import Ingest
 from server.ingest.open_frames import OpenFrames
 from server.ingest.pictures import MASK, check_files, check_size
@@ -191,12 +193,7 @@ def _seconds(value: str) -> float:
         seconds = float(value)
     except ValueError:
         seconds = math.nan
-    if not math.isfinite(seconds):
-        raise Problem(
-            422,
-            "time must be a finite number",
-            field="time",
-            value=value,
-            remedy="use seconds, such as 1.25, or omit time",
-        )
-    return seconds
+    try:
+        return check_time(seconds)
+    except InputError as error:
+        raise Problem(422, error.fault, field="time", value=value, remedy=error.remedy) from None

@@ -15,10 +15,9 @@ from server import counters
 from server.background import Background
 from server.ingest.acknowledge import Ingest, ReceivedFiles, shield_and_wait
 from server.problems import Problem, count_noun
-from server.storage.events import CameraAccepted, FrameAccepted, FrameMissing, JournalEvent, OpenFrame
+from server.storage.events import CameraAccepted, FrameMissing, JournalEvent, OpenFrame
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import replay
-from server.storage.ledger import frame_identity
 
 MAX_FRAMES_AHEAD = 8
 """Maximum number of simultaneously open frames, which limits how far one camera can be ahead of another."""
@@ -47,8 +46,8 @@ class OpenFrames:
         """Refuses a single-camera upload early if it would be refused regardless of its content.
 
         Raises:
-            Problem: 409 if the frame is too far ahead or is being sent as a whole; 422 if its time is invalid; 429 if
-                the queue is full.
+            Problem: 409 if the frame is too far ahead or is being sent as a whole; 422 if its time differs from that of
+                other cameras; 429 if the queue is full.
         """
         ledger, index = self._ledger, head.index
         if index < ledger.next_frame:
@@ -71,16 +70,14 @@ class OpenFrames:
                 raise self.ingest.queue_full_problem(index)
             raise self.ingest.gap_problem(index)
         frame = ledger.open.get(index)
-        if head.time is not None:
-            self.ingest.check_time(index, head.time)
-            if frame is not None and frame.time is not None and frame.time != head.time:
-                raise Problem(
-                    422,
-                    f"the time of frame {index} from camera {camera!r} differs from the previous cameras' time",
-                    field="time",
-                    value=head.time,
-                    remedy=f"send {frame.time!r} or no time; the first time sent applies to the frame",
-                )
+        if head.time is not None and frame is not None and frame.time not in (None, head.time):
+            raise Problem(
+                422,
+                f"the time of frame {index} from camera {camera!r} differs from the previous cameras' time",
+                field="time",
+                value=head.time,
+                remedy=f"send {frame.time!r} or no time; the first time sent applies to the frame",
+            )
 
     async def accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
         """Acknowledges one camera's files of a frame.
@@ -136,7 +133,7 @@ class OpenFrames:
             camera=camera,
             received=here,
             absent=[name for name in self._rules.rig.names if name not in here],
-            frame=None if entry is None else entry.receipt,
+            frame=None if entry is None else self.ingest.receipt_of(index),
         )
 
     async def _camera_events_of(self, index: int) -> OpenFrame | None:
@@ -196,7 +193,7 @@ class OpenFrames:
         async with self._log.lock:
             if index < ledger.next_frame:
                 entry = ledger.frames[index]
-                if (known := entry.receipt) is None:
+                if (known := self.ingest.receipt_of(index)) is None:
                     raise Problem(
                         409,
                         f"frame {index} is {entry.state}: {entry.error}",
@@ -238,9 +235,7 @@ class OpenFrames:
         """Closes a frame with the uploads received so far; the caller must hold the log's lock."""
         seconds = self.ingest.time_of(frame.index, frame.time)
         hashes = {camera: kinds for camera, kinds in frame.hashes.items() if FileKind.IMAGE in kinds}
-        identity, files = frame_identity(hashes, seconds), tuple(sorted(frame.files))
-        event = FrameAccepted(index=frame.index, time=seconds, identity=identity, files=files, closed_by=by)
-        receipt = await self.ingest.acknowledge(event)
+        receipt = await self.ingest.acknowledge(frame.index, seconds, hashes, tuple(sorted(frame.files)), by)
         self._forget(frame.index)
         return receipt
 

@@ -248,7 +248,7 @@ async def read_files(reader: BodyReader, receiving: FrameReceiver, *, ends_body:
 
 def framing_problem(error: FramingError) -> Problem:
     """Returns the 422 problem for a body that is not a valid frame."""
-    return Problem(422, f"the frame {error.fault}", field="body", value=error.fault, remedy=error.remedy)
+    return Problem(422, f"the frame {error.fault}", field=error.field, value=error.value, remedy=error.remedy)
 
 
 def check_length(head: FrameHead, start: int, total: int | None) -> None:

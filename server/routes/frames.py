@@ -17,6 +17,7 @@ from client.wire import (
     FrameBatch,
     FrameReceipt,
     FrameReportModel,
+    FrameSeconds,
     MissingRequest,
 )
 from server.http.immutable import immutable_response
@@ -99,8 +100,8 @@ FILE: dict[int | str, dict[str, Any]] = {
 }
 CameraPath = Annotated[str, Path(max_length=64, description="Name of a camera of the rig.")]
 Seconds = Annotated[
-    float | None,
-    Query(allow_inf_nan=False, description="Time of the frame in seconds; the first value sent by any camera is used."),
+    FrameSeconds | None,
+    Query(description="Time of the frame in seconds; the first value sent by any camera is used."),
 ]
 
 

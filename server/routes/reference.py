@@ -40,7 +40,7 @@ async def page(request: Request) -> Response:
 @router.get("/redoc")
 async def elsewhere() -> Response:
     """Redirects FastAPI's usual ReDoc address to the API reference page."""
-    return RedirectResponse("/docs")
+    return RedirectResponse("docs")
 
 
 @router.get("/docs/{name}")

@@ -21,17 +21,17 @@ FILES = {
 HEADERS = security_headers(worker_src="'self'")  # prevent script injection through names of rigs or scenes
 
 
-@router.get("/")
 @router.get("/viewer/")
 async def page(request: Request) -> Response:
     """Returns the viewer page."""
     return serve_file(request, FILES, "index.html", HEADERS, "/viewer/")
 
 
+@router.get("/")
 @router.get("/viewer")
 async def elsewhere() -> Response:
-    """Redirects the address without a trailing slash to the viewer page."""
-    return RedirectResponse("/viewer/")
+    """Redirects to the viewer page, with a relative URL because a proxy may serve the page under a path prefix."""
+    return RedirectResponse("viewer/")
 
 
 @router.get("/viewer/{name:path}")

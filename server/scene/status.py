@@ -19,6 +19,7 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.switches import decode_switches, first_switches
 from scas4d_core.frame_outcome import first_warnings, timing_warnings
+from scas4d_core.frame_times import ROWS, time_warnings
 from scas4d_core.settings import Settings
 from server.keep_up import with_time_limit
 from server.problems import Problem
@@ -130,7 +131,12 @@ class SceneFacts:
             states_deleted=ledger.states_deleted,
             effects=effects_of(settings, newest or None),
             damage=self.damage,
-            warnings=[*self.warnings, *first_warnings(self.first), *timing_warnings(newest.get("timing"))],
+            warnings=[
+                *self.warnings,
+                *time_warnings(ledger.times_before(ledger.next_frame, ROWS), request.frames_per_second),
+                *first_warnings(self.first),
+                *timing_warnings(newest.get("timing")),
+            ],
             created=self.definition.created.isoformat(),
             ingest=ledger.edited.rules(request.ingest),
             nodes=request.nodes,

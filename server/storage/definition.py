@@ -22,7 +22,7 @@ from server.storage.events import JournalEvent, ReconstructionBegun, SceneCreate
 from server.storage.journal import replay
 from server.storage.layout import SceneFolder
 
-FORMAT = 3
+FORMAT = 4
 """Format version of a scene folder.
 
 Increment it with every format change of the definition, journal, frame log or points.

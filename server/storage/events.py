@@ -19,6 +19,13 @@ Hashes = dict[str, dict[FileKind, str]]
 """BLAKE3 digest of each file, keyed by camera and kind."""
 
 
+ClosedBy = Literal["whole", "complete", "request", "deadline", "found"]
+"""Reason why a frame was closed.
+
+`found` means that the journal had lost the frame and recovery found its complete record in the frame log.
+"""
+
+
 class _Event(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -31,18 +38,18 @@ class SceneCreated(_Event):
 
 
 class FrameAccepted(_Event):
-    """Acknowledgement of a complete frame, whose images are in the records `files` of the frame log."""
+    """Acknowledgement of a complete frame, whose images are in the records `files` of the frame log.
+
+    `sent` is the time that the client sent, if the frame has another one (`scas4d_core.frame_times.time_after`).
+    """
 
     type: Literal["frame_accepted"] = "frame_accepted"
     index: int
     time: float
+    sent: float | None = None
     identity: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     files: tuple[str, ...]
-    closed_by: Literal["whole", "complete", "request", "deadline", "found"] = "whole"
-    """Reason why the frame was closed.
-
-    `found` means that the journal had lost the frame and recovery found its complete record in the frame log.
-    """
+    closed_by: ClosedBy = "whole"
 
 
 class CameraAccepted(_Event):

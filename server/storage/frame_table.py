@@ -1,7 +1,7 @@
 """Table of the frames of a scene, stored in columns. The table accesses neither disk nor clock.
 
 A scene that runs for a day at 30 fps has 2.6 million frames, so each frame permanently takes only
-46 bytes. Rare properties (errors, names of frame log records, worker crashes) are stored in
+54 bytes. Rare properties (errors, names of frame log records, worker crashes) are stored in
 dictionaries. The commit records of the newest frames stay in memory. The commit records of older
 frames are read from disk.
 """
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import FINISHED, FrameReceipt, FrameReportModel, FrameState
+from scas4d_core.frame_times import FrameTime
 from server.storage.events import OpenFrame, RareProperties
 from server.storage.report_fields import committed_fields
 
@@ -59,6 +60,7 @@ class FrameTable:
         self._states = bytearray()
         self._flags = bytearray()
         self._times = array("d")
+        self._sent = array("d")
         self._identities = bytearray()
         self._skipped_by = array("i")
         self._files: dict[int, tuple[str, ...]] = {}
@@ -87,6 +89,7 @@ class FrameTable:
             self._states.extend(bytes([CODES[FrameState.FAILED]]) * new)
             self._flags.extend(bytes(new))
             self._times.frombytes(bytes(8 * new))
+            self._sent.frombytes(bytes(8 * new))
             self._identities.extend(bytes(IDENTITY * new))
             self._skipped_by.frombytes(bytes(self._skipped_by.itemsize * new))
             self.counts[FrameState.FAILED] += new
@@ -118,17 +121,17 @@ class FrameTable:
         new._notes = copy.deepcopy(self._notes)
         return new
 
-    def enqueue(self, index: int, time: float, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
+    def enqueue(self, time: FrameTime, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
         """Queues an acknowledged frame.
 
         Args:
-            index: frame index.
-            time: time of the frame in seconds.
+            time: index and times of the frame.
             identity: identity from the receipt, a hexadecimal digest.
             files: names of the frame's records in the frame log.
             parts: uploads of the single cameras, or None if the frame was uploaded as a whole.
         """
-        self._times[index] = time
+        index = time.index
+        self._times[index], self._sent[index] = time.time, time.sent
         self.received += not self._flags[index] & RECEIPT
         self._flags[index] |= TIME | RECEIPT
         self._identities[IDENTITY * index : IDENTITY * (index + 1)] = bytes.fromhex(identity)
@@ -179,7 +182,7 @@ class FrameTable:
     def add_committed(self, index: int, time: float | None) -> None:
         """Marks a frame as committed whose state was found on disk but not in the journal."""
         if time is not None:
-            self._times[index] = time
+            self._times[index] = self._sent[index] = time
             self._flags[index] |= TIME
         if index in self._notes:
             self._notes[index].error = None
@@ -237,6 +240,11 @@ class FrameTable:
             self.counts[FrameState.COMMITTED] += len(rows)
         del states  # a bytearray cannot grow while a view of it exists
         self._list_all()
+
+    def index_at(self, sent: float) -> int | None:
+        """Returns the index of the newest frame that was sent with this time in seconds, or None."""
+        indices: list[int] = np.flatnonzero(np.frombuffer(self._sent) == sent).tolist()
+        return next((index for index in reversed(indices) if self._flags[index] & TIME), None)
 
     def set_files(self, index: int, files: tuple[str, ...]) -> None:
         """Sets the names of the frame's records in the frame log; an empty tuple also removes its parts."""
@@ -325,6 +333,12 @@ class FrameEntry:
     def time(self) -> float | None:
         """Time of the frame in seconds, or None if it never arrived."""
         return self._table._times[self.index] if self._table._flags[self.index] & TIME else None
+
+    @property
+    def times(self) -> FrameTime | None:
+        """Time of the frame and the time that was sent, or None if it never arrived."""
+        time = self.time
+        return None if time is None else FrameTime(self.index, time, self._table._sent[self.index])
 
     @property
     def identity(self) -> str | None:

@@ -18,11 +18,13 @@ from blake3 import blake3
 
 from client.wire import Budget, FrameState, Retention
 from scas4d_core.errors import message_of
+from scas4d_core.frame_times import FrameTime, time_after
 from scas4d_core.storage.history import NEWEST_KEPT
 from server.storage.disk import full_disk, no_room
 from server.storage.events import (
     BudgetChanged,
     CameraAccepted,
+    ClosedBy,
     FrameAccepted,
     FrameFailed,
     FrameMissing,
@@ -125,7 +127,8 @@ class Ledger:
             case FrameAccepted():
                 parts = self.open.pop(event.index, None)
                 self._grow_to(event.index)
-                self.frames.enqueue(event.index, event.time, event.identity, event.files, parts)
+                time = FrameTime(event.index, event.time, event.time if event.sent is None else event.sent)
+                self.frames.enqueue(time, event.identity, event.files, parts)
             case CameraAccepted() if event.index >= self.next_frame:
                 self.open.setdefault(event.index, OpenFrame(event.index)).add(event)
             case FrameMissing():
@@ -263,21 +266,49 @@ class Ledger:
         tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.FAILED]))
         return int(tried[-1]) if len(tried) else None
 
-    def last_time(self) -> float | None:
-        """Returns the time in seconds of the newest closed frame that has one, or None."""
-        for index in range(self.next_frame - 1, -1, -1):
-            time = self.frames[index].time
-            if time is not None:
-                return time
-        return None
+    def times_before(self, index: int, count: int = 1) -> list[FrameTime]:
+        """Returns the times of the last `count` closed frames before a frame, in ascending order of their indices."""
+        newest: list[FrameTime] = []
+        for before in range(min(index, self.next_frame) - 1, -1, -1):
+            if len(newest) == count:
+                break
+            if (times := self.frames[before].times) is not None:
+                newest.append(times)
+        return newest[::-1]
 
-    def index_at(self, seconds: float) -> int | None:
-        """Returns the index of the closed frame with this time in seconds, or None."""
-        for index in range(self.next_frame - 1, -1, -1):
-            time = self.frames[index].time
-            if time is not None and time <= seconds:
-                return index if time == seconds else None
-        return None
+    def accepted_event(
+        self,
+        index: int,
+        sent: float,
+        hashes: Hashes,
+        files: tuple[str, ...],
+        fps: float,
+        closed_by: ClosedBy,
+        *,
+        time: float | None = None,
+    ) -> FrameAccepted:
+        """Returns the event that acknowledges a frame.
+
+        Args:
+            index: frame index; earlier frames are closed.
+            sent: time that the client sent, in seconds.
+            hashes: digests of the frame's files.
+            files: names of the frame's records in the frame log.
+            fps: frame rate of the scene.
+            closed_by: reason why the frame is closed.
+            time: time of the frame in seconds; None to compute it from the sent time.
+        """
+        if time is None:
+            previous = self.times_before(index)
+            time = time_after(previous[0] if previous else None, index, sent, fps)
+        return FrameAccepted(
+            index=index,
+            time=time,
+            sent=None if sent == time else sent,
+            identity=frame_identity(hashes, time),
+            files=files,
+            closed_by=closed_by,
+        )
 
     def _grow_to(self, index: int) -> None:
         """Grows the table so that it contains a frame. New frames have the state FAILED.

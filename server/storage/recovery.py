@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from client.wire import FileKind, FrameState
+from client.wire import FileKind, FrameState, SceneCreate
 from scas4d_core.storage.faults import OtherFormatError
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.history import History, HistoryError
@@ -119,7 +119,8 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     if broken:
         events.extend(_events_of_states(states, ledger))
     if damage:
-        events.extend(_events_of_records(frames, sorted(_unreferenced(ledger, sizes)), ledger, states, broken))
+        names, fps = sorted(_unreferenced(ledger, sizes)), _frame_rate(definition or {})
+        events.extend(_events_of_records(frames, names, ledger, states, broken, fps))
     if recovered_frames := sorted(
         {event.index for event in events if isinstance(event, FrameAccepted | CameraAccepted)}
     ):
@@ -173,6 +174,12 @@ def _unreferenced(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
     return set(sizes) - named
 
 
+def _frame_rate(definition: Mapping[str, Any]) -> float:
+    """Returns the frame rate in the scene's definition."""
+    default: float = SceneCreate.model_fields["frames_per_second"].default
+    return float(definition["request"]["frames_per_second"]) if definition else default
+
+
 def _deletes_states(definition: Mapping[str, Any], ledger: Ledger) -> bool:
     """Returns whether the scene has a retention rule that deletes old states."""
     if ledger.edited.keep_states is not None:
@@ -214,7 +221,7 @@ def _events_of_states(states: _States, ledger: Ledger) -> Iterator[StateFound]:
 
 
 def _events_of_records(
-    folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool
+    folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool, fps: float
 ) -> Iterator[JournalEvent]:
     """Yields and applies events for image records whose events the damaged journal has lost.
 
@@ -229,12 +236,14 @@ def _events_of_records(
         known = entry is not None and not (without and entry.state in (FrameState.FAILED, FrameState.COMMITTED))
         if known or (entry is None and index != ledger.next_frame and not broken):
             continue
-        for event in _events_of(folder, index, records, ledger, states):
+        for event in _events_of(folder, index, records, ledger, states, fps):
             ledger.apply(event)
             yield event
 
 
-def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[JournalEvent]:
+def _events_of(
+    folder: Path, index: int, names: list[str], ledger: Ledger, states: _States, fps: float
+) -> list[JournalEvent]:
     """Returns the events of one frame, derived from its records."""
     pictures: dict[str, StoredPictures] = {}
     for name in names:
@@ -243,7 +252,7 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
     whole = [name for name, events in pictures.items() if not events.part]
     parts = {name: events for name, events in pictures.items() if events.part}
     if len(names) == len(whole) == 1:
-        accepted = _frame_event(index, whole[0], pictures[whole[0]], ledger)
+        accepted = _frame_event(index, whole[0], pictures[whole[0]], ledger, states.times.get(index), fps)
     elif index < ledger.next_frame:
         accepted = _close_event(index, parts, states.times.get(index))
     else:
@@ -272,15 +281,13 @@ def _fault_of(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     return None
 
 
-def _frame_event(index: int, name: str, pictures: StoredPictures, ledger: Ledger) -> FrameAccepted | None:
-    before = max(
-        (time for i in range(min(index, ledger.next_frame)) if (time := ledger.frames[i].time) is not None),
-        default=None,
-    )
-    if pictures.time is None or (before is not None and pictures.time <= before):
+def _frame_event(
+    index: int, name: str, pictures: StoredPictures, ledger: Ledger, time: float | None, fps: float
+) -> FrameAccepted | None:
+    """Returns the event of a frame that was uploaded as a whole; `time` is that of its committed state, if any."""
+    if pictures.time is None:
         return None
-    identity = frame_identity(pictures.hashes, pictures.time)
-    return FrameAccepted(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
+    return ledger.accepted_event(index, pictures.time, pictures.hashes, (name,), fps, "found", time=time)
 
 
 def _close_event(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:

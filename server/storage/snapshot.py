@@ -71,11 +71,12 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
 
 
 def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
-    index, note, receipt = entry.index, entry.rare_properties, entry.receipt
-    if receipt is not None:
+    index, note, receipt, times = entry.index, entry.rare_properties, entry.receipt, entry.times
+    if receipt is not None and times is not None:
         if note.parts is not None:
             yield from _camera_events(note.parts)
-        yield FrameAccepted(index=index, time=receipt.time, identity=receipt.identity, files=entry.files)
+        sent = None if times.sent == times.time else times.sent
+        yield FrameAccepted(index=index, time=times.time, sent=sent, identity=receipt.identity, files=entry.files)
     elif entry.state == FrameState.COMMITTED or entry.time is not None:
         yield StateFound(index=index, time=entry.time)
     for own in [True] * note.own_deaths + [False] * note.other_deaths:

@@ -29,7 +29,7 @@ export async function fetched(method, path, body, signal) {
   if (body !== undefined) headers["Content-Type"] = "application/json";
   let response;
   try {
-    response = await fetch(path, { method, headers, signal, body: body === undefined ? undefined : JSON.stringify(body) });
+    response = await fetch(address(path), { method, headers, signal, body: body === undefined ? undefined : JSON.stringify(body) });
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new ServiceError({ status: 0, detail: "the service does not respond" });
@@ -45,6 +45,9 @@ export async function call(method, path, body) {
   const response = await fetched(method, path, body);
   return response.status === 204 ? null : response.json();
 }
+
+/** URL of a path of the service, whose root is the folder above this file's folder, also under a path prefix. */
+export const address = (path) => new URL(`..${path}`, import.meta.url);
 
 export const scenePath = (id) => `/v1/scenes/${encodeURIComponent(id)}`;
 

@@ -1,6 +1,6 @@
 // Stream of a scene (docs/stream.md), whose subscriptions survive a broken connection.
 
-import { scenePath, ServiceError, call, ticket } from "./service.js";
+import { address, scenePath, ServiceError, call, ticket } from "./service.js";
 
 const PROTOCOL = "scas4d.stream.v1";
 const GONE = 4404;
@@ -51,9 +51,9 @@ export class Stream {
     try {
       const shown = await ticket();
       if (this.closed) return;
-      const address = new URL(scenePath(this.scene) + "/stream", location.href);
-      address.protocol = address.protocol.replace("http", "ws");
-      const socket = new WebSocket(address, shown ? [PROTOCOL, shown] : [PROTOCOL]);
+      const stream = address(`${scenePath(this.scene)}/stream`);
+      stream.protocol = stream.protocol.replace("http", "ws");
+      const socket = new WebSocket(stream, shown ? [PROTOCOL, shown] : [PROTOCOL]);
       socket.binaryType = "arraybuffer";
       this.socket = socket;
       socket.onopen = () => {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 from running import Running, fake_settings
@@ -124,6 +125,13 @@ def test_a_scene_is_gone_on_with(client, capture):
     assert client.frame(first.scene, 3).time == pytest.approx(3 / 30)
     again = push(capture, client, scene=first.scene)
     assert again.lateness.late == []
+
+
+def test_a_scene_has_a_printable_name_of_at_most_200_characters(client, capture):
+    folder = "take\x1b[31m\n7\udcff" + "é" * 230
+    name = push(replace(capture, name=folder), client, frames=1).status.name
+    assert name.startswith("take\\x1b[31m\\n7\\udcffé")
+    assert len(name) == 200
 
 
 def test_a_scene_of_another_rig_is_refused(client, capture):

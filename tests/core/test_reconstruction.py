@@ -15,6 +15,7 @@ from scas4d_core.cameras import Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.engines.choose import DeviceError, gpu_fault
 from scas4d_core.frame_outcome import FrameOutcome
+from scas4d_core.frame_times import FrameTime, time_after
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.query.ply import read_ply
 from scas4d_core.reconstruction import FrameReport, Progress, Reconstruction, StepError
@@ -96,6 +97,17 @@ def test_frames_are_committed_and_reported(stepped: tuple[Reconstruction, list[F
         assert {"decode", "cascade", "render", "adam"} <= set(report.seconds)
 
 
+def test_no_time_that_the_service_accepts_stops_a_scene() -> None:
+    sent = [0.0, 5e-324, 86_400.0, 1e10, 1e10, 1e19, 0.0, 1e-9, 0.1]
+    scene = start(shortened())
+    last = FrameTime(10, FRAMES[0].time, FRAMES[0].time)
+    for index, time in enumerate(sent, 11):
+        last = FrameTime(index, time_after(last, index, time, 30.0), time)
+        report = scene.step(replace(FRAMES[index % 3], index=index, time=last.time))
+        assert not report.outcome.rejected
+    assert np.isfinite(scene.history.newest.means).all()
+
+
 def test_points_are_followed_in_the_users_world(stepped: tuple[Reconstruction, list[FrameReport]]) -> None:
     scene, _ = stepped
     rows = np.arange(0, 384, 7)
@@ -146,7 +158,7 @@ def test_pixels_parts_visibility_and_ply_through_the_object(
 WRONG: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "index again": (lambda f: replace(f, index=10), "frame 10 is not after"),
     "index before": (lambda f: replace(f, index=3), "frame 3 is not after"),
-    "time again": (lambda f: replace(f, time=FRAMES[0].time), "is not after"),
+    "time again": (lambda f: replace(f, time=FRAMES[0].time), "must be after"),
     "time is not a number": (lambda f: replace(f, time=float("nan")), "time nan"),
     "time is infinite": (lambda f: replace(f, time=float("inf")), "time inf"),
     "no picture": (lambda f: replace(f, images={}), "no image of any of the rig's cameras"),

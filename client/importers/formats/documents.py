@@ -14,6 +14,7 @@ from xml.parsers import expat
 from client.importers.extras import load
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.files import read_json_value, read_text
+from scas4d_core.errors import exact
 
 LARGEST_FILE = 16 << 20
 START = 1 << 16
@@ -137,7 +138,7 @@ def positive(where: str, given: Mapping[str, Any], key: str, default: float | No
     """
     value = number(where, given, key, default)
     if value <= 0:
-        raise CaptureError(f"{where}: {key} must be positive; got {value:g}")
+        raise CaptureError(f"{where}: {key} must be positive; got {exact(value)}")
     return value
 
 
@@ -149,7 +150,7 @@ def whole(where: str, given: Mapping[str, Any], key: str, most: int = 1 << 16) -
     """
     value = number(where, given, key)
     if value != round(value) or not 1 <= value <= most:
-        raise CaptureError(f"{where}: {key} must be a whole number from 1 to {most}; got {value:g}")
+        raise CaptureError(f"{where}: {key} must be a whole number from 1 to {most}; got {exact(value)}")
     return int(value)
 
 

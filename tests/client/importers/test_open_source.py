@@ -126,6 +126,33 @@ def test_times_and_numbers_of_pictures_must_fit(tmp_path):
         open_source(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("start", "step", "unit"),
+    [
+        (0, 33.3, "milliseconds"),
+        (1.7643636e18, 33_333_333, "Unix times in nanoseconds"),
+        (1764363600, 0.03, "Unix times"),
+    ],
+)
+def test_times_that_are_probably_not_seconds_are_named(tmp_path, start, step, unit):
+    times = tuple(start + step * t for t in range(3))
+    write(tmp_path / "transforms.json", timed(tmp_path, times))
+    source = open_source(tmp_path)
+    [remark] = [remark for remark in source.remarks if "probably" in remark]
+    assert remark.startswith(f"the times are probably {unit}")
+    assert f"frame 2 has the time {times[2]!r}" in remark
+    assert source.time(2) == times[2]
+
+
+def test_numbers_of_times_are_exact_and_bounded(tmp_path):
+    write(tmp_path / "transforms.json", timed(tmp_path, (1764363600.25, 1764363600.5, 1764363600.5)))
+    with pytest.raises(CaptureError, match=r"frame 2 is at 1764363600.5 s, not later .* 1764363600.5 s; correct"):
+        open_source(tmp_path)
+    write(tmp_path / "transforms.json", timed(tmp_path, (0.0, 0.04, 1e300)))
+    with pytest.raises(CaptureError, match=r"frame 2 is at 1e\+300 s; give the times in seconds"):
+        open_source(tmp_path)
+
+
 def test_a_path_cannot_lead_out_of_the_capture(tmp_path):
     inner = tmp_path / "capture"
     inner.mkdir()

@@ -103,7 +103,7 @@ def test_what_is_retired_in_the_first_frame_is_left_out(tmp_path):
 
 
 def test_times_must_rise(tmp_path):
-    with pytest.raises(InputError, match=r"time 1 s of frame 13 is not later than that of the previous frame, 1 s"):
+    with pytest.raises(InputError, match=r"time 1 s of frame 13 is not later than the previous frame, 1 s"):
         written(tmp_path / "a.glb", [moving.state(0), moving.state(1)], times=[1.0, 1.0])
     with pytest.raises(InputError, match="there are no frames to export"):
         PartAsset(tmp_path / "a.glb", corner.WORLD, moving.LABELS).finish()

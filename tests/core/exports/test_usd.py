@@ -187,7 +187,7 @@ def test_without_a_rate_the_first_two_frames_tell_it(tmp_path):
 def test_given_up_and_refused_nothing_is_left(tmp_path):
     sequence = UsdSequence(tmp_path / "a.usdc", corner.WORLD)
     sequence.add(0, 0.0, corner.state())
-    with pytest.raises(InputError, match=r"time 0 s of frame 1 is not later than that of the previous frame, 0 s"):
+    with pytest.raises(InputError, match=r"time 0 s of frame 1 is not later than the previous frame, 0 s"):
         sequence.add(1, 0.0, corner.state())
     sequence.discard()
     with pytest.raises(InputError, match="there are no frames to export"):

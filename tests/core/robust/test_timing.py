@@ -109,6 +109,15 @@ def test_a_longer_way_is_no_larger_offset() -> None:
     assert after({0.15: 4}, way=0.2, frame=0.2).mean == pytest.approx(0.15)
 
 
+def test_a_gap_does_not_count_as_much_as_the_frames_that_it_replaces() -> None:
+    before = after({0.3: 20})
+    for gap in (1.0, 86_400.0):
+        with_gap = after({-0.5: 1}, way=gap, frame=gap, start=before)
+        assert with_gap.mean == pytest.approx(0.3, abs=0.02)
+    slower = after({0.3: 200}, way=1.0, frame=1.0, start=before)  # for good
+    assert slower.frame / slower.weight == pytest.approx(1.0, abs=0.01)
+
+
 def test_the_mean_forgets_and_one_look_is_bounded() -> None:
     before = after({0.0: 60})
     assert after({0.4: 60}, start=before).mean > 0.36

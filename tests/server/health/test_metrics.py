@@ -70,6 +70,11 @@ def test_a_log_line_is_one_json_object_without_secrets():
     assert "abcdef" not in plain
 
 
+def test_a_plain_log_line_escapes_control_characters():
+    line = logs.TextFormatter().format(record("scene \x1b[31m\nfake: \u202eline"))
+    assert line.endswith("scene \\x1b[31m\\nfake: \\u202eline")
+
+
 def test_an_exception_is_logged_with_its_traceback():
     try:
         raise KeyError("where")

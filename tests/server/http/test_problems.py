@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import re
 import socket
 
 import httpx
@@ -28,6 +30,24 @@ def test_a_body_of_another_kind(http, kind):
     for path in ("/v1/scenes", "/v1/estimate"):
         document = problem(http.post(path, content="{}", headers={"Content-Type": kind}), 415)
         assert document["field"] == "Content-Type"
+
+
+@pytest.mark.parametrize("coding", ["gzip", "br", "deflate, gzip", "x"])
+def test_a_compressed_body_is_refused_by_name_on_every_route(http, coding):
+    document = http.get("/openapi.json").json()
+    routes = [(method, path) for path, methods in document["paths"].items() for method in methods if method != "get"]
+    assert len(routes) > 20
+    for method, path in routes:
+        url = re.sub(r"{\w+}", "0", path)
+        answer = http.request(method, url, content=gzip.compress(b"{}"), headers={"Content-Encoding": coding})
+        assert (problem(answer, 415)["field"], answer.json()["value"]) == ("Content-Encoding", coding)
+        assert answer.headers["accept-encoding"] == "identity"
+        assert "without Content-Encoding" in answer.json()["remedy"]
+
+
+def test_the_coding_identity_changes_nothing(http):
+    headers = {"Content-Type": "application/json", "Content-Encoding": "Identity"}
+    assert problem(http.post("/v1/scenes", content="{}", headers=headers), 422)["field"] == "body.rig"
 
 
 def test_a_body_that_is_too_large_by_its_length_or_while_it_comes(http, service):

@@ -143,9 +143,10 @@ def test_numbers_may_be_left_to_the_service(http, paused):
     refused = post(http, paused, framed(0, DAMAGED, time=0.8), framed(0, time=0.9), numbering="next")
     assert statuses(refused) == [422, 202]
     assert refused.json()["answers"][1]["index"] == 4  # a refused frame takes no number
-    late = post(http, paused, framed(0, time=0.65), framed(0), numbering="next")
-    assert [entry["problem"]["field"] for entry in late.json()["answers"]] == ["time", "time"]
-    assert status(http, paused)["next_frame"] == 5
+    late, without = post(http, paused, framed(0, time=0.65), framed(0), numbering="next").json()["answers"]
+    assert (late["receipt"]["index"], late["receipt"]["time"]) == (5, 1.0)  # 0.1 s after frame 4
+    assert without["problem"]["field"] == "time"
+    assert status(http, paused)["next_frame"] == 6
 
 
 def test_what_is_no_batch_is_refused_by_name(http, paused):

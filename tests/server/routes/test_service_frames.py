@@ -191,11 +191,11 @@ def test_masks_belong_to_all_cameras_and_are_png(http, sdk, scene):
     assert sdk.wait(scene, 0).dropped_cameras == {}
 
 
-def test_time_is_a_number_that_rises(http, scene):
+def test_time_is_a_number_in_bounds(http, scene):
     assert problem(put(http, scene, 0, pictures(), time="noon"), 422)["field"] == "time"
     assert problem(put(http, scene, 0, pictures(), time="nan"), 422)["field"] == "time"
     assert put(http, scene, 0, pictures(), time="1.5").json()["time"] == 1.5
-    assert problem(put(http, scene, 1, pictures(), time="1.5"), 422)["field"] == "time"
+    assert problem(put(http, scene, 1, pictures(), time="1e20"), 422)["field"] == "time"
 
 
 def test_other_bodies_are_refused(http, scene):

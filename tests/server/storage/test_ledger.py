@@ -9,6 +9,7 @@ import pytest
 
 from client.wire import CameraFitModel, CurvePointModel, FrameReportModel, FrameState
 from scas4d_core.frame_report import CurvePoint, FrameReport
+from scas4d_core.frame_times import FrameTime
 from scas4d_core.update.result import CameraFit
 from server.storage.events import (
     CameraAccepted,
@@ -64,7 +65,9 @@ def test_an_entry_says_what_the_events_said():
     assert (reports_[3].error, reports_[3].worker_deaths) == ("two deaths", 2)
     assert reports_[3].dropped_cameras == {"c0": "torn"}
     assert ledger.frames[1].receipt is None
-    assert ledger.frames[2].receipt.model_dump() == {"scene": "abc", "index": 2, "time": 0.2, "identity": identity(2)}
+    assert ledger.frames[2].receipt.model_dump() == {
+        "scene": "abc", "index": 2, "time": 0.2, "identity": identity(2), "warnings": [],
+    }  # fmt: skip
     assert (ledger.frames[3].rare_properties.own_deaths, ledger.frames[3].rare_properties.other_deaths) == (1, 1)
     assert ledger.waiting() == [0, 4]
     assert ledger.frames.get(5) is None
@@ -125,7 +128,7 @@ def test_the_numbers_of_the_newest_commits_are_in_memory():
     table = FrameTable("abc")
     table.grow(RECORDS_KEPT + 1)
     for index in range(RECORDS_KEPT + 1):
-        table.enqueue(index, index / 10, identity(index), (), None)
+        table.enqueue(FrameTime(index, index / 10, index / 10), identity(index), (), None)
         table.set_state(index, FrameState.COMMITTED)
         table.set_record(index, REPORT)
     assert (table[0].record is None, table[1].record is None) == (True, False)
