@@ -97,7 +97,7 @@ def decode_image(
 def check_image(source: Source, *, size: Size | None = None, name: str | None = None) -> None:
     """Raises the error that `decode_image` would raise for a file.
 
-    The pixels of common JPEG files are not decoded, because their segments show that they can be.
+    The pixels of common JPEG files and of raw pixels are not decoded, because their structure shows that they can be.
 
     Args:
         source: image file, as bytes or as a path.
@@ -268,12 +268,13 @@ def describe_pictures(
         The bit depth, or None if there are no 16-bit images, and the remarks.
 
     Raises:
-        ImageError: if an image of the first frame cannot be read.
+        ImageError: if an image of the first frame cannot be read, or is rotated.
     """
     grey, several, deep = {}, [], []
     for camera, path in frames[0].items():
         with _errors_of(str(path)), _open(path) as picture:
             grey[camera] = picture.mode in ("1", "L", "LA", "I;16")
+            _check_orientation(picture)
             several += [camera] if getattr(picture, "n_frames", 1) > 1 else []
         with path.open("rb") as file:
             deep += [camera] if is_sixteen_bit(file.read(25)) else []
@@ -407,13 +408,7 @@ class _PictureFile:
             self._to_srgb = _to_srgb(profile) if profile and not mask else None
             if not self.header.decodable:
                 self._picture.load()
-            if (orientation := _orientation(self._picture)) != 1:
-                raise ImageError(
-                    f"EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not match "
-                    "a rotated image",
-                    "store the pixels in the calibrated orientation and remove the tag",
-                    str(orientation),
-                )
+            _check_orientation(self._picture)
             if size not in (None, self.header.size):
                 raise _wrong_size(self.header, size)
 
@@ -451,11 +446,18 @@ def _wrong_size(header: PictureHeader, size: Size) -> ImageError:
     )
 
 
-def _orientation(picture: Image.Image) -> int:
+def _check_orientation(picture: Image.Image) -> None:
     try:
-        return int(picture.getexif().get(EXIF_ORIENTATION, 1))
+        orientation = int(picture.getexif().get(EXIF_ORIENTATION, 1))
     except Exception:  # damaged metadata, which contains no orientation
-        return 1
+        return
+    if orientation != 1:
+        raise ImageError(
+            f"EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not match a "
+            "rotated image",
+            "store the pixels in the calibrated orientation and remove the tag",
+            str(orientation),
+        )
 
 
 def _eight_bits(data: bytes | memoryview, bit_depth: int | None) -> Image.Image:

@@ -1,7 +1,7 @@
 """Structure of image files: format, size and completeness, read without decoding pixels. Requires only NumPy.
 
 The structure covers the segments of a JPEG up to its end marker, the chunks and checksums of a PNG, the RIFF chunks of
-a WebP, the header of a BMP, and the length of a PPM or PGM.
+a WebP, and the length of a BMP, PPM or PGM.
 """
 
 from __future__ import annotations
@@ -167,15 +167,19 @@ def _png(data: memoryview) -> PictureHeader:
 
 
 def _bmp(data: memoryview) -> PictureHeader:
-    kind = struct.unpack("<I", data[14:18])[0] if len(data) >= 26 else 0
+    begin, kind = struct.unpack("<II", data[10:18]) if len(data) >= 34 else (0, 0)
     if kind == 12:
-        size = struct.unpack("<HH", data[18:22])
+        width, height, _, bits = struct.unpack("<HHHH", data[18:26])
+        compression = 0
     elif kind >= 40:
-        width, height = struct.unpack("<ii", data[18:26])
-        size = (width, abs(height))  # negative: rows from top to bottom
+        width, height, _, bits, compression = struct.unpack("<iiHHI", data[18:34])
+        height = abs(height)  # negative: rows from top to bottom
     else:
         raise ImageError("the BMP file has no valid header", RESEND)
-    return PictureHeader("BMP", size)
+    row = (width * bits + 31) // 32 * 4
+    if compression in (0, 3) and begin + row * height > len(data):
+        raise _truncated("BMP", len(data))
+    return PictureHeader("BMP", (width, height))
 
 
 def _ppm(data: memoryview) -> PictureHeader:
@@ -193,7 +197,7 @@ def _ppm(data: memoryview) -> PictureHeader:
             f"the PPM or PGM file has {len(data)} bytes, but its header declares {size}",
             "send one byte per channel and pixel, and nothing else",
         )
-    return PictureHeader("PPM", (width, height))
+    return PictureHeader("PPM", (width, height), decodable=min(width, height) > 0)
 
 
 def _webp(data: memoryview) -> PictureHeader:

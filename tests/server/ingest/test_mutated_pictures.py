@@ -13,7 +13,7 @@ from collections import Counter
 
 import pytest
 from mutated_pictures import mutated, whole_files
-from running import picture, problem
+from running import picture
 from sending import finished, framed, put_camera, put_form, put_framed
 from websockets.sync.client import connect
 
@@ -87,7 +87,9 @@ def test_what_is_acknowledged_is_decoded_and_the_rest_is_refused_by_name(http, m
         for index, name in sent.items()
         if (report := finished(http, id, index))["state"] != "committed" or report["dropped_cameras"]
     ]
-    print(f"{NUMBER} files: {len(sent)} acknowledged, {dict(refused)} refused, {len(lost)} acknowledged and not decoded")
+    print(
+        f"{NUMBER} files: {len(sent)} acknowledged, {dict(refused)} refused, {len(lost)} acknowledged and not decoded"
+    )
     assert lost == []
     assert len(sent) > NUMBER / 20
     assert min(refused[door.__name__] for door in DOORS) > NUMBER / 20

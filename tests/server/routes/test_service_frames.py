@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, picture, pictures, problem
-from sending import animated, declares
+from sending import declares
 from waiting import HANG_S
 
 
@@ -164,7 +164,6 @@ BAD = {
     "wrong size": ({"c0": picture(), "c1": picture(size=(7, 5))}, 422, "c1"),
     "huge header": ({"c0": picture(), "c1": declares(50_000, 50_000)}, 422, "c1"),
     "turned": ({"c0": picture(), "c1": turned()}, 422, "c1"),
-    "animated": ({"c0": picture(), "c1": animated()}, 422, "c1"),
     "truncated png": ({"c0": picture()[:-9], "c1": picture()}, 422, "c0"),
     "truncated jpeg": ({"c0": picture(format="JPEG")[:-2], "c1": picture()}, 422, "c0"),
     "truncated webp": ({"c0": picture(format="WEBP")[:-2], "c1": picture()}, 422, "c0"),
