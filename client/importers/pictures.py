@@ -17,7 +17,9 @@ from scas4d_core.captures.images import describe_pictures, eight_bit_file, pictu
 from scas4d_core.captures.picture_file import ACCEPTED
 from scas4d_core.captures.reader import read_bytes
 
-READ = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".ppm", ".pgm")
+SENT = (".jpg", ".jpeg", ".png", ".webp")
+"""Extensions of files that are sent without re-encoding."""
+READ = (*SENT, ".bmp", ".ppm", ".pgm")
 SHOWN = 3
 
 Frames = Mapping[str, Mapping[str, Path]]
@@ -71,9 +73,11 @@ class PictureFiles:
         """Returns the first image file of a camera."""
         return self._files[0][camera]
 
-    def file(self, index: int, camera: str) -> bytes:
-        """Returns the contents of the image file of a camera and frame, converted to 8 bits if necessary."""
+    def file(self, index: int, camera: str) -> bytes | None:
+        """Returns a JPEG, PNG or WebP file of a camera and frame, converted to 8 bits if necessary; otherwise None."""
         path = self._files[index][camera]
+        if path.suffix.lower() not in SENT:
+            return None
         return eight_bit_file(read_bytes(path), str(path), self.bit_depth)
 
     def decoded(self, index: int, camera: str) -> Picture:

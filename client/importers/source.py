@@ -53,7 +53,7 @@ class RawReader(Protocol):
         """Returns the first file of a camera, for messages."""
 
     def file(self, index: int, camera: str) -> bytes | None:
-        """Returns an image as the contents of an 8-bit JPEG, PNG or WebP file, or None if it is a video frame."""
+        """Returns an image as the contents of an 8-bit JPEG, PNG or WebP file, or None if it has to be encoded."""
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Returns the decoded image [H, W, 3] of a camera and frame."""
@@ -121,8 +121,8 @@ class ImportedPictures:
     def encoded_image(self, index: int, camera: str) -> bytes:
         """Returns the original image file, or the undistorted image re-encoded, as bytes.
 
-        The original is used if it is an image file and the camera has no distortion. 16-bit images are converted to
-        8 bits.
+        The original is used if it is a JPEG, PNG or WebP file and the camera has no distortion. 16-bit images are
+        converted to 8 bits.
         """
         if self._undistorters[camera].lens.is_pinhole:
             file = self._raw.file(index, camera)

@@ -40,11 +40,11 @@ def sixteen_bit_values(data: bytes | memoryview) -> NDArray[np.uint16]:
         return _read_as(data, "RGBA").view(">u2").astype(np.uint16)
     with Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
         if picture.mode == "I;16":
-            return np.array(picture).astype(np.uint16)
+            return np.array(picture)
     # Pillow keeps only the high byte of colours. If it is asked for little-endian values, it keeps the low byte.
     channels = "RGBA" if colour_type == _RGB_ALPHA else "RGB"
     high, low = (_read_as(data, f"{channels};16{order}").astype(np.uint16) for order in "BL")
-    return high << 8 | low
+    return (high << 8 | low).astype(np.uint16)
 
 
 def _read_as(data: bytes | memoryview, rawmode: str) -> NDArray[np.uint8]:
