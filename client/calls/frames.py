@@ -29,7 +29,7 @@ class NewFrame:
     Attributes:
         index: frame index; ignored with `numbering="next"`.
         images: JPEG, PNG, WebP, BMP, PPM or PGM file of each camera, keyed by camera name.
-        masks: PNG mask of each camera, keyed by camera name; empty for no masks.
+        masks: PNG or BMP mask of each camera, keyed by camera name; empty for no masks.
         time: timestamp in seconds; index / frames_per_second if None.
     """
 
@@ -56,7 +56,7 @@ def put_frame(
         id: scene id.
         index: frame index: 0, 1, 2, …
         images: JPEG, PNG, WebP, BMP, PPM or PGM file of each camera, keyed by camera name.
-        masks: PNG mask of each camera, keyed by camera name; required for all cameras or none.
+        masks: PNG or BMP mask of each camera, keyed by camera name; required for all cameras or none.
         time: timestamp in seconds, increasing from frame to frame; index / frames_per_second if None.
 
     Raises:

@@ -5,7 +5,7 @@ The service, the worker and the importers all use these rules:
 ======================  ====================================================================================
 formats                 JPEG, PNG, WebP, BMP, and binary PPM and PGM; of masks, PNG and BMP
 more than one image     the first image is used (MPO, animated PNG and WebP)
-EXIF orientation ≠ 1    rejected in all formats: intrinsics are valid for one orientation of the pixels only, and
+EXIF orientation 2…8    rejected in all formats: intrinsics are valid for one orientation of the pixels only, and
                         the file does not record for which orientation the camera was calibrated
 alpha (also palette)    composited over black, the empty background of a capture, without linearization
 grey                    replicated to three channels
@@ -113,7 +113,7 @@ def check_image(source: Source, *, size: Size | None = None, name: str | None = 
     scas4d_core.captures.picture_file.ImageError: north: not a JPEG, PNG, WebP, BMP, PPM or PGM file: ...
     """
     picture = _PictureFile(source, name or _name(source), size)
-    if not picture.header.decodable:
+    if not picture.is_plain:
         picture.rgb(bit_depth=None)
 
 
@@ -412,6 +412,12 @@ class _PictureFile:
             if size not in (None, self.header.size):
                 raise _wrong_size(self.header, size)
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the image is 8-bit RGB or grey without transparency, whose conversion to sRGB cannot fail."""
+        plain = self._picture.mode in ("L", "RGB") and "transparency" not in self._picture.info
+        return plain and self.header.bits <= 8
+
     def stored(self) -> NDArray[Any]:
         """Returns the values of a mask as stored, [H, W] or [H, W, C]; of a palette image, the indices."""
         with _errors_of(self._name):
@@ -451,7 +457,7 @@ def _check_orientation(picture: Image.Image) -> None:
         orientation = int(picture.getexif().get(EXIF_ORIENTATION, 1))
     except Exception:  # damaged metadata, which contains no orientation
         return
-    if orientation != 1:
+    if 2 <= orientation <= 8:  # some cameras write 0 for an unknown orientation
         raise ImageError(
             f"EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not match a "
             "rotated image",

@@ -65,9 +65,10 @@ def test_an_orientation_is_refused_and_upright_is_not():
         for kind in ("JPEG", "PNG", "WEBP"):
             with pytest.raises(ImageError, match=f"EXIF orientation is {orientation}; the intrinsics"):
                 decode_image(encoded(Image.fromarray(rgb()), kind, exif=exif), size=(6, 8))
-    exif = Image.Exif()
-    exif[0x0112] = 1
-    np.testing.assert_array_equal(decode_image(encoded(Image.fromarray(rgb()), exif=exif)), rgb())
+    for orientation in (0, 1):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        np.testing.assert_array_equal(decode_image(encoded(Image.fromarray(rgb()), exif=exif)), rgb())
 
 
 def test_alpha_is_composited_over_black():
