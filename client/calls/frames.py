@@ -28,8 +28,8 @@ class NewFrame:
 
     Attributes:
         index: frame index; ignored with `numbering="next"`.
-        images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
-        masks: PNG mask of each camera, keyed by camera name; empty for no masks.
+        images: JPEG, PNG, WebP, BMP, PPM or PGM file of each camera, keyed by camera name.
+        masks: PNG or BMP mask of each camera, keyed by camera name; empty for no masks.
         time: timestamp in seconds; index / frames_per_second if None.
     """
 
@@ -55,8 +55,8 @@ def put_frame(
     Args:
         id: scene id.
         index: frame index: 0, 1, 2, …
-        images: JPEG, PNG or WebP file of each camera in the rig, keyed by camera name.
-        masks: PNG mask of each camera, keyed by camera name; required for all cameras or none.
+        images: JPEG, PNG, WebP, BMP, PPM or PGM file of each camera, keyed by camera name.
+        masks: PNG or BMP mask of each camera, keyed by camera name; required for all cameras or none.
         time: timestamp in seconds, increasing from frame to frame; index / frames_per_second if None.
 
     Raises:
@@ -118,7 +118,7 @@ def put_camera(
         id: scene id.
         index: frame index.
         camera: name of a camera in the rig.
-        image: contents of a JPEG, PNG or WebP file.
+        image: contents of a JPEG, PNG, WebP, BMP, PPM or PGM file.
         mask: contents of a PNG file; None for no mask.
         time: timestamp of the frame in seconds; must be the same for all its cameras.
 

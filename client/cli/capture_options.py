@@ -55,6 +55,10 @@ def _options(
             )
         ),
     ] = None,
+    bit_depth: Annotated[
+        int | None,
+        typer.Option(min=8, max=16, help="Bits that the values of 16-bit images use; default: found from the values."),
+    ] = None,
 ) -> CaptureOptions:
     return CaptureOptions(
         calibration=calibration,
@@ -63,6 +67,7 @@ def _options(
         use_masks=masks,
         test=tuple(test or ()),
         size_mismatch=None if size_mismatch is None else size_mismatch.value,
+        bit_depth=bit_depth,
     )
 
 

@@ -23,7 +23,8 @@ NAMES = (
     "a dash or `mask.`"
 )
 PICTURE_SUFFIXES = (
-    ".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".exr", ".dng", ".raw", ".heic", ".gif", ".jp2", ".avif",
+    ".jpg", ".jpeg", ".png", ".webp", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".exr", ".dng", ".raw", ".heic", ".gif",
+    ".jp2", ".avif",
 )  # fmt: skip
 SPLITS = ("train", "val", "test")
 LISTED = 20

@@ -36,6 +36,7 @@ class CaptureOptions:
     use_masks: bool = True
     test: tuple[str, ...] = ()
     size_mismatch: SizeMismatch | None = None
+    bit_depth: int | None = None
     encoding: Encoding = "jpeg"
 
     def open(self, folder: Path | str, **more: Any) -> Capture:
@@ -68,6 +69,7 @@ def open_source(
     image_scale: float = 1.0,
     test: tuple[str, ...] = (),
     size_mismatch: SizeMismatch | None = None,
+    bit_depth: int | None = None,
 ) -> Capture:
     """Opens a capture in any supported layout (docs/captures.md). All commands and studies use this function.
 
@@ -87,6 +89,7 @@ def open_source(
         test: names of cameras to hold out for evaluation, in addition to those that the layout holds out.
         size_mismatch: how images whose aspect ratio differs from the calibration were produced (`adapt_intrinsics`);
             None to reject such images.
+        bit_depth: number of bits that the values of 16-bit images use; None to find it from the values.
 
     Raises:
         CaptureError: if the layout is unknown, or a file is invalid. The message names the problem.
@@ -109,10 +112,17 @@ def open_source(
                 f"{folder / TRAIN_META} already lists this capture's images; omit --pictures {pictures}, or choose "
                 "another calibration with --calibration"
             )
-        given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, size_mismatch=size_mismatch)
+        given = open_capture(
+            folder,
+            fps=fps,
+            use_masks=use_masks,
+            use_points=use_points,
+            size_mismatch=size_mismatch,
+            bit_depth=bit_depth,
+        )
     else:
         read = read_calibration(folder, calibration)
-        given = _imported(folder, read, pictures, fps, encoding, use_masks, size_mismatch)
+        given = _imported(folder, read, pictures, fps, encoding, use_masks, size_mismatch, bit_depth)
         given = given if use_points else replace(given, points=None)
         names = {label: name for name, label in read.labels.items()}
         test = tuple(names.get(name, name) for name in test)
@@ -129,8 +139,9 @@ def _imported(
     encoding: Encoding,
     use_masks: bool,
     size_mismatch: SizeMismatch | None,
+    bit_depth: int | None,
 ) -> Capture:
-    found, raw = _pictures(folder, found, pictures)
+    found, raw = _pictures(folder, found, pictures, bit_depth)
     found, resized = fit_to_pictures(found, raw, size_mismatch)
     masks = folder / "masks"
     files = masks_of(masks, found) if use_masks and masks.is_dir() else {}
@@ -156,22 +167,24 @@ def _imported(
     return replace(capture, remarks=(*capture.remarks, *unit_remarks(times, capture.fps))).with_held_out(found.test)
 
 
-def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> tuple[Calibration, RawReader]:
+def _pictures(
+    folder: Path, calibration: Calibration, wanted: PicturesFrom | None, bit_depth: int | None
+) -> tuple[Calibration, RawReader]:
     """Returns a reader for the images, and the calibration without cameras that have none."""
     several = min(len(views) for views in calibration.views.values()) > 1
     source = None if wanted == "named" or (wanted is None and several) else find_source(folder, calibration, wanted)
     if source is None:
-        return calibration, _named(folder, calibration, wanted)
+        return calibration, _named(folder, calibration, wanted, bit_depth)
     on_disk = source.names_of(calibration)
     if source.kind == "frames" and any(calibration.views.values()) and len(frame_folders(source.root, on_disk)) == 1:
-        return calibration, named_files(folder, calibration)  # the images that were used to calibrate
+        return calibration, named_files(folder, calibration, bit_depth)  # the images that were used to calibrate
     calibration = compare(source, calibration)
     if source.kind == "frames":
-        return calibration, PictureFiles(calibration, frames_of_folders(source.root, on_disk))
+        return calibration, PictureFiles(calibration, frames_of_folders(source.root, on_disk), bit_depth=bit_depth)
     files = {camera: source.entries[name] for camera, name in on_disk.items()}
     if source.kind == "images":
         folders = {camera: paths[0] for camera, paths in files.items()}
-        return calibration, PictureFiles(calibration, frames_of_cameras(folders))
+        return calibration, PictureFiles(calibration, frames_of_cameras(folders), bit_depth=bit_depth)
     for paths in files.values():
         if len(paths) > 1:
             raise CaptureError(
@@ -180,9 +193,9 @@ def _pictures(folder: Path, calibration: Calibration, wanted: PicturesFrom | Non
     return calibration, Videos(calibration, {camera: paths[0] for camera, paths in files.items()})
 
 
-def _named(folder: Path, calibration: Calibration, wanted: PicturesFrom | None) -> PictureFiles:
+def _named(folder: Path, calibration: Calibration, wanted: PicturesFrom | None, bit_depth: int | None) -> PictureFiles:
     if wanted in (None, "named") and any(calibration.views.values()):
-        return named_files(folder, calibration)
+        return named_files(folder, calibration, bit_depth)
     there = [
         f"{source.root.name}/ contains {listed(list(source.entries))}"
         for source in picture_sources(folder)

@@ -13,11 +13,13 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from client.importers.calibration import PICTURE_SUFFIXES, Calibration, composed, listed, natural
 from client.importers.source import Picture
 from scas4d_core.captures import CaptureError, ImageError, decode_image
-from scas4d_core.captures.images import describe_pictures, picture_size
+from scas4d_core.captures.images import describe_pictures, eight_bit_file, picture_size
+from scas4d_core.captures.picture_file import ACCEPTED
+from scas4d_core.captures.reader import read_bytes
 
 SENT = (".jpg", ".jpeg", ".png", ".webp")
-"""Extensions that the service accepts without re-encoding."""
-READ = (*SENT, ".bmp")
+"""Extensions of files that are sent without re-encoding."""
+READ = (*SENT, ".bmp", ".ppm", ".pgm")
 SHOWN = 3
 
 Frames = Mapping[str, Mapping[str, Path]]
@@ -32,6 +34,10 @@ class PictureFiles:
         files: image files of each frame, keyed by the name of the frame and by camera name.
         times: time of each frame in seconds; empty if unknown.
         remarks: messages for the user.
+        bit_depth: number of bits that the values of 16-bit images use; None to find it from the values.
+
+    Attributes:
+        bit_depth: the bit depth, or None if there are no 16-bit images.
 
     Raises:
         CaptureError: if the first image of a camera cannot be read.
@@ -40,18 +46,24 @@ class PictureFiles:
     fps: float | None = None
 
     def __init__(
-        self, calibration: Calibration, files: Frames, times: Sequence[float] = (), remarks: Sequence[str] = ()
+        self,
+        calibration: Calibration,
+        files: Frames,
+        times: Sequence[float] = (),
+        remarks: Sequence[str] = (),
+        *,
+        bit_depth: int | None = None,
     ) -> None:
-        self._files = list(files.values())
+        self._files = [{camera: frame[camera] for camera in calibration.names} for frame in files.values()]
         self._names = list(files)
         self._times = times
         self.frame_count = len(files)
-        first = {camera: self._files[0][camera] for camera in calibration.names}
         try:
-            self.sizes = {camera: picture_size(path) for camera, path in first.items()}
-            self.remarks = [*remarks, *describe_pictures(first)]
+            self.sizes = {camera: picture_size(path) for camera, path in self._files[0].items()}
+            self.bit_depth, described = describe_pictures(self._files, bit_depth)
         except ImageError as fault:
             raise CaptureError(str(fault)) from fault
+        self.remarks = [*remarks, *described]
 
     def time(self, index: int) -> float | None:
         """Returns the frame's time in seconds, or None if the calibration has no times."""
@@ -61,14 +73,16 @@ class PictureFiles:
         """Returns the first image file of a camera."""
         return self._files[0][camera]
 
-    def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image file of a camera and frame, or None if the service does not accept its format."""
+    def file(self, index: int, camera: str) -> bytes | None:
+        """Returns a JPEG, PNG or WebP file of a camera and frame, converted to 8 bits if necessary; otherwise None."""
         path = self._files[index][camera]
-        return path if path.suffix.lower() in SENT else None
+        if path.suffix.lower() not in SENT:
+            return None
+        return eight_bit_file(read_bytes(path), str(path), self.bit_depth)
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Returns the decoded image [H, W, 3] of a camera and frame."""
-        return decode_image(self._files[index][camera], size=self.sizes[camera])
+        return decode_image(self._files[index][camera], size=self.sizes[camera], bit_depth=self.bit_depth)
 
     def check_same_frames(self, masks: Frames) -> None:
         """Checks that masks and images have the same frame names.
@@ -172,7 +186,7 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
         if path.name.startswith(".") or end not in PICTURE_SUFFIXES:
             continue
         if end not in READ:
-            raise CaptureError(f"{path}: {end} is not supported; use JPEG, PNG, WebP or BMP")
+            raise CaptureError(f"{path}: {end} is not supported; use {ACCEPTED}")
         if path.stem in pictures:
             raise CaptureError(f"{path} and {pictures[path.stem].name} are the same frame; keep only one of them")
         pictures[path.stem] = path
@@ -182,7 +196,7 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
     return pictures
 
 
-def named_files(folder: Path, calibration: Calibration) -> PictureFiles:
+def named_files(folder: Path, calibration: Calibration, bit_depth: int | None = None) -> PictureFiles:
     """Returns a reader for the files that the calibration lists.
 
     Frame t consists of the t-th image of each camera. Times are in seconds. They are used only if all are known, and
@@ -224,6 +238,7 @@ def named_files(folder: Path, calibration: Calibration) -> PictureFiles:
         frames,
         times if len(times) == len(frames) and len(frames) > 1 else [],
         _unlisted(frames, calibration),
+        bit_depth=bit_depth,
     )
 
 

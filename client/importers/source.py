@@ -18,8 +18,7 @@ from client.importers.extras import MissingExtraError, opencv
 from client.importers.undistort import Undistorter
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import CaptureError, SizeMismatch, decode_mask
-from scas4d_core.captures.images import Size, eight_bit_file
-from scas4d_core.captures.reader import read_bytes
+from scas4d_core.captures.images import Size
 from scas4d_core.captures.size_mismatch import adapt_intrinsics
 from scas4d_core.errors import exact
 from scas4d_core.frame_times import MAX_TIME, ROWS, FrameTime, time_warnings
@@ -55,8 +54,8 @@ class RawReader(Protocol):
     def path(self, camera: str) -> Path:
         """Returns the first file of a camera, for messages."""
 
-    def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image file of a camera and frame, or None if no file is in a format that the service accepts."""
+    def file(self, index: int, camera: str) -> bytes | None:
+        """Returns an image as the contents of an 8-bit JPEG, PNG or WebP file, or None if it has to be encoded."""
 
     def decoded(self, index: int, camera: str) -> Picture:
         """Returns the decoded image [H, W, 3] of a camera and frame."""
@@ -124,13 +123,13 @@ class ImportedPictures:
     def encoded_image(self, index: int, camera: str) -> bytes:
         """Returns the original image file, or the undistorted image re-encoded, as bytes.
 
-        The original is used if the service accepts its format and the camera has no distortion. 16-bit images are
-        rounded to 8 bits.
+        The original is used if it is a JPEG, PNG or WebP file and the camera has no distortion. 16-bit images are
+        converted to 8 bits.
         """
         if self._undistorters[camera].lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
-                return eight_bit_file(read_bytes(file), str(file))
+                return file
         return encode(self.image(index, camera), self._encoding)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:

@@ -109,7 +109,7 @@ class Videos:
         """Returns the video file of a camera."""
         return self._videos[camera].path
 
-    def file(self, index: int, camera: str) -> Path | None:
+    def file(self, index: int, camera: str) -> None:
         """Returns None, because a video frame has no file of its own."""
         return None
 

@@ -10,7 +10,8 @@ from scas4d_core.captures.dynamic3dgs import TRAIN_META, read_dynamic3dgs
 from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.ground_truth import GroundTruth, TruePart
-from scas4d_core.captures.images import ImageError, decode_image, decode_mask, resize_area
+from scas4d_core.captures.images import check_image, check_mask, decode_image, decode_mask, resize_area
+from scas4d_core.captures.picture_file import ImageError
 from scas4d_core.captures.reader import PictureReader
 from scas4d_core.captures.size_mismatch import SizeMismatch
 
@@ -24,6 +25,8 @@ __all__ = [
     "PictureReader",
     "SizeMismatch",
     "TruePart",
+    "check_image",
+    "check_mask",
     "decode_image",
     "decode_mask",
     "open_capture",
@@ -38,7 +41,7 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
     Args:
         folder: folder of the capture.
         options: keyword arguments for `read_dynamic3dgs`: image_scale, fps, use_masks, use_points,
-            size_mismatch.
+            size_mismatch, bit_depth.
 
     Raises:
         CaptureError: if the folder does not exist, its layout is unknown, or one of its files is

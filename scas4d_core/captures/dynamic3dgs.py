@@ -29,7 +29,8 @@ from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.files import CaptureError, read_json, read_npz
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.captures.ground_truth import read_extent, read_ground_truth
-from scas4d_core.captures.images import ImageError, describe_pictures, picture_size, scaled_size
+from scas4d_core.captures.images import describe_pictures, picture_size, scaled_size
+from scas4d_core.captures.picture_file import ImageError
 from scas4d_core.captures.reader import FileReader, Files
 from scas4d_core.captures.size_mismatch import SizeMismatch, adapt_intrinsics
 
@@ -46,6 +47,7 @@ def read_dynamic3dgs(
     use_masks: bool = True,
     use_points: bool = True,
     size_mismatch: SizeMismatch | None = None,
+    bit_depth: int | None = None,
 ) -> Capture:
     """Opens a capture in the Dynamic3DGaussians layout.
 
@@ -62,6 +64,7 @@ def read_dynamic3dgs(
         use_points: whether to read ``init_pt_cld.npz``.
         size_mismatch: how images with an aspect ratio other than ``w``:``h`` were produced (see
             `adapt_intrinsics`), or None to reject such images.
+        bit_depth: number of bits that the values of 16-bit images use; None to find it from the values.
 
     Raises:
         CaptureError: if a file is missing, damaged or inconsistent with other files, or if a camera
@@ -87,17 +90,22 @@ def read_dynamic3dgs(
     masks: list[tuple[Files, ...]] = [({},) * len(train.images)]
     if use_masks and (folder / "seg").is_dir():
         masks = [_masks(folder, one, required=one is train) for one in given]
+    images = _merge_files([one.images for one in given])
+    try:
+        depth, described = describe_pictures(images, bit_depth)
+    except ImageError as fault:
+        raise CaptureError(str(fault)) from fault
     return Capture(
         name=folder.resolve().name,
         full_rig=train.rig,
         full_test_rig=test.rig if test else None,
-        pictures=FileReader(_merge_files([one.images for one in given]), _merge_files(masks), sizes),
+        pictures=FileReader(images, _merge_files(masks), sizes, depth),
         image_scale=image_scale,
         fps=float(rate),
         points=_read_points(folder / "init_pt_cld.npz") if use_points else None,
         ground_truth=read_ground_truth(folder, len(train.images), scaled),
         extent=read_extent(folder),
-        remarks=tuple(_remarks(given)),
+        remarks=(*(remark for one in given for remark in one.remarks), *described),
     )
 
 
@@ -113,14 +121,6 @@ class _Cameras:
     relative: tuple[dict[str, PurePosixPath], ...]
     fps: Any
     remarks: list[str]
-
-
-def _remarks(given: list[_Cameras]) -> list[str]:
-    try:
-        described = describe_pictures({name: file for one in given for name, file in one.images[0].items()})
-    except ImageError as fault:
-        raise CaptureError(str(fault)) from fault
-    return [remark for one in given for remark in one.remarks] + described
 
 
 def _read_cameras(folder: Path, file: str, size_mismatch: SizeMismatch | None) -> _Cameras:

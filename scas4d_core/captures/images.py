@@ -1,18 +1,21 @@
-"""Decodes and resizes images and masks. Requires only NumPy and Pillow.
+"""Decides which files are images and masks, and decodes and resizes them. Requires only NumPy and Pillow.
 
-Image files are handled as follows:
+The service, the worker and the importers all use these rules:
 
 ======================  ====================================================================================
-EXIF orientation ≠ 1    rejected: intrinsics are valid for one orientation of the pixels only, and the file
-                        does not record for which orientation the camera was calibrated
+formats                 JPEG, PNG, WebP, BMP, and binary PPM and PGM; of masks, PNG and BMP
+more than one image     the first image is used (MPO, animated PNG and WebP)
+EXIF orientation 2…8    rejected in all formats: intrinsics are valid for one orientation of the pixels only, and
+                        the file does not record for which orientation the camera was calibrated
 alpha (also palette)    composited over black, the empty background of a capture, without linearization
 grey                    replicated to three channels
-16 bit                  grey: value / 257, rounded to 8 bit; colour: the high byte (at most one level off)
-ICC profile             converted to sRGB (relative colorimetric), unless its description names sRGB
+16 bit                  scaled to 8 bit from a given bit depth, and rounded; rejected if the depth is not given
+ICC profile             converted to sRGB (relative colorimetric), unless its description names sRGB; rejected if
+                        it is damaged
 grey ICC profile        ignored
 no ICC profile          assumed to be sRGB; gAMA and cHRM chunks are ignored
 CMYK, float, Lab        rejected
-more than one image     rejected (animations, multi-page and multi-image files)
+truncated or damaged    rejected, except damage within the scan of a JPEG, which its format cannot detect
 ======================  ====================================================================================
 
 A mask is 1 where the stored value of any channel is nonzero. Masks with alpha or in lossy formats are rejected.
@@ -21,25 +24,28 @@ A mask is 1 where the stored value of any channel is nonzero. Masks with alpha o
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageCms
+from PIL import Image, ImageCms, UnidentifiedImageError
 
+from scas4d_core.captures.bit_depth import find_bit_depth, is_sixteen_bit, sixteen_bit_values, to_eight_bits
+from scas4d_core.captures.picture_file import ACCEPTED, RESEND, ImageError, PictureHeader, picture_header
 from scas4d_core.frame_outcome import grey_warnings
 
-PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM")
+FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "PPM")
 MASK_FORMATS = ("PNG", "BMP")
 EXIF_ORIENTATION = 0x0112
+SAMPLED_FRAMES = 8
+"""Number of frames, evenly spaced over the capture, whose values determine the bit depth."""
 
 Size = tuple[int, int]
-
-
-class ImageError(ValueError):
-    """Raised if an image or mask cannot be used; the message names the file and the problem."""
+Source = bytes | memoryview | Path
 
 
 def scaled_size(size: Size, image_scale: float) -> Size:
@@ -50,7 +56,12 @@ def scaled_size(size: Size, image_scale: float) -> Size:
 
 
 def decode_image(
-    source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
+    source: Source,
+    *,
+    size: Size | None = None,
+    image_scale: float = 1.0,
+    bit_depth: int | None = None,
+    name: str | None = None,
 ) -> NDArray[np.uint8]:
     """Decodes an image file to 8-bit sRGB values.
 
@@ -59,6 +70,8 @@ def decode_image(
         size: required (width, height) of the file in pixels, before scaling; not checked if None.
         image_scale: scale factor. The image is resized by area averaging to the size that
             `Camera.scaled` returns.
+        bit_depth: number of bits that the values of a 16-bit file use (see `find_bit_depth`). If None,
+            16-bit files are rejected.
         name: name of the image in error messages; defaults to the path.
 
     Returns:
@@ -77,13 +90,35 @@ def decode_image(
             [255, 128,   0]]], dtype=uint8)
     """
     name = name or _name(source)
-    picture = _open(source, name, PICTURE_FORMATS, size)
-    rgb = _rgb(picture, name)
-    return resize_area(rgb, scaled_size(picture.size, image_scale))
+    rgb = _PictureFile(source, name, size).rgb(bit_depth)
+    return resize_area(rgb, scaled_size((rgb.shape[1], rgb.shape[0]), image_scale))
+
+
+def check_image(source: Source, *, size: Size | None = None, name: str | None = None) -> None:
+    """Raises the error that `decode_image` would raise for a file.
+
+    The pixels of common JPEG files and of raw pixels are not decoded, because their structure shows that they can be.
+
+    Args:
+        source: image file, as bytes or as a path.
+        size: required (width, height) of the file in pixels; not checked if None.
+        name: name of the image in error messages; defaults to the path.
+
+    Raises:
+        ImageError: if the file cannot be used as an image.
+
+    >>> check_image(b"GIF89a", name="north")
+    Traceback (most recent call last):
+    ...
+    scas4d_core.captures.picture_file.ImageError: north: not a JPEG, PNG, WebP, BMP, PPM or PGM file: ...
+    """
+    picture = _PictureFile(source, name or _name(source), size)
+    if not picture.is_plain:
+        picture.rgb(bit_depth=None)
 
 
 def decode_mask(
-    source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
+    source: Source, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
     """Decodes a foreground mask. The arguments and errors are those of `decode_image`.
 
@@ -98,17 +133,25 @@ def decode_mask(
     >>> decode_mask(file.getvalue())
     array([[0, 1, 1]], dtype=uint8)
     """
-    name = name or _name(source)
-    picture = _open(source, name, MASK_FORMATS, size)
-    if picture.mode in ("LA", "PA", "RGBA", "La", "RGBa"):
-        raise ImageError(
-            f"{name}: a mask with an alpha channel is ambiguous; use a single channel, with 0 for background"
-        )
-    values = np.asarray(picture)  # palette images give the index, not the colour
+    values = _PictureFile(source, name or _name(source), size, mask=True).stored()
     foreground = values != 0
     if foreground.ndim == 3:
         foreground = foreground.any(axis=-1)
-    return resize_mask(np.array(foreground, dtype=np.uint8), scaled_size(picture.size, image_scale))
+    mask = np.array(foreground, dtype=np.uint8)
+    return resize_mask(mask, scaled_size((mask.shape[1], mask.shape[0]), image_scale))
+
+
+def check_mask(source: Source, *, size: Size | None = None, name: str | None = None) -> None:
+    """Raises the error that `decode_mask` would raise for a file. The arguments are those of `check_image`.
+
+    >>> file = io.BytesIO()
+    >>> Image.new("L", (4, 2)).save(file, "JPEG")
+    >>> check_mask(file.getvalue(), name="mask.north")
+    Traceback (most recent call last):
+    ...
+    scas4d_core.captures.picture_file.ImageError: mask.north: masks must be PNG or BMP, not JPEG; ...
+    """
+    _PictureFile(source, name or _name(source), size, mask=True).stored()
 
 
 def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
@@ -132,31 +175,28 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
     array([[3, 7]], dtype=uint8)
     """
     name = name or _name(source)
-    picture = _open(source, name, MASK_FORMATS, size)
-    if picture.mode not in ("L", "P"):
-        raise ImageError(f"{name}: labels must have a single 8-bit channel; got colour mode {picture.mode}")
+    stored = _PictureFile(source, name, size, mask=True).stored()
+    if stored.ndim != 2 or stored.dtype != np.uint8:
+        raise ImageError(f"{name}: labels must have a single 8-bit channel; got {stored.dtype} [{stored.shape}]")
     columns, rows = (
         np.floor((np.arange(count) + 0.5) * (length / count)).astype(np.intp)
         for count, length in zip(target, size, strict=True)
     )
-    labels: NDArray[np.uint8] = np.asarray(picture)[np.ix_(rows, columns)]
+    labels: NDArray[np.uint8] = stored[np.ix_(rows, columns)]
     return labels
 
 
-def picture_size(source: bytes | Path, name: str | None = None) -> Size:
-    """Returns the width and height of an image in pixels. The pixels are not decoded.
+def picture_size(path: Path) -> Size:
+    """Returns the width and height of an image file in pixels. The pixels are not decoded.
 
-    >>> file = io.BytesIO()
-    >>> Image.new("RGB", (4, 2)).save(file, "JPEG")
-    >>> picture_size(file.getvalue())
-    (4, 2)
+    Raises:
+        ImageError: if the file is missing or its header cannot be read.
+
+    >>> picture_size(Path("samples/robot/ims/3/000000.png"))
+    (256, 256)
     """
-    name = name or _name(source)
-    try:
-        with Image.open(_stream(source), formats=PICTURE_FORMATS) as picture:
-            return picture.size
-    except Exception as fault:
-        raise _unreadable(name, fault) from fault
+    with _errors_of(str(path)), _open(path) as picture:
+        return picture.size
 
 
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
@@ -188,54 +228,74 @@ def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     return resized
 
 
-def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
+def eight_bit_file(data: bytes, name: str = "picture", bit_depth: int | None = None) -> bytes:
     """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG file.
+
+    Args:
+        data: contents of the file.
+        name: name of the image in error messages.
+        bit_depth: see `decode_image`.
 
     Raises:
         ImageError: if the image must be re-encoded but cannot be decoded.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
-    >>> decode_image(eight_bit_file(file.getvalue()))[0, 0].tolist()
+    >>> decode_image(eight_bit_file(file.getvalue(), bit_depth=16))[0, 0].tolist()
     [100, 100, 100]
     """
     sent = data.startswith((b"\xff\xd8", b"\x89PNG")) or data[8:12] == b"WEBP"
     if sent and not is_sixteen_bit(data):
         return data
     file = io.BytesIO()
-    Image.fromarray(decode_image(data, name=name)).save(file, "PNG", compress_level=1)
+    Image.fromarray(decode_image(data, bit_depth=bit_depth, name=name)).save(file, "PNG", compress_level=1)
     return file.getvalue()
 
 
-def is_sixteen_bit(head: bytes) -> bool:
-    """Returns whether a file is a PNG with 16 bits per channel, given its first 25 bytes."""
-    return head.startswith(b"\x89PNG") and head[24:25] == b"\x10"
+def describe_pictures(
+    frames: Sequence[Mapping[str, Path]], bit_depth: int | None = None
+) -> tuple[int | None, list[str]]:
+    """Returns the bit depth of a capture's 16-bit images, and remarks for the user on its images.
 
-
-def describe_pictures(files: Mapping[str, Path]) -> list[str]:
-    """Returns remarks for the user on 16-bit images, and on greyscale cameras in a colour rig.
-
-    The remarks are based on the headers of the files. The pixels are not decoded.
+    The remarks concern 16-bit images, files with several images, and greyscale cameras in a colour rig. They are based
+    on the headers of the first frame's files. Of 16-bit cameras, the images of several frames are decoded.
 
     Args:
-        files: maps each camera name to one of its image files.
+        frames: the image files of each frame, keyed by camera name.
+        bit_depth: number of bits that the values of 16-bit images use; None to find it (`find_bit_depth`).
+
+    Returns:
+        The bit depth, or None if there are no 16-bit images, and the remarks.
 
     Raises:
-        ImageError: if an image cannot be read.
+        ImageError: if an image of the first frame cannot be read, or is rotated.
     """
-    remarks, grey = [], {}
-    for camera, path in files.items():
-        try:
-            with path.open("rb") as file:
-                deep = is_sixteen_bit(file.read(25))
-            with Image.open(path, formats=PICTURE_FORMATS) as picture:
-                grey[camera] = picture.mode in ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
-        except Exception as fault:
-            raise _unreadable(str(path), fault) from fault
-        if deep:
-            grey_or_colour = "rounded (value / 257)" if grey[camera] else "reduced to their high byte"
-            remarks.append(f"camera {camera!r}: 16-bit images are converted to 8 bits, {grey_or_colour}")
-    return remarks + mixed_colours(grey)
+    grey, several, deep = {}, [], []
+    for camera, path in frames[0].items():
+        with _errors_of(str(path)), _open(path) as picture:
+            grey[camera] = picture.mode in ("1", "L", "LA", "I;16")
+            _check_orientation(picture)
+            several += [camera] if getattr(picture, "n_frames", 1) > 1 else []
+        with path.open("rb") as file:
+            deep += [camera] if is_sixteen_bit(file.read(25)) else []
+    remarks = mixed_colours(grey)
+    if several:
+        remarks.append(f"{_listed(several)}: files contain several images; only the first of each file is used")
+    if not deep:
+        return None, remarks
+    depth = bit_depth
+    if depth is None:
+        sampled = frames[:: -(-len(frames) // SAMPLED_FRAMES)]
+        depth = find_bit_depth(frame[camera] for frame in sampled for camera in deep)
+    remarks.append(
+        f"{_listed(deep)}: 16-bit images are converted to 8 bits from a bit depth of {depth}"
+        + ("" if bit_depth else ", which was found from their values; if it is wrong, set --bit-depth")
+    )
+    return depth, remarks
+
+
+def _listed(cameras: Sequence[str]) -> str:
+    return f"camera {cameras[0]!r}" if len(cameras) == 1 else f"{len(cameras)} cameras, such as {cameras[0]!r}"
 
 
 def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
@@ -288,82 +348,146 @@ def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64
     return picture
 
 
-def _name(source: bytes | Path) -> str:
-    return "image data" if isinstance(source, bytes) else str(source)
+def _name(source: Source) -> str:
+    return str(source) if isinstance(source, Path) else "image data"
 
 
-def _stream(source: bytes | Path) -> io.BytesIO:
-    return io.BytesIO(source if isinstance(source, bytes) else source.read_bytes())
+def _open(source: Path | io.BytesIO, formats: tuple[str, ...] = FORMATS) -> Image.Image:
+    return Image.open(source, formats=formats)
 
 
-def _unreadable(name: str, fault: Exception) -> ImageError:
-    if isinstance(fault, ImageError):
-        return fault
-    if isinstance(fault, FileNotFoundError):
-        return ImageError(f"{name}: no such file")
-    return ImageError(f"{name} cannot be read as an image ({type(fault).__name__}: {fault})")
-
-
-def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size | None) -> Image.Image:
-    # Pillow raises many types of exceptions for damaged files (OSError, SyntaxError, …).
+@contextmanager
+def _errors_of(name: str) -> Iterator[None]:
+    """Raises each error as `ImageError` with the name of the image. Pillow raises errors of many types."""
     try:
-        picture = Image.open(_stream(source), formats=formats)
-        # The size is checked before decoding, because a small file can decompress to gigabytes.
-        if size is not None and picture.size != size:
-            raise ImageError(
-                f"{name} is {picture.width}x{picture.height} pixels, but its camera requires {size[0]}x{size[1]}; "
-                "use images of the size for which the camera was calibrated (image_scale resizes both)"
-            )
-        count = getattr(picture, "n_frames", 1)
-        if count > 1:
-            raise ImageError(f"{name} contains {count} images; use a file with a single image")
-        orientation = picture.getexif().get(EXIF_ORIENTATION, 1)
-        if orientation != 1:
-            raise ImageError(
-                f"{name}: EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not "
-                "match a rotated image; store the pixels in the calibrated orientation and remove the tag"
-            )
-        picture.load()
-    except Exception as fault:
-        raise _unreadable(name, fault) from fault
-    return picture
+        yield
+    except ImageError as error:
+        raise ImageError(f"{name}: {error.fault}", error.remedy, error.value) from error
+    except FileNotFoundError as error:
+        raise ImageError(f"{name}: no such file") from error
+    except UnidentifiedImageError as error:  # its message only names a buffer
+        raise ImageError(f"{name} cannot be read as an image: it is damaged, or not {ACCEPTED}", RESEND) from error
+    except Exception as error:
+        raise ImageError(f"{name} cannot be read as an image ({type(error).__name__}: {error})", RESEND) from error
 
 
-def _rgb(picture: Image.Image, name: str) -> NDArray[np.uint8]:
-    profile = picture.info.get("icc_profile")
-    if picture.mode in ("I;16", "I;16B", "I;16L", "I"):
-        grey = np.asarray(picture).astype(np.int64)
-        if grey.min() < 0 or grey.max() > 65535:
-            raise ImageError(
-                f"{name}: grey values {grey.min()}…{grey.max()} exceed 16 bits; use 8-bit or 16-bit values"
-            )
-        picture = Image.fromarray(((grey + 128) // 257).astype(np.uint8))
-    if picture.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-        raise ImageError(f"{name}: colour mode {picture.mode} is not supported; use RGB or grayscale")
-    transparent = picture.mode in ("LA", "PA", "RGBA") or "transparency" in picture.info
-    picture = picture.convert("RGBA" if transparent else "RGB")
-    alpha = np.asarray(picture.getchannel("A")).astype(np.uint32)[..., None] if transparent else None
-    picture = picture.convert("RGB")
-    if profile:
-        picture = _to_srgb(picture, profile, name)
-    rgb: NDArray[np.uint8] = np.array(picture)
-    if alpha is not None:
-        rgb = ((rgb * alpha + 127) // 255).astype(np.uint8)
-    return rgb
+class _PictureFile:
+    """Image file that follows the rules of this module.
+
+    Its pixels are already decoded, unless its header shows that they can be.
+
+    Args:
+        source: image file, as bytes or as a path.
+        name: name of the image in error messages.
+        size: required (width, height), or None.
+        mask: whether the file is a mask or a label image.
+
+    Raises:
+        ImageError: if the file breaks a rule, or cannot be decoded.
+    """
+
+    def __init__(self, source: Source, name: str, size: Size | None, *, mask: bool = False) -> None:
+        self._name = name
+        with _errors_of(name):
+            self._data = source.read_bytes() if isinstance(source, Path) else source
+            self.header = picture_header(self._data)
+            if mask and self.header.format not in MASK_FORMATS:
+                raise ImageError(
+                    f"masks must be PNG or BMP, not {self.header.format}",
+                    "encode masks as PNG, which keeps their values exactly",
+                    self.header.format,
+                )
+            # Before decoding, because a small file can declare a huge image. The orientation of a rotated image is
+            # reported below.
+            if size is not None and sorted(size) != sorted(self.header.size):
+                raise _wrong_size(self.header, size)
+            self._picture = _open(io.BytesIO(self._data), (self.header.format,))
+            if self._picture.size != self.header.size:
+                raise ImageError("the file contains different image sizes", RESEND)
+            profile = self._picture.info.get("icc_profile")
+            self._to_srgb = _to_srgb(profile) if profile and not mask else None
+            if not self.header.decodable:
+                self._picture.load()
+            _check_orientation(self._picture)
+            if size not in (None, self.header.size):
+                raise _wrong_size(self.header, size)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the image is 8-bit RGB or grey without transparency, whose conversion to sRGB cannot fail."""
+        plain = self._picture.mode in ("L", "RGB") and "transparency" not in self._picture.info
+        return plain and self.header.bits <= 8
+
+    def stored(self) -> NDArray[Any]:
+        """Returns the values of a mask as stored, [H, W] or [H, W, C]; of a palette image, the indices."""
+        with _errors_of(self._name):
+            if self._picture.mode in ("LA", "PA", "RGBA", "La", "RGBa"):
+                raise ImageError(
+                    "a mask with an alpha channel is ambiguous", "use a single channel, with 0 for background", "alpha"
+                )
+            return np.asarray(self._picture)
+
+    def rgb(self, bit_depth: int | None) -> NDArray[np.uint8]:
+        """Returns the image [H, W, 3], converted to sRGB. For `bit_depth`, see `decode_image`."""
+        with _errors_of(self._name):
+            picture = self._picture if self.header.bits <= 8 else _eight_bits(self._data, bit_depth)
+            if picture.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
+                raise ImageError(f"colour mode {picture.mode} is not supported", "use RGB or greyscale", picture.mode)
+            transparent = picture.mode in ("LA", "PA", "RGBA") or "transparency" in picture.info
+            picture = picture.convert("RGBA" if transparent else "RGB")
+            alpha = np.asarray(picture.getchannel("A")).astype(np.uint32)[..., None] if transparent else None
+            picture = picture.convert("RGB")
+            if self._to_srgb is not None:
+                picture = self._to_srgb.apply(picture)
+            rgb: NDArray[np.uint8] = np.array(picture)
+            return rgb if alpha is None else ((rgb * alpha + 127) // 255).astype(np.uint8)
 
 
-def _to_srgb(picture: Image.Image, profile: bytes, name: str) -> Image.Image:
+def _wrong_size(header: PictureHeader, size: Size) -> ImageError:
+    given = f"{header.size[0]}x{header.size[1]}"
+    return ImageError(
+        f"the image is {given} pixels, but its camera requires {size[0]}x{size[1]}",
+        "use images of the size for which the camera was calibrated",
+        given,
+    )
+
+
+def _check_orientation(picture: Image.Image) -> None:
+    try:
+        orientation = int(picture.getexif().get(EXIF_ORIENTATION, 1))
+    except Exception:  # damaged metadata, which contains no orientation
+        return
+    if 2 <= orientation <= 8:  # some cameras write 0 for an unknown orientation
+        raise ImageError(
+            f"EXIF orientation is {orientation}; the intrinsics apply to the stored pixels and would not match a "
+            "rotated image",
+            "store the pixels in the calibrated orientation and remove the tag",
+            str(orientation),
+        )
+
+
+def _eight_bits(data: bytes | memoryview, bit_depth: int | None) -> Image.Image:
+    if bit_depth is None:
+        depth = find_bit_depth([data])
+        scale = "" if depth == 16 else f"; its values use {depth} bits, so multiply them by 255/{(1 << depth) - 1}"
+        raise ImageError(
+            "the PNG file has 16 bits per channel", f"convert the image to 8 bits per channel{scale}", "16 bits"
+        )
+    return Image.fromarray(to_eight_bits(sixteen_bit_values(data), bit_depth))
+
+
+@lru_cache(16)
+def _to_srgb(profile: bytes) -> Any:
+    """Returns the Pillow transform from an ICC profile to sRGB, or None if no conversion is needed."""
     try:
         source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         described = source.profile.profile_description or ""
         if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in described:
             # A grey profile is only a tone curve. A conversion from sRGB to sRGB would only add
             # rounding errors.
-            return picture
-        converted = ImageCms.profileToProfile(
-            picture, source, ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
+            return None
+        return ImageCms.buildTransform(
+            source, ImageCms.createProfile("sRGB"), "RGB", "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC
         )
-    except (ImageCms.PyCMSError, OSError) as fault:
-        raise ImageError(f"{name}: the ICC profile cannot be read ({fault}); convert the image to sRGB") from fault
-    assert converted is not None  # only in-place conversion returns None
-    return converted
+    except (ImageCms.PyCMSError, OSError) as error:
+        raise ImageError(f"the ICC profile cannot be read ({error})", "convert the image to sRGB") from error

@@ -69,10 +69,18 @@ class FileReader:
         masks: one mapping per frame, from camera name to mask file. Cameras without a mask are
             absent.
         sizes: maps each camera name to the required (width, height) of its files.
+        bit_depth: number of bits that the values of 16-bit images use (`describe_pictures`).
     """
 
-    def __init__(self, images: Sequence[Files], masks: Sequence[Files], sizes: Mapping[str, Size]) -> None:
+    def __init__(
+        self,
+        images: Sequence[Files],
+        masks: Sequence[Files],
+        sizes: Mapping[str, Size],
+        bit_depth: int | None = None,
+    ) -> None:
         self.images, self.masks, self._sizes = tuple(images), tuple(masks), dict(sizes)
+        self._bit_depth = bit_depth
         self.frame_count = len(self.images)
 
     def time(self, index: int) -> float | None:
@@ -81,7 +89,7 @@ class FileReader:
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
         """Returns a decoded image, [H, W, 3]."""
-        return decode_image(self.images[index][camera], size=self._sizes[camera])
+        return decode_image(self.images[index][camera], size=self._sizes[camera], bit_depth=self._bit_depth)
 
     def has_mask(self, index: int, camera: str) -> bool:
         """Returns whether an image has a mask file."""
@@ -93,7 +101,8 @@ class FileReader:
 
     def encoded_image(self, index: int, camera: str) -> bytes:
         """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG."""
-        return eight_bit_file(read_bytes(self.images[index][camera]), str(self.images[index][camera]))
+        path = self.images[index][camera]
+        return eight_bit_file(read_bytes(path), str(path), self._bit_depth)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
         """Returns the unchanged mask file, or None if the image has no mask file."""

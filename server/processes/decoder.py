@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame
-from scas4d_core.captures.images import ImageError, decode_image, decode_mask
+from scas4d_core.captures.images import decode_image, decode_mask
+from scas4d_core.captures.picture_file import ImageError
 from server.messages import FrameReady
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.ledger import frame_identity
@@ -120,9 +121,9 @@ def _pictures_of(camera: Camera, encoded: Encoded) -> tuple[Picture, Picture | N
     if name not in encoded.images:
         return "; ".join(encoded.faults) or f"camera {name!r} had not sent an image when the frame was closed"
     try:
-        image = decode_image(bytes(encoded.images[name]), size=size, name=f"image of camera {name!r}")
+        image = decode_image(encoded.images[name], size=size, name=f"image of camera {name!r}")
         if name not in encoded.masks:
             return image, None
-        return image, decode_mask(bytes(encoded.masks[name]), size=size, name=f"mask of camera {name!r}")
+        return image, decode_mask(encoded.masks[name], size=size, name=f"mask of camera {name!r}")
     except ImageError as error:
         return str(error)

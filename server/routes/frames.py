@@ -107,7 +107,7 @@ Seconds = Annotated[
 
 @router.put("/{id}/frames/{n}", status_code=202, openapi_extra=BODY)
 async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
-    """Accepts frame n with one JPEG, PNG or WebP per camera; frames must arrive in order and without gaps.
+    """Accepts frame n with one image file per camera; frames must arrive in order and without gaps.
 
     The frame is on disk when the response is sent. Sending the same frame again returns the same response. Different
     content for a known index, and gaps, are refused (409, with the expected index). If the queue is full, the response

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import struct
 import zlib
 
 import httpx
-from PIL import Image
-from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, picture, pictures
+from running import Running, fake_settings, make_rig, picture, pictures
 from waiting import HANG_S, wait_for
 
 from client.sdk import Client
@@ -92,13 +90,6 @@ def declares(width, height):
     """A PNG whose header, checksum and all, declares another size."""
     header = b"IHDR" + struct.pack(">II", width, height) + picture()[24:29]
     return picture()[:12] + header + struct.pack(">I", zlib.crc32(header)) + picture()[33:]
-
-
-def animated():
-    first, second = (Image.new("RGB", (WIDTH, HEIGHT), (red, 0, 0)) for red in (0, 99))
-    file = io.BytesIO()
-    first.save(file, "PNG", save_all=True, append_images=[second])
-    return file.getvalue()
 
 
 @contextlib.contextmanager

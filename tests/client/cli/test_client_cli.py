@@ -181,7 +181,7 @@ def test_unlike_cameras_are_pushed_straight_from_their_folder(service, tmp_path)
 
 
 def test_the_options_of_a_capture_are_those_of_every_command():
-    names = ("--calibration", "--pictures", "--capture-fps", "--masks", "--test", "--size-mismatch")
+    names = ("--calibration", "--pictures", "--capture-fps", "--masks", "--test", "--size-mismatch", "--bit-depth")
     for command in ("push", "import", "reconstruct", "evaluate", "demo"):
         said = scas4d(command, "--help", COLUMNS="200").stdout
         assert [name for name in names if name not in said] == [], command

@@ -40,7 +40,10 @@ def test_each_camera_keeps_its_size_and_sees_the_ball_where_it_is(folder):
 
 def test_what_is_not_as_usual_is_said(folder):
     remarks = open_source(folder).remarks
-    assert any(remark.startswith(f"camera {DEEP!r}: 16-bit images are converted to 8 bits, ") for remark in remarks)
+    assert any(
+        remark.startswith(f"camera {DEEP!r}: 16-bit images are converted to 8 bits from a bit depth of 16")
+        for remark in remarks
+    )
     assert any(remark.startswith(f"grayscale cameras among colour ones: {GREY};") for remark in remarks)
     assert len(remarks) == 2
 

@@ -12,7 +12,7 @@ from rigs import NAMES, lenses, transforms, write, write_pictures
 
 from client.importers.calibration import natural
 from client.importers.open_source import open_source
-from scas4d_core.captures import CaptureError, decode_image, decode_mask
+from scas4d_core.captures import CaptureError, ImageError, decode_image, decode_mask
 
 
 @pytest.fixture
@@ -38,6 +38,44 @@ def test_pictures_of_a_camera_without_a_calibration_are_named(straight):
     (straight / "images" / "cam7").mkdir()
     assert open_source(straight).remarks == ("skipped cameras that are not in transforms.json: cam7",)
     assert open_source(straight).rig.names == ("cam1", "cam2", "cam10")
+
+
+def test_values_of_16_bit_pictures_are_scaled_alike_in_all_frames(straight):
+    """The first frame is dark: it alone has 8 bits. The second shows that the cameras have 12."""
+    for camera in NAMES:
+        for frame, largest in enumerate((200, 4000)):
+            values = np.full((HEIGHT, WIDTH), largest, np.uint16)
+            Image.fromarray(values).save(straight / f"images/{camera}/{frame:06d}.png")
+    source = open_source(straight)
+    assert source.remarks == (
+        "3 cameras, such as 'cam1': 16-bit images are converted to 8 bits from a bit depth of 12, which was found from "
+        "their values; if it is wrong, set --bit-depth",
+    )
+    for frame, shade in enumerate((12, 249)):
+        assert source.frame(frame).images["cam2"].max() == shade
+        assert decode_image(source.encoded_image(frame, "cam2")).max() == shade
+    assert open_source(straight, bit_depth=14).frame(1).images["cam2"].max() == 62
+    with pytest.raises(ImageError, match=r"000001.png: the value 4000 exceeds 10 bits.*--bit-depth"):
+        open_source(straight, bit_depth=10).encoded_image(1, "cam2")
+
+
+def test_raw_pictures_are_read(straight):
+    for camera in NAMES:
+        for path in sorted((straight / "images" / camera).iterdir()):
+            Image.open(path).convert("RGB").save(path.with_suffix(".ppm"))
+            path.unlink()
+    source = open_source(straight)
+    shown = decode_image(source.encoded_image(1, "cam2"))
+    np.testing.assert_array_equal(shown, source.frame(1).images["cam2"])
+
+
+def test_a_rotated_picture_is_named_when_the_capture_is_opened(straight):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = straight / "images/cam2/000000.png"
+    Image.open(path).save(path, exif=exif)
+    with pytest.raises(CaptureError, match=r"cam2/000000.png: EXIF orientation is 6.*remove the tag"):
+        open_source(straight)
 
 
 def test_frames_are_in_natural_order_and_one_name_is_one_frame(straight):

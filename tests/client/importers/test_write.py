@@ -100,7 +100,7 @@ def test_cameras_of_different_sizes_are_written_and_read(tmp_path):
 
 def test_a_folder_that_was_not_finished_is_no_capture(distorted, tmp_path):
     (distorted / "images/cam10/1.png").write_bytes(b"damaged")
-    with pytest.raises(ValueError, match=r"images/cam10/1.png cannot be read as an image"):
+    with pytest.raises(ValueError, match=r"images/cam10/1.png: not a JPEG"):
         write_dynamic3dgs(open_source(distorted), tmp_path / "out")
     with pytest.raises(CaptureError, match="unknown capture layout"):
         open_capture(tmp_path / "out")

@@ -141,8 +141,17 @@ def test_pictures_are_decoded_when_looked_at(folder):
     (folder / "ims/1/000001.png").write_bytes(b"damaged")
     frame = capture.frame(1)
     assert frame.images["0"].shape == (6, 8, 3)
-    with pytest.raises(ImageError, match=r"000001\.png cannot be read"):
+    with pytest.raises(ImageError, match=r"000001\.png: not a JPEG"):
         frame.images["1"]
+
+
+def test_the_bit_depth_of_16_bit_pictures_is_found(folder):
+    for path in (folder / "ims").rglob("*.png"):
+        Image.fromarray(np.full((6, 8), 3000, np.uint16)).save(path)
+    capture = open_capture(folder)
+    assert "from a bit depth of 12" in capture.remarks[0]
+    assert capture.frame(1).images["0"].max() == decode_image(capture.encoded_image(1, "0")).max() == 187
+    assert open_capture(folder, bit_depth=16).frame(1).images["0"].max() == 12
 
 
 def test_everything_but_pictures_and_cameras_is_optional(folder):

@@ -6,10 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mutated_pictures import join, sixteen_bit_png, split
 from PIL import Image, ImageCms
 
 from scas4d_core.cameras import Camera
-from scas4d_core.captures.images import ImageError, decode_image, decode_labels, decode_mask, picture_size, resize_area
+from scas4d_core.captures.bit_depth import find_bit_depth
+from scas4d_core.captures.images import (
+    check_image,
+    decode_image,
+    decode_labels,
+    decode_mask,
+    describe_pictures,
+    picture_size,
+    resize_area,
+)
+from scas4d_core.captures.picture_file import ImageError
 
 
 def encoded(picture, kind="PNG", **options):
@@ -51,12 +62,13 @@ def test_an_orientation_is_refused_and_upright_is_not():
     for orientation in range(2, 9):
         exif = Image.Exif()
         exif[0x0112] = orientation
-        for kind in ("JPEG", "PNG"):
+        for kind in ("JPEG", "PNG", "WEBP"):
             with pytest.raises(ImageError, match=f"EXIF orientation is {orientation}; the intrinsics"):
-                decode_image(encoded(Image.fromarray(rgb()), kind, exif=exif))
-    exif = Image.Exif()
-    exif[0x0112] = 1
-    np.testing.assert_array_equal(decode_image(encoded(Image.fromarray(rgb()), exif=exif)), rgb())
+                decode_image(encoded(Image.fromarray(rgb()), kind, exif=exif), size=(6, 8))
+    for orientation in (0, 1):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        np.testing.assert_array_equal(decode_image(encoded(Image.fromarray(rgb()), exif=exif)), rgb())
 
 
 def test_alpha_is_composited_over_black():
@@ -80,25 +92,59 @@ def test_grey_is_replicated():
     assert decode_image(encoded(Image.fromarray(grey > 100)))[0, :, 1].tolist() == [0, 0, 255]
 
 
-def test_16_bit_is_divided_by_257():
-    grey = np.array([[0, 257, 128, 129, 65535, 100 * 257 + 128]], np.uint16)
-    assert decode_image(encoded(Image.fromarray(grey)))[0, :, 0].tolist() == [0, 1, 0, 1, 255, 100]
-    values = [0, 257 * 77, 65535]
-    assert decode_image(png(1, 1, 16, 2, [struct.pack(">HHH", *values)])).tolist() == [[[0, 77, 255]]]
-    # Colour by the high byte: within one level of v / 257.
-    many = np.random.default_rng(0).integers(0, 65536, 300)
-    shown = decode_image(png(100, 1, 16, 2, [struct.pack(">300H", *many.tolist())])).ravel()
-    assert np.abs(shown - many / 257).max() <= 1
+def test_16_bit_is_rounded_for_all_kinds_of_channels():
+    values = np.random.default_rng(0).integers(0, 65536, (9, 7, 4)).astype(np.uint16)
+    values[..., 3] = 65535
+    for colour_type, channels in ((0, [0]), (2, [0, 1, 2]), (4, [0, 3]), (6, [0, 1, 2, 3])):
+        shown = decode_image(sixteen_bit_png(values[..., channels], colour_type), bit_depth=16)
+        colours = values[..., [0] * 3 if colour_type in (0, 4) else [0, 1, 2]]
+        np.testing.assert_array_equal(shown, np.rint(colours / 257))
 
 
-def test_cmyk_animation_and_unknown_formats_are_refused():
-    with pytest.raises(ImageError, match="colour mode CMYK"):
+@pytest.mark.parametrize("depth", [10, 12, 14])
+def test_the_bit_depth_of_16_bit_files_is_found_and_scaled(depth):
+    values = np.linspace(0, 2**depth - 1, 48).astype(np.uint16).reshape(6, 8)
+    dark = sixteen_bit_png(values // 64, 0)
+    files = [dark, sixteen_bit_png(values, 0)]
+    assert find_bit_depth(files) == depth
+    assert find_bit_depth([sixteen_bit_png(np.dstack([values] * 3), 2)]) == depth
+    np.testing.assert_array_equal(
+        decode_image(files[1], bit_depth=depth)[..., 0], np.rint(values / (2**depth - 1) * 255)
+    )
+    with pytest.raises(ImageError, match=rf"the value {2**depth - 1} exceeds 8 bits.*--bit-depth"):
+        decode_image(files[1], bit_depth=8)
+
+
+def test_a_stated_bit_depth_counts_if_the_values_are_not_scaled():
+    dark = np.full((6, 8), 200, np.uint16)
+    assert find_bit_depth([sixteen_bit_png(dark, 0, sBIT=b"\x0c")]) == 12
+    assert find_bit_depth([sixteen_bit_png(dark * 300, 0, sBIT=b"\x0c")]) == 16  # scaled, as the format requires
+    assert find_bit_depth([sixteen_bit_png(0 * dark, 0)]) == 16
+
+
+def test_without_a_bit_depth_16_bit_is_refused_with_the_scale():
+    data = sixteen_bit_png(np.full((6, 8), 4000, np.uint16), 0)
+    with pytest.raises(ImageError, match=r"16 bits per channel; .* use 12 bits, so multiply them by 255/4095"):
+        decode_image(data)
+
+
+def test_cmyk_and_unknown_formats_are_refused():
+    with pytest.raises(ImageError, match=r"front.jpg: unsupported JPEG format: CMYK"):
         decode_image(encoded(Image.new("CMYK", (4, 4)), "JPEG"), name="front.jpg")
-    frames = [Image.fromarray(rgb(seed)) for seed in range(3)]
-    with pytest.raises(ImageError, match=r"front.png contains 3 images"):
-        decode_image(encoded(frames[0], save_all=True, append_images=frames[1:]), name="front.png")
-    with pytest.raises(ImageError, match="cannot be read as an image"):
-        decode_image(encoded(frames[0], "GIF"))
+    with pytest.raises(ImageError, match=r"not a JPEG.*it starts with 47 49 46"):
+        decode_image(encoded(Image.fromarray(rgb()), "GIF"))
+
+
+@pytest.mark.parametrize("kind", ["MPO", "PNG", "WEBP"])
+def test_of_several_images_in_a_file_the_first_is_used_with_a_remark(tmp_path, kind):
+    first, second = (Image.fromarray(np.full((16, 16, 3), value, np.uint8)) for value in (10, 200))
+    path = tmp_path / "a"
+    path.write_bytes(encoded(first, kind, save_all=True, append_images=[second]))
+    assert np.abs(decode_image(path).astype(int) - 10).max() <= 2
+    check_image(path)
+    assert describe_pictures([{"north": path}])[1] == [
+        "camera 'north': files contain several images; only the first of each file is used"
+    ]
 
 
 def linear_profile():
@@ -127,9 +173,9 @@ def test_an_icc_profile_is_converted_to_srgb_and_srgb_itself_left_alone():
 
 
 def test_the_size_of_the_camera_is_checked_before_decoding():
-    damaged = encoded(Image.fromarray(rgb()))[:60]  # the head is whole, the pixels are not
-    with pytest.raises(ImageError, match=r"cam3 is 8x6 pixels, but its camera requires 16x12"):
-        decode_image(damaged, size=(16, 12), name="cam3")
+    huge = png(50_000, 50_000, 8, 2, [])
+    with pytest.raises(ImageError, match=r"cam3: the image is 50000x50000 pixels, but its camera requires 16x12"):
+        decode_image(huge, size=(16, 12), name="cam3")
 
 
 def test_files_that_are_missing_damaged_or_empty_are_named(tmp_path):
@@ -137,8 +183,16 @@ def test_files_that_are_missing_damaged_or_empty_are_named(tmp_path):
         decode_image(tmp_path / "gone.png")
     with pytest.raises(ImageError, match=r"gone\.png: no such file"):
         picture_size(tmp_path / "gone.png")
-    for data in (b"", b"text", encoded(Image.fromarray(rgb()))[:-30]):
-        with pytest.raises(ImageError, match="front cannot be read as an image"):
+    without_last_pixels = [
+        part[:-9] if part[:4] == b"IDAT" else part for part in split(encoded(Image.fromarray(rgb())))
+    ]
+    for data, fault in (
+        (b"", "front: the file is empty; send the image as JPEG"),
+        (b"text", "front: not a JPEG"),
+        (encoded(Image.fromarray(rgb()))[:-30], "front: the PNG file is truncated"),
+        (join(without_last_pixels, encoded(Image.fromarray(rgb()))), "front cannot be read as an image .*truncated"),
+    ):
+        with pytest.raises(ImageError, match=fault):
             decode_image(data, name="front")
 
 
@@ -201,7 +255,7 @@ def test_any_value_but_zero_is_foreground(value):
 def test_masks_with_two_readings_are_refused():
     with pytest.raises(ImageError, match="alpha channel is ambiguous"):
         decode_mask(encoded(Image.new("RGBA", (4, 4))))
-    with pytest.raises(ImageError, match="cannot be read as an image"):
+    with pytest.raises(ImageError, match="masks must be PNG or BMP, not JPEG; encode masks as PNG"):
         decode_mask(encoded(Image.new("L", (4, 4)), "JPEG"))
 
 

@@ -112,8 +112,8 @@ PICTURES = {
     "missing": ({"c0": picture()}, "c1", "nothing", "add it"),
     "cut": ({"c0": picture(), "c1": CUT_JPEG}, "c1", f"{len(CUT_JPEG)} bytes", "original file"),
     "cut PNG": ({"c0": picture(), "c1": CUT_PNG}, "c1", f"{len(CUT_PNG)} bytes", "original file"),
-    "empty": ({"c0": picture(), "c1": b""}, "c1", "0 bytes", "as JPEG, PNG or WebP"),
-    "another kind": ({"c0": picture(), "c1": b"BM" + bytes(60)}, "c1", "62 bytes", "encode"),
+    "empty": ({"c0": picture(), "c1": b""}, "c1", "0 bytes", "as JPEG, PNG, WebP, BMP, PPM or PGM"),
+    "another kind": ({"c0": picture(), "c1": b"GIF89a" + bytes(60)}, "c1", "66 bytes", "encode"),
 }
 
 

@@ -7,25 +7,26 @@ import json
 
 import numpy as np
 import pytest
+from mutated_pictures import exif, join, split
 from PIL import Image
 from running import HEIGHT, WIDTH, make_rig, picture, pictures, problem
-from sending import animated, declares
+from sending import declares
 from websockets.sync.client import connect
 
 from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
 
 
-def sixteen_bits():
+def sixteen_bits(largest):
     file = io.BytesIO()
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save(file, "PNG")
+    Image.fromarray(np.full((HEIGHT, WIDTH), largest, np.uint16)).save(file, "PNG")
     return file.getvalue()
 
 
-def animated_webp():
-    first, second = (Image.new("RGB", (WIDTH, HEIGHT), (red, 0, 0)) for red in (0, 99))
-    file = io.BytesIO()
-    first.save(file, "WEBP", save_all=True, append_images=[second])
-    return file.getvalue()
+def without_last_pixels():
+    """A PNG whose checksums fit."""
+    data = picture()
+    parts = split(data)
+    return join([part[:-9] if part[:4] == b"IDAT" else part for part in parts], data)
 
 
 BAD = {
@@ -33,10 +34,15 @@ BAD = {
     "truncated PNG": (lambda: picture()[:-5], "bytes", "the original file again"),
     "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "the original file again"),
     "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "for which the camera was"),
-    "16 bits": (sixteen_bits, "16 bits", "convert the image to 8 bits"),
-    "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send 8-bit RGB"),
-    "animated PNG": (animated, "animated", "a single still image"),
-    "animated WebP": (animated_webp, "animated", "a single still image"),
+    "16 bits": (lambda: sixteen_bits(60_000), "16 bits", "convert the image to 8 bits per channel"),
+    "12 bits in 16": (lambda: sixteen_bits(4000), "16 bits", "its values use 12 bits, so multiply them by 255/4095"),
+    "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "use 8-bit RGB"),
+    **{
+        f"rotated {kind}": (lambda kind=kind: picture(format=kind, exif=exif(6)), "6", "remove the tag")
+        for kind in ("JPEG", "PNG", "WEBP")
+    },
+    "damaged ICC profile": (lambda: picture(icc_profile=b"nonsense"), "bytes", "convert the image to sRGB"),
+    "PNG without its last pixels": (without_last_pixels, "bytes", "send the original again"),
     "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "for which the camera was"),
     "PPM with 16 bits": (lambda: b"P6 16 16 65535\n" + bytes(1536), "maximum value 65535", "use 255"),
     "PPM with extra bytes": (lambda: picture(format="PPM") + b"\0", "bytes", "and nothing else"),
@@ -81,6 +87,26 @@ def test_a_bad_picture_is_refused_at_every_door(http, service, quiet_scene, name
     assert remedy in document["remedy"]
     status = http.get(f"/v1/scenes/{quiet_scene}").json()
     assert (status["next_frame"], status["open_frames"], status["frames_kept"]) == (0, [], 0)
+
+
+BAD_MASKS = {
+    "JPEG": (lambda: picture(format="JPEG"), "JPEG", "encode masks as PNG"),
+    "alpha": (lambda: picture(mode="RGBA"), "alpha", "use a single channel"),
+    "rotated": (lambda: picture(exif=exif(3)), "3", "remove the tag"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_MASKS)
+def test_a_bad_mask_is_refused(http, quiet_scene, name):
+    data, value, remedy = BAD_MASKS[name]
+    files = {**pictures(), "mask.c0": picture(), "mask.c1": data()}
+    answer = http.put(
+        f"/v1/scenes/{quiet_scene}/frames/0", files={field: (field, file) for field, file in files.items()}
+    )
+    document = problem(answer, 422)
+    assert (document["field"], document["value"]) == ("mask.c1", value)
+    assert remedy in document["remedy"]
+    assert "BytesIO" not in document["detail"]
 
 
 @pytest.mark.parametrize("door", ["form", "frame", "camera"])

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from running import make_rig
+from running import make_rig, picture
 
 from scas4d_core.captures import Frame
 from server.messages import FrameReady
-from server.processes.decoder import FrameDecoder
+from server.processes.decoder import Encoded, FrameDecoder
 from server.storage.frame_store import FrameDamage
 
 
@@ -69,3 +69,11 @@ def test_damage_is_reported_when_the_frame_is_taken(decoder):
     decoder.begin(ready(13))
     with pytest.raises(FrameDamage):
         decoder.decode(ready(13))
+
+
+def test_an_image_that_cannot_be_decoded_leaves_its_camera_out(tmp_path):
+    """Ingest refuses such images; frame logs of earlier versions may contain them."""
+    encoded = Encoded({"c0": memoryview(picture()), "c1": memoryview(picture()[:-9])}, {}, [])
+    frame, dropped = FrameDecoder(make_rig(), tmp_path).decode_images(ready(1), encoded)
+    assert list(frame.images) == ["c0"]
+    assert dropped["c1"].startswith("image of camera 'c1': the PNG file is truncated")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, picture, pictures, problem
-from sending import animated, declares
+from sending import declares
 from waiting import HANG_S
 
 
@@ -141,15 +141,12 @@ def test_a_frame_that_kills_its_worker_twice_is_set_aside_and_the_scene_goes_on(
     assert sdk.scene(scene).state == "ready"
 
 
-def test_a_picture_that_only_decoding_shows_to_be_damaged_drops_its_camera(sdk, scene):
+def damaged_tables():
+    """A JPEG whose segments are whole, but whose Huffman tables no decoder takes."""
     damaged = bytearray(picture(30, format="JPEG"))
-    start = damaged.index(b"\xff\xc4") + 5  # code lengths of a Huffman table: the segments still walk
+    start = damaged.index(b"\xff\xc4") + 5  # the code lengths
     damaged[start : start + 16] = b"\xf0" * 16
-    sdk.put_frame(scene, 0, {"c0": picture(3), "c1": bytes(damaged)})
-    report = sdk.wait(scene, 0)
-    assert list(report.dropped_cameras) == ["c1"]
-    assert report.state == "committed"
-    assert sdk.scene(scene).state == "degraded"
+    return bytes(damaged)
 
 
 def turned():
@@ -164,12 +161,12 @@ BAD = {
     "wrong size": ({"c0": picture(), "c1": picture(size=(7, 5))}, 422, "c1"),
     "huge header": ({"c0": picture(), "c1": declares(50_000, 50_000)}, 422, "c1"),
     "turned": ({"c0": picture(), "c1": turned()}, 422, "c1"),
-    "animated": ({"c0": picture(), "c1": animated()}, 422, "c1"),
     "truncated png": ({"c0": picture()[:-9], "c1": picture()}, 422, "c0"),
     "truncated jpeg": ({"c0": picture(format="JPEG")[:-2], "c1": picture()}, 422, "c0"),
     "truncated webp": ({"c0": picture(format="WEBP")[:-2], "c1": picture()}, 422, "c0"),
     "flipped bit": ({"c0": picture().replace(b"IDAT", b"IDAU"), "c1": picture()}, 422, "c0"),
     "cmyk": ({"c0": picture(format="JPEG", mode="CMYK"), "c1": picture()}, 422, "c0"),
+    "damaged tables": ({"c0": picture(), "c1": damaged_tables()}, 422, "c1"),
     "no picture": ({"c0": b"hello", "c1": picture()}, 422, "c0"),
     "empty": ({"c0": b"", "c1": picture()}, 422, "c0"),
 }
