@@ -289,7 +289,14 @@ class Worker:
                 "write_seconds": self._commits.write_seconds,
                 "publish_seconds": self._commits.publish_seconds,
             }
-            self.reconstruction.step(frame, dropped=dropped, notes=notes, started=began, defer=commit.writes.append)
+            self.reconstruction.step(
+                frame,
+                dropped=dropped,
+                notes=notes,
+                started=began,
+                defer=commit.writes.append,
+                defer_cleanup=commit.cleanups.append,
+            )
         return commit
 
     def retain(self, defer: Defer = run_now) -> list[int]:
