@@ -203,7 +203,7 @@ class Reconstruction(CommittedScene):
             with_first_figures(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time
         )
         prepared = self._prepared.with_carry_over(seen=seen, past=past, shown=shown, effects=effects)
-        self._commit(report, result.gaussians, prepared, {**self._fixed.record(), **(notes or {})}, defer)
+        self._commit(report, result.gaussians, prepared, {**self._fixed.record(), **(notes or {})}, defer, defer)
         return self
 
     @classmethod
@@ -307,6 +307,7 @@ class Reconstruction(CommittedScene):
         notes: Mapping[str, Any] | None = None,
         started: float | None = None,
         defer: Defer = run_now,
+        defer_cleanup: Defer | None = None,
     ) -> FrameReport:
         """Updates the state to fit a frame, and commits the result.
 
@@ -323,6 +324,8 @@ class Reconstruction(CommittedScene):
             defer: function that receives each function that writes files of the commit, in order.
                 By default, each of these functions is called immediately. They may also be called
                 after the next frame was updated.
+            defer_cleanup: function that receives a function that deletes files which the commit made
+                unnecessary, to be called after all others; by default, ``defer``.
 
         Raises:
             StepError: if the frame is not later than the last committed one. Also if the frame has
@@ -336,7 +339,7 @@ class Reconstruction(CommittedScene):
         self._solve(context)
         self._populate(context)
         report = self._report(context)
-        self._commit_update(context, report, defer)
+        self._commit_update(context, report, defer, defer_cleanup or defer)
         return report
 
     def _observe(self, context: FrameContext, seconds: float) -> None:
@@ -437,12 +440,12 @@ class Reconstruction(CommittedScene):
             context.watch, context.dropped, context.birth_fit_time.postponed,
         )  # fmt: skip
 
-    def _commit_update(self, context: FrameContext, report: FrameReport, defer: Defer) -> None:
+    def _commit_update(self, context: FrameContext, report: FrameReport, defer: Defer, defer_cleanup: Defer) -> None:
         """Commits the frame with the Gaussians added in it, and updates the time budget."""
         result, prepared, watch = context.result, context.prepared, context.watch
         grown = prepared.roots is not self._prepared.roots
         birth = {"roots": prepared.roots, "parents": result.parents} if grown else {}
-        self._commit(report, result.gaussians, prepared, context.notes, defer, **birth)
+        self._commit(report, result.gaussians, prepared, context.notes, defer, defer_cleanup, **birth)
         after = context.check_seconds + watch.seconds.get("presence", 0.0) - context.birth_fit_time.spent
         after += perf_counter() - watch.began - watch.total
         self._budget.record_frame(result.trace.iteration_ends, result.trace.seconds, after)
@@ -516,7 +519,7 @@ class Reconstruction(CommittedScene):
 
     def _commit(
         self, report: FrameReport, gaussians: Gaussians, prepared: PreparedUpdate, more: Mapping[str, Any],
-        defer: Defer = run_now, **birth: Any,
+        defer: Defer, defer_cleanup: Defer, **birth: Any,
     ) -> None:  # fmt: skip
         """Writes the checkpoint, and then commits the state and the report.
 
@@ -526,6 +529,7 @@ class Reconstruction(CommittedScene):
             prepared: input of the next update.
             more: additional JSON data to commit.
             defer, birth: see ``History.append``.
+            defer_cleanup: see ``step``.
         """
         carried, checkpoints = prepared.carried, self._checkpoints
         if checkpoints is not None:
@@ -548,4 +552,4 @@ class Reconstruction(CommittedScene):
         self._prepared, self.report = prepared, report
         if checkpoints is not None:
             committed = self.history.indices
-            defer(lambda: checkpoints.clean(committed))
+            defer_cleanup(lambda: checkpoints.clean(committed))

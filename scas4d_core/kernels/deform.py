@@ -77,6 +77,25 @@ def block_sums(points, present, sums):
 
 
 @kernel
+def load_blocks(means, factors, rows, points, entering):
+    """Loads the Gaussians of a state into blocks.
+
+    Args:
+        means, factors: [N, 3] and [N, 3, 3] arrays of the state.
+        rows: [B, 16] rows of each block's Gaussians.
+        points: [L, B, 3, 16] points before each layer, of which the first layer is filled.
+        entering: [B, 208] values before the first layer, of which the factors are filled.
+    """
+    for block in range(len(rows)):
+        for lane in range(lanes.COUNT):
+            row = rows[block, lane]
+            for k in range(3):
+                points[0, block, k, lane] = means[row, k]
+                for j in range(3):
+                    entering[block, (3 * k + j) * lanes.COUNT + lane] = factors[row, k, j]
+
+
+@kernel
 def fill_tables(part, layer, parameters, parts, ranges, sums, tables):
     """Computes the tables of a layer's clusters in one part; see ``deform``."""
     for j in range(parts[part, 1 + layer], parts[part + 1, 1 + layer]):

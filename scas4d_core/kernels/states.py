@@ -59,6 +59,41 @@ def find_implausible(
 
 
 @kernel
+def find_finite(means, factors, rows, finite):
+    """Marks the Gaussians whose mean and factor are finite.
+
+    Args:
+        means, factors: [N, 3] and [N, 3, 3] arrays of the state.
+        rows: [M] rows to check.
+        finite: [M] bool output.
+    """
+    for i in range(len(rows)):
+        fine = True
+        for k in range(3):
+            fine &= np.isfinite(means[rows[i], k])
+            for j in range(3):
+                fine &= np.isfinite(factors[rows[i], k, j])
+        finite[i] = fine
+
+
+@kernel
+def count_votes(gathered, least, share, asked, says):
+    """Counts the cameras that see each Gaussian, and those that see it in changed pixels; call it for each camera.
+
+    Args:
+        gathered: [N, 2] float32 blended weight of each Gaussian in all pixels of a camera, and in changed ones.
+        least: weight above which the camera sees a Gaussian.
+        share: share of the weight in changed pixels above which the camera sees the Gaussian change.
+        asked, says: [N] int64 numbers of cameras, which are increased.
+    """
+    for row in range(len(gathered)):
+        total = gathered[row, 0]
+        sees = total > least
+        asked[row] += sees
+        says[row] += sees and gathered[row, 1] > share * total
+
+
+@kernel
 def find_outside(means, factors, rows, poses, lenses, widths, outside):
     """Marks the Gaussians that are outside all images, including their extent.
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome, degraded_text
+from scas4d_core.kernels.pictures import row_differences
 from scas4d_core.robust.outliers import LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
 from scas4d_core.update.result import CameraFit
 
@@ -286,9 +287,13 @@ def sharpness_of(picture: NDArray[np.uint8]) -> float:
     The ratio cancels the amount of texture, so objects that move through the image do not affect it. Returns NaN for an
     image without texture.
     """
-    rows = picture[:: max(1, len(picture) // ROWS)].astype(np.int16)
-    first = np.diff(rows, axis=1)
-    slope, bend = (float(np.abs(part).mean()) if part.size else 0.0 for part in (first, np.diff(first, axis=1)))
+    every = max(1, len(picture) // ROWS)
+    first, second = row_differences(np.ascontiguousarray(picture), every)
+    rows, width, channels = picture[::every].shape
+    slope, bend = (
+        total / (rows * steps * channels) if steps > 0 else 0.0
+        for total, steps in ((first, width - 1), (second, width - 2))
+    )
     return log(bend / slope) if slope > FLAT and bend > 0 else nan
 
 

@@ -100,11 +100,28 @@ class Chunks:
         self.known, self._firsts = known, list(known)
 
     def refresh_chunk(self, first: int) -> None:
-        """Updates the chunk that starts with frame ``first``, after the chunk was created or extended."""
-        if (chunk := self._load_chunk(first)) is not None:
+        """Updates the chunk that starts with frame ``first``, after the chunk was created or extended.
+
+        Of a known chunk, only the new records are read.
+        """
+        known = self.known.get(first)
+        chunk = self._load_chunk(first) if known is None or known.damage is not None else self._extended(known)
+        if chunk is not None:
             self.known[first] = chunk
             if first not in self._firsts:
                 insort(self._firsts, first)
+
+    def _extended(self, known: Chunk) -> Chunk | None:
+        """Returns a known chunk with the records that were appended since, or None if its file was deleted."""
+        try:
+            status = known.path.stat()
+            reader = self._reader(known)
+        except FileNotFoundError:
+            return None
+        reader.refresh()
+        chunk = _chunk_of(reader, status)
+        self._readers[known.path] = chunk, reader
+        return chunk
 
     def _load_chunk(self, first: int) -> Chunk | None:
         path = self.directory / chunk_file(first)
@@ -303,24 +320,27 @@ def chunk_of(name: str) -> int | None:
 
 def _listed(path: Path, status: os.stat_result) -> Chunk:
     """Returns a chunk with the list of its frames, which is empty if the file cannot be opened."""
-    size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:
-            sizes = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
-            return Chunk(
-                path,
-                size,
-                changed,
-                array("q", reader.frames),
-                array("d", reader.times.tolist()),
-                array("q", [sizes[index][0] for index in reader.frames]),
-                array("q", [sizes[index][1] for index in reader.frames]),
-                reader.damage,
-            )
+            return _chunk_of(reader, status)
     except (FileError, OSError) as error:
-        return Chunk(
-            path, size, changed, damage=f"{path.name}: {message_of(error)}", foreign=isinstance(error, FormatError)
-        )
+        damage, foreign = f"{path.name}: {message_of(error)}", isinstance(error, FormatError)
+        return Chunk(path, status.st_size, status.st_mtime_ns, damage=damage, foreign=foreign)
+
+
+def _chunk_of(reader: CompactReader, status: os.stat_result) -> Chunk:
+    """Returns a chunk with the list of its frames; ``status`` is that of the file before it was read."""
+    sizes = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
+    return Chunk(
+        reader.path,
+        status.st_size,
+        status.st_mtime_ns,
+        array("q", reader.frames),
+        array("d", reader.times.tolist()),
+        array("q", [sizes[index][0] for index in reader.frames]),
+        array("q", [sizes[index][1] for index in reader.frames]),
+        reader.damage,
+    )
 
 
 @contextmanager

@@ -7,14 +7,21 @@ frame therefore remains readable, no matter when the process ends. Renders of an
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from scas4d_core.compact import CompactWriter, FileError, FileHeader
-from scas4d_core.storage.chunks import chunk_file, make_note
+from scas4d_core.gaussians import PER_FRAME, WHOLES, Gaussians
+from scas4d_core.storage.births import Int
+from scas4d_core.storage.chunks import REPORT, chunk_file, make_note
+from scas4d_core.storage.faults import HistoryError, UnreadableFrameError
 from scas4d_core.storage.frame_files import frame_of
 from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
@@ -29,10 +36,28 @@ NOT_ENCODED = (ValueError, ArithmeticError, MemoryError)
 log = logging.getLogger("scas4d.storage")
 
 
+@dataclass(frozen=True, eq=False)
+class DueState:
+    """A state to move to a chunk.
+
+    Attributes:
+        index: index of the frame.
+        time: time of the frame in seconds.
+        fixed: arguments of ``Gaussians`` that the file of the frame lacks; see ``HistoryReader.fixed_at``.
+        log: [E, 4] event log up to the frame.
+    """
+
+    index: int
+    time: float
+    fixed: Mapping[str, Any]
+    log: Int
+
+
 class Compaction:
     """Compaction of a history, which moves its oldest exact states to chunks one step at a time.
 
-    It must run in the process that appends to the history.
+    It must run in the process that appends to the history. A step consists of ``begin``, ``write`` and ``finish``.
+    Only ``write`` takes long. It may run in another thread while frames are appended to the history.
 
     Args:
         history: history stored in a directory.
@@ -66,6 +91,8 @@ class Compaction:
         self._writer: CompactWriter | None = None
         self._first = -1
         """First frame of the current chunk."""
+        self._closed: list[int] = []
+        """First frame of each chunk that was completed since the last step."""
         self._passed = max(history.files.chunks, default=-1)
         """Last frame that is in a chunk or could not be moved."""
         self._queue: deque[int] = deque()
@@ -85,22 +112,51 @@ class Compaction:
         Raises:
             OSError: if the disk is full or failing. Nothing is lost, and the next step tries again.
         """
+        while (due := self.begin()) is not None:
+            state = due
+            if self.finish(state, lambda: self.write(state)):  # noqa: B023 (called at once)
+                return state.index
+        return None
+
+    def begin(self) -> DueState | None:
+        """Returns the next state to move, or None if there is none."""
+        history = self._history
         while self.due:
             index = self._queue[0]
-            try:
-                if index in self._history:  # otherwise, retention has deleted it
-                    self._move(index)
-            except OSError:
-                self._release_writer()
-                raise
-            except NOT_ENCODED as error:  # a damaged or unencodable state keeps its file
-                log.warning("frame %d was not compacted: %s", index, error)
-                self._release_writer()
-            else:
-                self._passed = self._queue.popleft()
-                return index
-            self._passed = self._queue.popleft()
+            if index in history:
+                return DueState(index, history.time(index), history.fixed_at(index), history.log_at(index))
+            self._passed = self._queue.popleft()  # deleted by retention
         return None
+
+    def finish(self, due: DueState, written: Callable[[], None]) -> bool:
+        """Deletes the own file of a state that is in a chunk. A damaged or unencodable state keeps its file.
+
+        Args:
+            due: state that was passed to ``write``.
+            written: function that returns once ``write`` has returned, or raises its error.
+
+        Returns:
+            Whether the state was moved.
+
+        Raises:
+            OSError: if the disk is full or failing. Nothing is lost, and the next step tries again.
+        """
+        moved = True
+        try:
+            written()
+            self._delete_own_file(due.index)
+        except OSError:
+            self._release_writer()
+            raise
+        except NOT_ENCODED as error:
+            log.warning("frame %d was not compacted: %s", due.index, error)
+            self._release_writer()
+            moved = False
+            if isinstance(error, UnreadableFrameError):
+                with suppress(HistoryError):
+                    self._history.gaussians(due.index)  # records the damage
+        self._passed = self._queue.popleft()
+        return moved
 
     def close(self) -> None:
         """Closes the current chunk without completing it; another ``Compaction`` can resume it."""
@@ -118,34 +174,53 @@ class Compaction:
                 self._files.path(index).unlink()
                 self._history.mark_compacted(index)
 
-    def _move(self, index: int) -> None:
-        history, files = self._history, self._files
-        if self._writer is not None and self._first not in files.chunks.known:  # deleted by retention
+    def write(self, due: DueState) -> None:
+        """Appends a state to a chunk, and syncs the chunk.
+
+        Raises:
+            OSError: if the disk is full or failing.
+            ValueError, ArithmeticError, MemoryError: if the state cannot be read or encoded.
+        """
+        index = due.index
+        if self._writer is not None and self._first not in self._files.chunks.known:  # deleted by retention
             self._release_writer()
-        state, time = history.gaussians(index), history.time(index)
-        report, log = history.report(index), history.log_at(index)
+        state, report = self._read(due)
         writer = self._writer or self._resume_chunk()
         if writer is None or not self._fits(writer, index):
-            self._finish(writer)
+            self._close_chunk(writer)
             writer = self._begin_chunk(index)
         self._writer = writer
         if writer.last_frame < index:  # otherwise, only the last sync failed
             try:
-                writer.add(index, time, state, note=make_note(report, log, writer.last_frame))
+                writer.add(index, due.time, state, note=make_note(report, due.log, writer.last_frame))
             except FileError:
                 if not writer.frames:
                     self._release_writer()
                     writer.path.unlink(missing_ok=True)
                     raise
-                self._finish(writer)  # the Gaussians changed, so a new chunk may fit
+                self._close_chunk(writer)  # the Gaussians changed, so a new chunk may fit
                 writer = self._writer = self._begin_chunk(index)
-                writer.add(index, time, state, note=make_note(report, log, -1))
+                writer.add(index, due.time, state, note=make_note(report, due.log, -1))
         writer.sync()
-        files.chunks.refresh_chunk(self._first)
-        if index not in files.chunks:
-            raise FileError(f"{writer.path.name}: frame {index} is missing after it was written")
-        files.path(index).unlink(missing_ok=True)
-        history.mark_compacted(index)
+
+    def _read(self, due: DueState) -> tuple[Gaussians, dict[str, Any]]:
+        """Reads a state and its report from disk. The history is not used, because it is not thread-safe."""
+        try:
+            frame = self._files.read(due.index, (*PER_FRAME, REPORT), WHOLES)
+        except FileNotFoundError as error:
+            raise UnreadableFrameError(f"frame {due.index} is missing") from error
+        report = json.loads(frame.pop(REPORT).tobytes())
+        return Gaussians(**frame, **due.fixed), report
+
+    def _delete_own_file(self, index: int) -> None:
+        chunks = self._files.chunks
+        while self._closed:
+            chunks.refresh_chunk(self._closed.pop())
+        chunks.refresh_chunk(self._first)
+        if index not in chunks:
+            raise FileError(f"{chunk_file(self._first)}: frame {index} is missing after it was written")
+        self._files.path(index).unlink(missing_ok=True)
+        self._history.mark_compacted(index)
 
     def _fits(self, writer: CompactWriter, index: int) -> bool:
         return writer.last_frame == index or (writer.frames < CHUNK_FRAMES and writer.last_frame < index)
@@ -161,7 +236,7 @@ class Compaction:
         except NOT_ENCODED:
             return None
         if writer.head.text() != self._head().text():
-            self._finish(writer)
+            self._close_chunk(writer)
             return None
         return writer
 
@@ -173,12 +248,12 @@ class Compaction:
         sync_folder(path.parent)
         return writer
 
-    def _finish(self, writer: CompactWriter | None) -> None:
+    def _close_chunk(self, writer: CompactWriter | None) -> None:
         """Completes a chunk by writing its index."""
         if writer is not None:
             writer.close()
             _confirm(writer.path)
-            self._files.chunks.refresh()
+            self._closed.append(self._first)
         self._writer = None
 
     def _release_writer(self) -> None:

@@ -55,13 +55,18 @@ class HistoryReader(FramesReader):
             self._keep(index, frame)
         else:
             self._frames.move_to_end(index)
-        log = self.log_at(index)
-        if not len(log):
-            return Gaussians(**frame, **self._fixed)
-        fixed = self._fixed_after(births_in(log))
+        fixed = self.fixed_at(index)
         if len(frame["means"]) != len(fixed["ids"]):
             raise DamagedFrameError(f"frame {index}: expected {len(fixed['ids'])} Gaussians, got {len(frame['means'])}")
-        return Gaussians(**frame, **fixed, retired=retired_after(log, fixed["ids"]))
+        return Gaussians(**frame, **fixed)
+
+    def fixed_at(self, index: int) -> dict[str, NDArray[Any]]:
+        """Returns the arguments of ``Gaussians`` that are not stored per frame: opacities, ids and retirements."""
+        log = self.log_at(index)
+        if not len(log):
+            return dict(self._fixed)
+        fixed = self._fixed_after(births_in(log))
+        return {**fixed, "retired": retired_after(log, fixed["ids"])}
 
     @property
     def first(self) -> Gaussians:

@@ -14,6 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
@@ -34,6 +35,8 @@ An overwritten array header is parsed before the checksum is verified, and may d
 """
 DIGEST = 16
 """Size of a checksum in bytes."""
+LARGE = 1 << 15
+"""Size of an array in bytes from which its checksum is computed by another thread."""
 PIECE = 1 << 20
 """Number of bytes that ``iter_verified`` reads at a time."""
 
@@ -71,16 +74,18 @@ def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
 
 def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
     """Writes a zip file like ``np.savez``, with the checksums as its comment."""
-    checksums = {}
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, given in arrays.items():
-            array = np.asarray(given)
+    values_of = {name: np.asarray(given) for name, given in arrays.items()}
+    # A second core hashes while this one writes. Both release the GIL for large arrays.
+    with ThreadPoolExecutor(1) as hashing, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        digests = {name: hashing.submit(_digest, array) for name, array in values_of.items() if array.nbytes >= LARGE}
+        for name, array in values_of.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 values = array if array.flags.c_contiguous else array.copy()
                 np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(values))
                 member.write(values.reshape(-1).view(np.uint8).data)  # ``write_array`` would copy the values
-            checksums[name] = _digest(array)
-        archive.comment = _comment(checksums)
+        archive.comment = _comment(
+            {name: digests[name].result() if name in digests else _digest(array) for name, array in values_of.items()}
+        )
 
 
 def _comment(checksums: Mapping[str, str]) -> bytes:

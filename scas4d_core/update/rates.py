@@ -8,6 +8,7 @@ would move thousands of Gaussians. If the prediction is poor, all layers learn t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import cos, pi
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,7 @@ def first_iteration(start: float, iterations: int) -> int:
     return round(start * iterations)
 
 
+@lru_cache(maxsize=256)  # each iteration of an update asks for the same spans
 def learning_span(start: float, rest: float, iterations: int) -> range:
     """Returns the indices of the iterations in which a parameter learns; at least one iteration.
 

@@ -32,12 +32,14 @@ class PendingCommit:
         index: index of the frame.
         writes: functions that write the files, in order. Each may be called again if it raises an error.
         message: message to send once all files are synced.
+        cleanups: functions that delete earlier checkpoints after the message was sent.
         deletions: functions that delete files that are no longer needed once all files are synced.
     """
 
     index: int
     writes: list[Callable[[], None]] = field(default_factory=list)
     message: FrameCommitted | None = None
+    cleanups: list[Callable[[], None]] = field(default_factory=list)
     deletions: list[Callable[[], None]] = field(default_factory=list)
 
 
@@ -88,17 +90,19 @@ class CommitWriter:
         try:
             for write in commit.writes:
                 self._write_when_there_is_room(commit.index, write)
+            sending = time.perf_counter()
+            self.write_seconds = sending - began
+            with contextlib.suppress(OSError):  # the service is gone, which the inbox notices
+                self._send(commit.message)
+            self.publish_seconds = time.perf_counter() - sending
+            for clean in commit.cleanups:
+                clean()
         except BaseException as error:
             failure = CommitError(f"frame {commit.index} cannot be committed: {message_of(error)}")
             failure.__cause__ = error
             self._fail(failure)
             return  # nothing may be written after it
         self._written = commit
-        sending = time.perf_counter()
-        self.write_seconds = sending - began
-        with contextlib.suppress(OSError):  # the service is gone, which the inbox notices
-            self._send(commit.message)
-        self.publish_seconds = time.perf_counter() - sending
         self._idle.set()
 
     def _write_when_there_is_room(self, index: int, write: Callable[[], None]) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
@@ -163,7 +164,7 @@ class Worker:
     def next(self) -> Any:
         """Waits for the next message and returns it.
 
-        In the meantime, files of old states are deleted or compacted.
+        In the meantime, files of old states are deleted, and one is compacted by a thread.
         """
         while True:
             idle = self._commits.wait(0)
@@ -171,17 +172,16 @@ class Worker:
                 self._commits.delete_files()
             if self.states is not None and len(self.states) > (self.spec.retention.exact_states or len(self.states)):
                 # A commit that is being written has priority, because compaction also waits for the disk.
-                self._compacting.compact_while_idle(
-                    self.states, lambda: self.inbox.waiting or not self._commits.wait(0)
-                )
+                self._compacting.compact(self.states, lambda: self.inbox.waiting or not self._commits.wait(0))
             try:
-                return self.inbox.next(None if idle else IDLE_CHECK_S)
+                return self.inbox.next(None if idle and not self._compacting.at_work else IDLE_CHECK_S)
             except TimeoutError:
                 continue
 
     def finish_commit(self) -> None:
         """Waits until the last commit is on disk, or, if that takes too long, leaves the frame to the next worker."""
         self._commits.wait(STOP_S)
+        self._compacting.wait(STOP_S)
 
     def _await_commit(self) -> None:
         """Waits until the previous commit is on disk.
@@ -235,6 +235,7 @@ class Worker:
         """Checks and repairs damaged files, and reports the outcome for each."""
         assert self.states is not None
         self._await_commit()
+        self._compacting.wait()
         for mended in repairs.repair_files(self.states, self.reconstruction, message):
             self.send(mended)
 
@@ -242,6 +243,7 @@ class Worker:
         """Recomputes a damaged state from its images and reports the outcome."""
         assert self.states is not None
         self._await_commit()
+        self._compacting.wait()
 
         def pictures() -> tuple[Frame, dict[str, str]]:
             return self._decoder.decode(message.frame)
@@ -287,7 +289,14 @@ class Worker:
                 "write_seconds": self._commits.write_seconds,
                 "publish_seconds": self._commits.publish_seconds,
             }
-            self.reconstruction.step(frame, dropped=dropped, notes=notes, started=began, defer=commit.writes.append)
+            self.reconstruction.step(
+                frame,
+                dropped=dropped,
+                notes=notes,
+                started=began,
+                defer=commit.writes.append,
+                defer_cleanup=commit.cleanups.append,
+            )
         return commit
 
     def retain(self, defer: Defer = run_now) -> list[int]:
@@ -298,7 +307,17 @@ class Worker:
         assert self.states is not None
         rule = self.spec.retention.keep_states
         last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
-        return self.states.retain(last=last, size_bytes=size, defer=defer)
+
+        def delete_later(delete: Callable[[], None]) -> None:
+            defer(lambda: self._delete(delete))
+
+        if last is not None or size is not None:  # states that are being moved cannot be deleted
+            self._compacting.wait()
+        return self.states.retain(last=last, size_bytes=size, defer=delete_later)
+
+    def _delete(self, delete: Callable[[], None]) -> None:
+        self._compacting.wait()
+        delete()
 
     def points(self) -> InitialPoints | None:
         """Returns the initial point cloud, or None if none was uploaded before the first frame."""

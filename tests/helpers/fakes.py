@@ -202,7 +202,7 @@ class FakeReconstruction:
         self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record, defer=defer)
         return report
 
-    def step(self, frame, *, dropped=None, notes=None, started=None, defer=run_now):
+    def step(self, frame, *, dropped=None, notes=None, started=None, defer=run_now, defer_cleanup=None):
         assert started is None or started <= time.perf_counter()
         obey(frame)
         return self.commit(frame, dropped, notes, defer)

@@ -17,10 +17,11 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import balance, neighbour_terms
 from scas4d_core.kernels.cascade import COUNTED_GUARDS, PARAMETERS, RECORD, TABLE
-from scas4d_core.kernels.deform import CARRIED, block_sums, deform, deform_backward, freeze_layer
+from scas4d_core.kernels.deform import CARRIED, block_sums, deform, deform_backward, freeze_layer, load_blocks
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.jit import threads
 from scas4d_core.kernels.lanes import COUNT
+from scas4d_core.kernels.states import find_finite
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
 
@@ -102,8 +103,8 @@ class CpuDeformation:
     def start(self, previous: Gaussians) -> None:
         """Loads the state Θ_{t−1} to be deformed. Its static Gaussians remain unchanged."""
         moving = self.hierarchy.rows
-        held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
-        sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)
+        sound = np.empty(len(moving), np.bool_)
+        find_finite(np.ascontiguousarray(previous.means), np.ascontiguousarray(previous.factors), moving, sound)
         self.held_back = moving[~sound]
         self._held = previous.means[self.held_back], previous.factors[self.held_back]
         means, factors = previous.means, previous.factors
@@ -113,9 +114,9 @@ class CpuDeformation:
             factors[self.held_back] = 0
         self._hold_back(sound)
         self._state[:, PREVIOUS : PREVIOUS + 3] = means[moving]
-        self._points[0] = np.swapaxes(means[self._rows], 1, 2)
-        entering = self._before.reshape(-1, CARRIED // COUNT, COUNT)
-        entering[:, :9] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
+        load_blocks(
+            np.ascontiguousarray(means), np.ascontiguousarray(factors), self._rows, self._points, self._before
+        )  # fmt: skip
         block_sums(self._points, self._present, self._sums)
         self._unfreeze_layers()
         self.means = previous.means.copy()

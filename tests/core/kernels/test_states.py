@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scas4d_core.kernels.states import extrapolate_rows, find_implausible, find_outside, rotate_rows
+from scas4d_core.kernels.states import (
+    count_votes,
+    extrapolate_rows,
+    find_finite,
+    find_implausible,
+    find_outside,
+    rotate_rows,
+)
 
 RNG = np.random.default_rng(0)
 
@@ -26,6 +33,22 @@ def test_only_moving_rows_are_extrapolated() -> None:
     extrapolate_rows(before, after, moving, np.float32(0.5), result)
     expected = np.where(moving[:, None], after + np.float32(0.5) * (after - before), after)
     np.testing.assert_array_equal(result, expected)
+
+
+def test_votes_are_counted_for_gaussians_that_are_seen() -> None:
+    gathered = np.array([[5, 4], [5, 2], [1, 1], [np.nan, 1]], np.float32)
+    asked, says = np.full(4, 3), np.full(4, 1)
+    count_votes(gathered, np.float32(2), np.float32(0.5), asked, says)
+    assert (asked.tolist(), says.tolist()) == ([4, 4, 3, 3], [2, 1, 1, 1])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_rows_with_values_that_are_not_finite_are_not_marked(value: float) -> None:
+    means, factors = np.zeros((5, 3), np.float32), np.zeros((5, 3, 3), np.float32)
+    means[1, 2] = factors[3, 0, 1] = means[4, 0] = value
+    finite = np.empty(4, np.bool_)
+    find_finite(means, factors, np.array([0, 1, 2, 3]), finite)
+    assert finite.tolist() == [True, False, True, False]
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +153,25 @@ def test_a_stop_anywhere_loses_nothing_and_changes_no_byte(tmp_path: Path, true:
         found = {path.name: path.read_bytes() for path in folder.iterdir()}
         assert found.keys() == wanted.keys()
         assert [name for name in found if found[name] != wanted[name]] == [], stops
+
+
+def test_a_state_is_written_by_another_thread_while_frames_are_appended(tmp_path: Path, true: History) -> None:
+    history = filled(tmp_path / "states")
+    later = history.truncate(true.indices[-3])
+    moving = Compaction(history, head, EXACT)
+    due = moving.begin()
+    assert due is not None
+    with ThreadPoolExecutor(1) as thread:
+        written = thread.submit(moving.write, due)
+        for index in later:
+            state = true.gaussians(index)
+            history.append(index, true.time(index), state, report=true.report(index))
+        assert moving.finish(due, written.result)
+    assert not history.files.path(due.index).exists()
+    while moving.step() is not None:
+        pass
+    moving.close()
+    same(history, true, {0, *true.indices[-EXACT:]})
 
 
 def test_a_full_disk_loses_nothing_and_is_tried_again(tmp_path: Path, true: History) -> None:
