@@ -45,19 +45,27 @@ class RawReader(Protocol):
 
     @property
     def sizes(self) -> Mapping[str, Size]:
-        """(width, height) of each camera's images, keyed by camera name."""
+        """(width, height) of the images of each camera that has a readable one, keyed by camera name."""
 
     def time(self, index: int) -> float | None:
         """Returns the frame's time in seconds, or None if unknown."""
 
     def path(self, camera: str) -> Path:
-        """Returns the first file of a camera, for messages."""
+        """Returns a file of a camera in `sizes`, for messages."""
 
     def file(self, index: int, camera: str) -> Path | None:
-        """Returns the image file of a camera and frame, or None if no file is in a format that the service accepts."""
+        """Returns the image file of a camera and frame, or None if no file is in a format that the service accepts.
+
+        Raises:
+            ImageError: if the file is missing.
+        """
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Returns the decoded image [H, W, 3] of a camera and frame."""
+        """Returns the decoded image [H, W, 3] of a camera and frame.
+
+        Raises:
+            ImageError, CaptureError: if the image is missing or damaged.
+        """
 
 
 class ImportedPictures:
@@ -125,10 +133,11 @@ class ImportedPictures:
         The original is used if the service accepts its format and the camera has no distortion. 16-bit images are
         rounded to 8 bits.
         """
-        if self._undistorters[camera].lens.is_pinhole:
+        lens = self._undistorters[camera].lens
+        if lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
-                return eight_bit_file(read_bytes(file), str(file))
+                return eight_bit_file(read_bytes(file), (lens.width, lens.height), str(file))
         return encode(self.image(index, camera), self._encoding)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
@@ -149,7 +158,10 @@ def fit_to_pictures(
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:
-        size = raw.sizes[lens.name]
+        size = raw.sizes.get(lens.name)
+        if size is None:
+            cameras.append(lens)
+            continue
         k, remark = adapt_intrinsics(
             lens.intrinsics,
             (lens.width, lens.height),

@@ -21,7 +21,8 @@ A mask is 1 where the stored value of any channel is nonzero. Masks with alpha o
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ from scas4d_core.frame_outcome import grey_warnings
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM")
 MASK_FORMATS = ("PNG", "BMP")
 EXIF_ORIENTATION = 0x0112
+SIZES = 5
+"""Number of images to compare if the first one does not have the calibrated size."""
 
 Size = tuple[int, int]
 
@@ -159,6 +162,38 @@ def picture_size(source: bytes | Path, name: str | None = None) -> Size:
         raise _unreadable(name, fault) from fault
 
 
+def usual_size(paths: Iterable[Path], calibrated: Size | None = None) -> tuple[Path, Size]:
+    """Returns the first image of a camera that has the camera's usual size, and this size.
+
+    The usual size is the calibrated size if one of the first images has it, or else the most common size among them.
+    Images that cannot be read are ignored. The pixels are not decoded.
+
+    Args:
+        paths: images of a camera.
+        calibrated: (width, height) for which the camera was calibrated, or None if unknown.
+
+    Raises:
+        ImageError: if no image can be read.
+    """
+    sizes: dict[Path, Size] = {}
+    fault = ImageError("there is no image")
+    for number, path in enumerate(paths):
+        try:
+            size = picture_size(path)
+        except ImageError as error:
+            fault = error if number == 0 else fault
+            continue
+        if size == calibrated:
+            return path, size
+        sizes[path] = size
+        if len(sizes) == SIZES:
+            break
+    if not sizes:
+        raise fault
+    common = Counter(sizes.values()).most_common(1)[0][0]
+    return next(path for path, size in sizes.items() if size == common), common
+
+
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     """Resizes an image [H, W, C] to (width, height) by area averaging.
 
@@ -188,22 +223,23 @@ def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     return resized
 
 
-def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
+def eight_bit_file(data: bytes, size: Size, name: str = "picture") -> bytes:
     """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG file.
 
     Raises:
-        ImageError: if the image must be re-encoded but cannot be decoded.
+        ImageError: if the image cannot be decoded, or does not have the given (width, height).
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
-    >>> decode_image(eight_bit_file(file.getvalue()))[0, 0].tolist()
+    >>> decode_image(eight_bit_file(file.getvalue(), size=(4, 2)))[0, 0].tolist()
     [100, 100, 100]
     """
+    picture = decode_image(data, size=size, name=name)  # truncated files are found only by decoding them
     sent = data.startswith((b"\xff\xd8", b"\x89PNG")) or data[8:12] == b"WEBP"
     if sent and not is_sixteen_bit(data):
         return data
     file = io.BytesIO()
-    Image.fromarray(decode_image(data, name=name)).save(file, "PNG", compress_level=1)
+    Image.fromarray(picture).save(file, "PNG", compress_level=1)
     return file.getvalue()
 
 
