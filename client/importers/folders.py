@@ -23,7 +23,7 @@ PANOPTIC = ("hd_", "vga_", "kinect_")
 """CMU Panoptic's videos are named after the type and the name of their camera."""
 
 COMPARED = 5
-"""Number of frame folders whose images are compared with the cameras."""
+"""Number of frame folders among which the one with the most images is compared with the cameras."""
 
 Kind = Literal["images", "frames", "videos"]
 
@@ -72,10 +72,9 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
         if folders if own else pictured:
             yield PictureSource("images", root, {name: [folders[name]] for name in (folders if own else pictured)}, own)
         if pictured:
-            # Single images may be missing, also from the first frame.
-            first = [path for name in pictured[:COMPARED] for path in pictures_in(folders[name])]
-            entries = {composed(stem(path)): [path] for path in reversed(first)}
-            yield PictureSource("frames", root, dict(reversed(entries.items())), own)
+            # An image of the first frame may be missing.
+            fullest = max((pictures_in(folders[name]) for name in pictured[:COMPARED]), key=len)
+            yield PictureSource("frames", root, {composed(stem(path)): [path] for path in fullest}, own)
     for place in VIDEOS:
         root = capture / place
         videos: dict[str, list[Path]] = {}
