@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 from client.calls import NewFrame
-from client.errors import FrameGap, error_of_problem
+from client.errors import FrameGap, InvalidRequest, TooLarge, error_of_problem
 from client.ingest import IngestSocket
 from client.rig.delivery import Delivery
 from client.rig.pace import Pace
@@ -171,23 +171,37 @@ class Sender:
     def _send(self, index: int) -> None:
         if self._cameras is None and self._pace.drops(index):
             self._lose(index, "lost by the rig simulator")
+            self._on_message(f"frame {index}: lost by the rig, declared missing")
             return
         self._send_files(index, self._sequence.files(index))
 
     def _send_files(self, index: int, files: EncodedFrame) -> None:
         """Sends a frame without the images that cannot be used or are lost, or declares it missing."""
         left_out = self._delivery.left_out
+        while not left_out.is_too_much(files.unusable):
+            try:
+                self._send_usable(index, files)
+                break
+            except (InvalidRequest, TooLarge) as refusal:
+                name = (refusal.problem.field or "").removeprefix("mask.")
+                if name not in files.images:
+                    raise
+                files = files.without(name, f"refused by the service: {refusal.problem.detail}")
+                if left_out.is_too_much(files.unusable):
+                    raise
+        else:
+            self._lose(index, "too few of its images can be used")
         for message in left_out.record(index, files.unusable):
             self._on_message(message)
-        if left_out.is_too_much(files.unusable):
-            self._lose(index, "too few of its images can be used")
-            return
+
+    def _send_usable(self, index: int, files: EncodedFrame) -> None:
         if self._cameras is None and not files.unusable:
             self._way.frame(index, files)
             return
         sending = [name for name in files.images if self._cameras is None or not self._pace.drops(index, name)]
-        if len(sending) < left_out.minimum:
+        if len(sending) < self._delivery.left_out.minimum:
             self._lose(index, "lost by the rig simulator")
+            self._on_message(f"frame {index}: lost by the rig, declared missing")
             return
         send = map if self._cameras is None else self._cameras.map
         list(send(lambda name: self._send_camera(index, name, files), sending))
@@ -204,8 +218,6 @@ class Sender:
     def _lose(self, index: int, reason: str) -> None:
         self._client.declare_missing(self._delivery.scene, index, reason=reason)
         self._delivery.lost.append(index)
-        if index not in self._delivery.left_out.frames:
-            self._on_message(f"frame {index}: lost by the rig, declared missing")
 
     def close(self) -> None:
         """Stops the threads."""

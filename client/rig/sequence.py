@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from client.left_out import LeftOut
 from scas4d_core.captures import Capture, CaptureError, ImageError
@@ -23,6 +23,13 @@ class EncodedFrame:
     images: dict[str, bytes]
     masks: dict[str, bytes]
     unusable: dict[str, str]
+
+    def without(self, camera: str, reason: str) -> EncodedFrame:
+        """Returns the frame without the image and mask of a camera."""
+        images, masks = (
+            {name: file for name, file in of.items() if name != camera} for of in (self.images, self.masks)
+        )
+        return replace(self, images=images, masks=masks, unusable={**self.unusable, camera: reason})
 
 
 def ping_pong(index: int, count: int) -> int:
