@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from client.importers.calibration import Calibration, composed, listed, natural, stem
-from client.importers.pictures import READ, frame_folders
+from client.importers.pictures import READ, frame_folders, readable_entries
 from client.importers.video.reader import Video
 from client.importers.videos import ENDS
 from scas4d_core.captures import CaptureError, ImageError
@@ -68,7 +68,7 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
             for path in sorted(root.iterdir() if root.is_dir() else (), key=lambda path: natural(path.name))
             if path.is_dir() and not path.name.startswith(".") and (own or path.name not in NOT_CAMERAS)
         }
-        pictured = [name for name, path in folders.items() if any(map(_is_picture, path.iterdir()))]
+        pictured = [name for name, path in folders.items() if any(map(_is_picture, readable_entries(path)))]
         if folders if own else pictured:
             yield PictureSource("images", root, {name: [folders[name]] for name in (folders if own else pictured)}, own)
         if pictured:

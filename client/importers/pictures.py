@@ -7,7 +7,7 @@ name, but may have different extensions, and may start with the name of their ca
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from client.importers.calibration import PICTURE_SUFFIXES, Calibration, composed, listed, natural, stem
@@ -186,7 +186,7 @@ def frame_folders(root: Path, stems: Mapping[str, str]) -> dict[str, dict[str, P
     """Returns the images of the given cameras in each folder that contains any, in natural order of the folders."""
     frames = {}
     for folder in sorted((path for path in root.iterdir() if path.is_dir()), key=lambda path: natural(path.name)):
-        files = {composed(path.stem): path for path in _pictures_in(folder).values()}
+        files = {composed(path.stem): path for path in _pictures_in(folder, readable_entries(folder)).values()}
         there = {camera: files[name] for camera, name in stems.items() if name in files}
         if there:
             frames[folder.name] = there
@@ -212,9 +212,17 @@ def masks_of(root: Path, calibration: Calibration) -> dict[str, dict[str, Path]]
     return frames_of_cameras(folders, what="masks")
 
 
-def _pictures_in(folder: Path) -> dict[str, Path]:
+def readable_entries(folder: Path) -> list[Path]:
+    """Returns the entries of a folder, or an empty list if they must not be listed, like those of `lost+found`."""
+    try:
+        return list(folder.iterdir())
+    except PermissionError:
+        return []
+
+
+def _pictures_in(folder: Path, entries: Iterable[Path] | None = None) -> dict[str, Path]:
     pictures: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.iterdir() if entries is None else entries):
         end = path.suffix.lower()
         if path.name.startswith(".") or end not in PICTURE_SUFFIXES:
             continue

@@ -144,4 +144,7 @@ def _end_of(picture: bytes) -> str:
 
 def _put(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    try:
+        path.write_bytes(data)
+    except OSError as fault:  # a full disk, for which Python does not name the file
+        raise OSError(fault.errno, fault.strerror, str(path)) from fault

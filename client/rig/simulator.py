@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from client.errors import ServiceError, ServiceUnreachable
@@ -191,14 +191,13 @@ class _DeleteIfEmpty:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             return
-        try:
-            if issubclass(kind, ServiceUnreachable):  # it has been retried long enough
-                raise ServiceUnreachable
-            status = self._client.scene(self._scene)
-            if status.next_frame == status.missing:
-                self._client.delete_scene(self._scene)
-        except (ServiceError, ServiceUnreachable):
-            self._on_message(f"scene {self._scene} may be empty; if so: scas4d scenes delete {self._scene}")
+        if not issubclass(kind, ServiceUnreachable):  # which has been retried long enough
+            with suppress(ServiceError, ServiceUnreachable):
+                status = self._client.scene(self._scene)
+                if status.next_frame == status.missing:
+                    self._client.delete_scene(self._scene)
+                return
+        self._on_message(f"scene {self._scene} may be empty; if so: scas4d scenes delete {self._scene}")
 
 
 def _check_cameras(status: SceneStatus, source: Capture) -> None:

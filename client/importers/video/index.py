@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import numpy as np
@@ -98,8 +98,12 @@ def video_index(path: Path) -> VideoIndex:
 
 
 def cache_folder() -> Path:
-    """Returns the folder of the cached indices: scas4d/videos in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scas4d" / "videos"
+    """Returns the folder of the cached indices: scas4d/videos in the user's cache folder, or the temporary folder."""
+    given = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return Path(given or Path.home() / ".cache") / "scas4d" / "videos"
+    except RuntimeError:  # a user without a home folder, as in some containers
+        return Path(gettempdir()) / "scas4d" / "videos"
 
 
 def _cached_file(path: Path) -> Path:

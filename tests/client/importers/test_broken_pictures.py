@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,6 +126,43 @@ def test_a_camera_without_any_usable_image_is_left_out_of_all_frames(tmp_path, l
         path("cam1", frame).write_bytes(b"")
     with pytest.raises(CaptureError, match=r"cam1.*cannot be read as an image|cam1\.png cannot be read as an image"):
         open_source(tmp_path)
+
+
+def test_a_folder_that_must_not_be_listed_is_not_part_of_the_capture(tmp_path, monkeypatch):
+    """As `lost+found` at the root of a disk."""
+    make(frame_folders, tmp_path)
+    for folder in (tmp_path / "images").iterdir():
+        folder.rename(tmp_path / folder.name)
+    (tmp_path / "images").rmdir()
+    (tmp_path / "lost+found").mkdir()
+    own = Path.iterdir
+
+    def iterdir(path):
+        if path.name == "lost+found":
+            raise PermissionError(13, "Permission denied", str(path))
+        return own(path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    capture = open_source(tmp_path)
+    assert (set(capture.rig.names), capture.frame_count) == (set(NAMES), COUNT)
+
+
+def test_a_full_disk_is_named_with_the_file(tmp_path, monkeypatch):
+    make(camera_folders, tmp_path / "raw")
+
+    def full(path, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"No space left on device: .*000000\.png"):
+        write_dynamic3dgs(open_source(tmp_path / "raw"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("fps", [None, 24.0])
+def test_a_frame_rate_that_is_null_is_not_given(tmp_path, fps):
+    make(camera_folders, tmp_path)
+    write(tmp_path / "transforms.json", transforms(lenses("PINHOLE"), "PINHOLE") | {"fps": fps})
+    assert open_source(tmp_path).fps == (fps or 30.0)
 
 
 def test_a_broken_mask_leaves_its_camera_out(tmp_path):
