@@ -99,8 +99,8 @@ def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], 
         return []
     usual = float(np.median(list(known.values())))
     causes = (
-        "the calibration may be inaccurate, or images may belong to another camera or time; to refine the calibration "
-        "using the images of frame 0, set static.refine_calibration"
+        "the calibration may be inaccurate, or images may belong to another camera or time; set "
+        "static.refine_calibration to refine the calibration using the images of frame 0"
     )
     inside = [known[camera.name] / scale for camera, scale in zip(matches.cameras, matches.scale, strict=True)
               if camera.name in known]  # fmt: skip

@@ -62,10 +62,9 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
     points = np.concatenate(drawn)
     inside, free = np.stack([_seen(view, points) for view in views], axis=1)
     if free.any(axis=0).all():
-        empty = sum(view.mask is not None and not view.mask.any() for view in views)
         raise InitialPointsError(
-            f"masks: no place is in the foreground of all masks that show it; {empty} of {len(views)} masks are empty; "
-            "provide masks in which the foreground is not 0, or none"
+            "images: no place is in the foreground of all images that show it, according to the masks or, without "
+            "masks, to the plain background; provide a point cloud or other masks"
         )
     points, inside = points[~free.any(axis=0)], inside[:, ~free.any(axis=0)]
     # Three cameras agree by chance less often than two.
