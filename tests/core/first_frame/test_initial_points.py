@@ -276,7 +276,7 @@ def test_cameras_that_see_nothing_in_common_are_refused(scene):
     )
     rng = np.random.default_rng(0)
     images = {name: rng.integers(0, 256, (128, 128, 3)).astype(np.uint8) for name in rig.names}
-    with pytest.raises(InitialPointsError, match="^poses: no two cameras see the same place"):
+    with pytest.raises(InitialPointsError, match=r"^poses: no two cameras see the same place"):
         initial_points(rig, images, {}, stereo=False)
     images = {name: np.full((128, 128, 3), 9, np.uint8) for name in rig.names}
     with pytest.raises(InitialPointsError, match=r"^all 2 images are black .*; images: no place is in the foreground"):
