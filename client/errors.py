@@ -16,10 +16,17 @@
 
 from __future__ import annotations
 
+import socket
+import ssl
+import urllib.request
+
 import httpx
+import websockets.exceptions
 
 from client.wire import ProblemDetails
 
+MAX_CAUSES = 8
+"""Maximum number of chained exceptions that are examined."""
 TEXT_LENGTH = 200
 """Maximum number of characters to show from a response that is not a problem document."""
 
@@ -76,7 +83,68 @@ class ServiceFault(ServiceError):
 
 
 class ServiceUnreachable(ConnectionError):
-    """Error raised if there was no response or the connection was lost."""
+    """Error raised if there was no response or the connection was lost.
+
+    Attributes:
+        refused: whether the connection was refused, because no program listens at the address.
+    """
+
+    def __init__(self, message: str, *, refused: bool = False) -> None:
+        super().__init__(message)
+        self.refused = refused
+
+
+def unreachable(url: str, error: Exception, attempts: int = 1) -> ServiceUnreachable:
+    """Returns the exception for a connection that failed. It says what happened, and not more than is known.
+
+    Args:
+        url: address of the service.
+        error: exception of the HTTP or WebSocket library.
+        attempts: number of attempts.
+    """
+    tries = f" after {attempts} attempts" if attempts > 1 else ""
+    what = str(error) or type(error).__name__
+    causes = [error]
+    while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None and len(causes) < MAX_CAUSES:
+        causes.append(cause)  # type: ignore[arg-type]
+
+    def is_any(*kinds: type[Exception]) -> bool:
+        return any(isinstance(cause, kinds) for cause in causes)
+
+    refused = is_any(ConnectionRefusedError)
+    if is_any(httpx.ProxyError, websockets.exceptions.ProxyError):
+        text = f"{url} cannot be reached{tries}, because the proxy failed: {what}"
+    elif is_any(ssl.SSLError):
+        text = f"{url} was reached{tries}, but the TLS handshake failed: {what}; for a service without TLS, use http://"
+    elif is_any(socket.gaierror):
+        text = f"{url} cannot be reached{tries}: its host name could not be resolved ({what})"
+    elif refused:
+        text = f"{url} cannot be reached{tries}: the connection was refused"
+    elif is_any(httpx.ConnectTimeout):
+        text = (
+            f"{url} cannot be reached{tries}: no connection was made in time; the host or a firewall does not respond"
+        )
+    elif is_any(httpx.TimeoutException, TimeoutError):
+        text = f"{url} did not respond in time{tries} ({what})"
+    elif is_any(httpx.NetworkError, httpx.RemoteProtocolError) and not is_any(httpx.ConnectError):
+        text = f"the connection to {url} was lost{tries}: {what}"
+    else:
+        text = f"{url} cannot be reached{tries}: {what}"
+    proxy = _proxy_of(url)
+    return ServiceUnreachable(
+        text if proxy is None else f"{text}; through the proxy {proxy}, from the environment",
+        refused=refused and proxy is None,
+    )
+
+
+def _proxy_of(url: str) -> str | None:
+    """Returns the address of the proxy that the environment sets for a URL, without its password, or None."""
+    target = httpx.URL(url)
+    proxies = urllib.request.getproxies()
+    proxy = proxies.get(target.scheme, proxies.get("all"))
+    if not proxy or urllib.request.proxy_bypass(target.host):
+        return None
+    return proxy.rsplit("@", 1)[-1]
 
 
 BY_STATUS: dict[int, type[ServiceError]] = {
@@ -100,7 +168,10 @@ def error_of(response: httpx.Response) -> ServiceError:
         problem = ProblemDetails.model_validate_json(response.content)
     except ValueError:  # not from our service, e.g. from a proxy in front of it
         text = response.text[:TEXT_LENGTH]
-        problem = ProblemDetails(title="unexpected response", status=response.status_code, detail=text)
+        detail = (
+            f"unexpected response, which is not from the service but perhaps from a proxy or another server: {text}"
+        )
+        problem = ProblemDetails(title="unexpected response", status=response.status_code, detail=detail)
     return error_of_problem(problem)
 
 

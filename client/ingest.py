@@ -118,7 +118,9 @@ class IngestSocket:
                 )
             except (OSError, TimeoutError, ConnectionClosed, InvalidHandshake) as error:
                 self.close()
-                wait = retries.after_connection_error(httpx.ReadError(str(error)))
+                lost = httpx.ReadError(str(error))
+                lost.__cause__ = error
+                wait = retries.after_connection_error(lost)
             else:
                 first = answers[0]
                 if first.receipt is not None or (refusals and first.status not in RETRIED_STATUSES):

@@ -28,7 +28,7 @@ from typing import Any, Literal
 import httpx
 
 from client.calls import Call
-from client.errors import ServiceUnreachable, error_of
+from client.errors import error_of, unreachable
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
@@ -90,9 +90,7 @@ class Retries:
         if (self.call.repeatable or unsent) and not isinstance(error, httpx.UnsupportedProtocol):
             wait = self._outage_wait(0.0, str(error))
         if wait is None:
-            tries = f" after {self._failures} attempts" if self._failures > 1 else ""
-            what = str(error) or type(error).__name__
-            raise ServiceUnreachable(f"{self._url} cannot be reached{tries}: {what}") from error
+            raise unreachable(self._url, error, self._failures) from error
         self._lost = self._lost or not unsent
         return wait
 

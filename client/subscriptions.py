@@ -17,7 +17,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from client.calls.call import wire_camera
-from client.errors import ServiceUnreachable, error_of_problem
+from client.errors import error_of_problem, unreachable
 from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel, TracksRequest
 from client.wire.base import Model
 from client.wire.stream import (
@@ -326,7 +326,7 @@ class StreamSession:
         if now - self._failed_at >= self.outage:
             if isinstance(error, InvalidStatus):
                 raise error_of_problem(_problem(error)) from error
-            raise ServiceUnreachable(f"{self.address} cannot be reached: {error}") from error
+            raise unreachable(self.address, error, self._failures) from error
         self._failures += 1
         grown = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16))
         return grown * random.uniform(0.5, 1.0)

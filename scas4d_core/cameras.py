@@ -232,6 +232,15 @@ LONG_LENS = 2.0
 """
 
 
+def minimum_cameras(count: int, minimum: int | None = None) -> int:
+    """Returns how many of `count` cameras must have a usable image in a frame: at most `minimum`, by default half.
+
+    >>> minimum_cameras(5), minimum_cameras(5, 2), minimum_cameras(5, 9)
+    (3, 2, 5)
+    """
+    return -(-count // 2) if minimum is None else min(minimum, count)
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Ordered set of uniquely named cameras that observe the same scene.

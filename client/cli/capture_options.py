@@ -12,8 +12,9 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from client.importers.open_source import CaptureOptions
+from client.left_out import LeftOut
 from client.progress import console
-from scas4d_core.captures import Capture
+from scas4d_core.captures import Capture, CaptureError
 
 
 class PicturesFrom(StrEnum):
@@ -119,4 +120,21 @@ def open_capture(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
 def print_remarks(capture: Capture) -> None:
     """Prints the remarks that were recorded while reading a capture."""
     for remark in capture.remarks:
-        console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)
+        note(remark)
+
+
+def note(message: str) -> None:
+    """Prints a message about a capture or its sending."""
+    console.print(message, style="yellow", highlight=False, markup=False, soft_wrap=True)
+
+
+def finish(left_out: LeftOut) -> None:
+    """Prints how many images could not be used.
+
+    Raises:
+        CaptureError: if frames are left out. The command has done everything else, but its exit status is 1.
+    """
+    if left_out.frames:
+        raise CaptureError(left_out.summary)
+    if left_out.summary is not None:
+        note(left_out.summary)

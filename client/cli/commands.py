@@ -12,12 +12,12 @@ import typer
 
 from client import rig
 from client.cli import scenes
-from client.cli.capture_options import open_capture, with_capture_options
+from client.cli.capture_options import finish, note, open_capture, with_capture_options
 from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_labels
 from client.importers.open_source import CaptureOptions
 from client.progress import Bars, console
 from client.sdk import DEFAULT_URL, Client
-from client.wire import FINISHED, FrameReportModel, IngestSettings
+from client.wire import FINISHED, FrameReportModel, IngestSettings, SceneState, SceneStatus
 from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
@@ -122,17 +122,32 @@ def push(
             ingest=IngestSettings(when_full=when_full.value),
             nodes=labels,
             on_progress=bars,
-            on_message=lambda sentence: console.print(sentence, style="yellow", highlight=False),
+            on_message=note,
         )
         status = client.scene(delivery.scene)
+        only_left_out = delivery.left_out.images > 0 and _lacks_only_cameras(client, status)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
     for sentence in status.warnings:
         if sentence not in source.remarks:  # already printed when the capture was opened
             console.print(sentence, style="yellow", highlight=False)
     console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
     console.print(f"{url.rstrip('/')}/#scene={status.id}", soft_wrap=True)
-    if status.error:
+    if status.error and not only_left_out:
         raise SystemExit(f"scas4d: {status.error}")
+    finish(delivery.left_out)
+
+
+def _lacks_only_cameras(client: Client, status: SceneStatus) -> bool:
+    """Returns whether the last frame is as it should be, except that it lacks cameras."""
+    if status.state == SceneState.FAILED or status.last_committed is None:
+        return False
+    report = client.frame(status.id, status.last_committed)
+    return (
+        bool(report.dropped_cameras)
+        and not report.degraded
+        and status.error is not None
+        and (status.error.startswith(f"frame {report.index} "))
+    )
 
 
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
@@ -290,9 +305,10 @@ def import_(
 
     source = open_capture(capture, options, encoding=encoding.value)
     with Bars() as bars:
-        write_dynamic3dgs(source, out, frames=frames, on_progress=bars)
+        left_out = write_dynamic3dgs(source, out, frames=frames, on_progress=bars, on_message=note)
     count = len(source.rig) + (0 if source.test_rig is None else len(source.test_rig))
     console.print(f"wrote {count} cameras to {out}; to send them: scas4d push {out}", highlight=False, soft_wrap=True)
+    finish(left_out)
 
 
 REPORT_LINE_PARTS = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})

@@ -18,8 +18,9 @@ from client.cli.changes import format_changes
 from client.cli.reconstruct import compile_kernels, reconstruct_frames
 from client.cli.scores import Row, Store, digest, markdown, stage_table
 from client.importers.open_source import CaptureOptions
+from client.left_out import LeftOut
 from client.progress import Bars
-from scas4d_core.captures import Capture
+from scas4d_core.captures import Capture, CaptureError
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 
@@ -205,8 +206,17 @@ def measure(
     store.start_frames(job.key)
     count = given.frame_count if job.frames is None else min(job.frames, given.frame_count)
     lines: list[Row] = []
+    left_out = LeftOut(given.rig)
+
+    def note(message: str) -> None:
+        if left_out.frames:
+            raise CaptureError(f"{given.name}: {message}; scores need every frame")
+        report(f"    {message}")
+
     with Bars(Console(stderr=True)) as bars:
-        frames = reconstruct_frames(given, job.settings, count, static=static and static[0], progress=bars)
+        frames = reconstruct_frames(
+            given, job.settings, count, static=static and static[0], progress=bars, left_out=left_out, on_message=note
+        )
         for reconstruction, done in frames:
             index = done.index
             line: Row = {"index": index, "seconds": done.seconds, "stages": {}}

@@ -241,7 +241,8 @@ def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError]
             raise
         raise SystemExit(f"{name}: {install}") from None
     except ServiceUnreachable as error:
-        raise SystemExit(f"{name}: {error}; start a service with: scas4d serve") from None
+        hint = "; start a service with: scas4d serve" if error.refused else ""
+        raise SystemExit(f"{name}: {error}{hint}") from None
     except (ServiceError, CaptureError, ImageError, RuntimeError, ValueError, OSError) as error:
         raise SystemExit(f"{name}: {error}") from None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from client import pictures
+from client.cli.capture_options import finish, note
 from client.exports.video.video_file import video_file
+from client.left_out import LeftOut
 from client.progress import Bars, console
-from scas4d_core.captures import Capture
+from scas4d_core.captures import Capture, CaptureError, ImageError
 from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.frame_outcome import AlarmKind
 from scas4d_core.presets import preset as named
@@ -40,13 +42,15 @@ class ReconstructedFrame:
         index: frame index in the capture.
         seconds: wall-clock time of this frame in seconds, including decoding.
         cpu_seconds: CPU time of this frame in seconds, summed over all threads.
-        report: report on the update; None for frame 0.
+        report: report on the update; None for the first frame.
+        unusable: cameras whose image cannot be used.
     """
 
     index: int
     seconds: float
     cpu_seconds: float
     report: FrameReport | None
+    unusable: Collection[str] = ()
 
 
 def reconstruct_frames(
@@ -57,39 +61,57 @@ def reconstruct_frames(
     history: History | None = None,
     static: StaticResult | None = None,
     progress: Callable[[str, int, int], None],
+    left_out: LeftOut,
+    on_message: Callable[[str], None],
 ) -> Iterator[tuple[Reconstruction, ReconstructedFrame]]:
     """Reconstructs the first `count` frames of a capture in order.
 
-    After each frame, the function yields the reconstruction and the result of the frame.
+    Cameras without a usable image are left out. Like the service, the function leaves out a frame if too few cameras
+    remain, and starts with the first other frame. After each frame that is not left out, it yields the reconstruction
+    and the result of the frame.
 
     Args:
         capture: capture at full size; the reconstruction resizes its images itself.
         settings: reconstruction settings.
         count: number of frames, at least 1.
         history: storage for the states; None to keep them in memory.
-        static: previously fitted frame 0; None to fit it here.
+        static: previously fitted first frame; None to fit it here.
         progress: callback that receives (stage, done, total).
+        left_out: record of the images that cannot be used.
+        on_message: callback that receives the messages of `left_out`.
+
+    Raises:
+        CaptureError: if every frame was left out.
     """
     from scas4d_core.reconstruction import Reconstruction
 
-    started, cpu = time.perf_counter(), time.process_time()
-    reconstruction = Reconstruction.start(
-        capture.rig,
-        capture.frame(0),
-        settings,
-        points=capture.points,
-        progress=lambda now: progress(f"frame 0, {now.stage}", now.done, now.total),
-        history=history,
-        static=static,
-    )
-    report: FrameReport | None = None
+    reconstruction: Reconstruction | None = None
     for index in range(count):
-        if index:
-            started, cpu = time.perf_counter(), time.process_time()
-            report = reconstruction.step(capture.frame(index))
-        done = ReconstructedFrame(index, time.perf_counter() - started, time.process_time() - cpu, report)
+        started, cpu = time.perf_counter(), time.process_time()
+        frame, dropped = capture.usable_frame(index)
+        report: FrameReport | None = None
+        for message in left_out.record(index, dropped):
+            on_message(message)
+        if left_out.is_too_much(dropped):
+            continue
+        if reconstruction is None:
+            reconstruction = Reconstruction.start(
+                capture.rig,
+                frame,
+                settings,
+                points=capture.points,
+                progress=lambda now: progress(f"frame 0, {now.stage}", now.done, now.total),
+                history=history,
+                static=static,
+                dropped=dropped,
+            )
+        else:
+            report = reconstruction.step(frame, dropped=dropped, started=started)
+        done = ReconstructedFrame(index, time.perf_counter() - started, time.process_time() - cpu, report, dropped)
         progress("frames", index + 1, count)
         yield reconstruction, done
+    if reconstruction is None:
+        raise CaptureError(f"{capture.name} has no frame that can be used: {left_out.summary}")
 
 
 def reconstruct(
@@ -104,7 +126,7 @@ def reconstruct(
     """Reconstructs every frame and writes comparison images, `states/`, `states.s4d` and `last.ply` to `out`.
 
     Renders are compared with the test cameras' images. If there are no test cameras, one training camera is used and
-    the last printed line says so.
+    the last printed line says so. An image that cannot be used is left out, with a message.
 
     Args:
         given: capture at full size; the reconstruction resizes its images itself.
@@ -113,6 +135,9 @@ def reconstruct(
         preset: preset name.
         changes: nested settings that override the preset.
         videos: whether to also write each camera's comparison images as a video at the capture's frame rate.
+
+    Raises:
+        CaptureError: if a frame was left out, because it has too few usable images; all files are written before.
     """
     from scas4d_core.query.parts import parts
     from scas4d_core.query.ply import write_ply
@@ -133,11 +158,15 @@ def reconstruct(
     compact = out / "states.s4d"
     compact.unlink(missing_ok=True)
     history = History(out / "states")
+    left_out = LeftOut(given.rig)
     compile_kernels()
     with Bars() as bars, ExitStack() as opened:
         writer: CompactWriter | None = None
         add: dict[str, Callable[[pictures.Picture], None]] = {}
-        for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
+        frames_of = reconstruct_frames(
+            given, settings, count, history=history, progress=bars, left_out=left_out, on_message=note
+        )
+        for reconstruction, done in frames_of:
             index = done.index
             if writer is None:
                 head = FileHeader(
@@ -150,17 +179,20 @@ def reconstruct(
             writer.add(index, history.time(index), history.gaussians(index))
             truth = capture.test_frame(index) if capture.test_rig is not None else capture.frame(index)
             scores = []
-            if index in (0, count - 1) and reconstruction.report is not None:
+            if (done.report is None or index == count - 1) and reconstruction.report is not None:
                 for sentence in reconstruction.report.warnings:
                     if sentence not in given.remarks:
                         console.print(sentence)
             if capture.test_rig is None:
                 cameras = reconstruction.calibrated.scaled(settings.scene.image_scale).cameras[:1]
             for camera in cameras:
-                render, true = (
-                    pictures.eight_bit(reconstruction.render(camera, index).colour),
-                    truth.images[camera.name],
-                )
+                try:
+                    true = truth.images[camera.name]
+                except (CaptureError, ImageError) as fault:
+                    if capture.test_rig is not None:  # that of a training camera has been reported
+                        note(f"frame {index}, not compared with camera {camera.name}: {fault}")
+                    continue
+                render = pictures.eight_bit(reconstruction.render(camera, index).colour)
                 scores.append(pictures.psnr(true, render))
                 compared = pictures.comparison(true, render)
                 pictures.save(out / f"camera_{camera.name}" / f"{index:06d}.png", compared)
@@ -169,7 +201,9 @@ def reconstruct(
                     add[camera.name] = opened.enter_context(video_file(file, given.fps))
                 if videos:
                     add[camera.name](compared)
-            console.print(f"frame {index}: {np.mean(scores):.2f} dB{remarks_on(done.report)}")
+            score = f"{np.mean(scores):.2f} dB" if scores else "not compared"
+            remarks = remarks_on(done.report, done.unusable)
+            console.print(f"frame {index}: {score}{remarks}", markup=False, soft_wrap=True)
         if writer is not None and history.newest.moving.any():
             writer.add_parts(history.indices[-1], parts(history))
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
@@ -179,10 +213,15 @@ def reconstruct(
         else f" (PSNR of training camera {cameras[0].name}; use --test to hold out others)"
     )
     console.print(f"images, states, states.s4d and last.ply: {out}{seen}")
+    finish(left_out)
 
 
-def remarks_on(report: FrameReport | None) -> str:
+def remarks_on(report: FrameReport | None, reported: Collection[str] = ()) -> str:
     """Returns the text printed after a frame's PSNR: why the frame is degraded, and its alarms.
+
+    Args:
+        report: report of the frame, or None.
+        reported: cameras about which a message says why they were left out.
 
     >>> remarks_on(None)
     ''
@@ -191,6 +230,8 @@ def remarks_on(report: FrameReport | None) -> str:
         return ""
     parts = [] if report.degraded is None else [report.degraded]
     for alarm in report.alarms:
+        if alarm.kind is AlarmKind.CAMERA_LEFT_OUT and alarm.camera in reported:
+            continue
         if alarm.kind not in FRAME_ALARMS:  # `degraded` already contains this evidence
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     return "".join(f"\n  ! {part}" for part in parts)

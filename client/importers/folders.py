@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Literal
 
 from client.importers.calibration import Calibration, composed, listed, natural, stem
-from client.importers.pictures import READ
+from client.importers.pictures import READ, frame_folders, readable_entries
 from client.importers.video.reader import Video
 from client.importers.videos import ENDS
 from scas4d_core.captures import CaptureError, ImageError
-from scas4d_core.captures.images import picture_size
+from scas4d_core.captures.images import usual_size
 
 IMAGES = ("images", "hdImgs", "frames", ".")
 VIDEOS = ("videos", "hdVideos", ".")
@@ -21,6 +21,9 @@ NOT_CAMERAS = {*IMAGES, *VIDEOS, "masks", "sparse", "dense", "colmap", "calibrat
 """Folders in a capture that are not cameras or frames."""
 PANOPTIC = ("hd_", "vga_", "kinect_")
 """CMU Panoptic's videos are named after the type and the name of their camera."""
+
+COMPARED = 5
+"""Number of frame folders among which the one with the most images is compared with the cameras."""
 
 Kind = Literal["images", "frames", "videos"]
 
@@ -65,12 +68,13 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
             for path in sorted(root.iterdir() if root.is_dir() else (), key=lambda path: natural(path.name))
             if path.is_dir() and not path.name.startswith(".") and (own or path.name not in NOT_CAMERAS)
         }
-        pictured = [name for name, path in folders.items() if any(map(_is_picture, path.iterdir()))]
+        pictured = [name for name, path in folders.items() if any(map(_is_picture, readable_entries(path)))]
         if folders if own else pictured:
             yield PictureSource("images", root, {name: [folders[name]] for name in (folders if own else pictured)}, own)
         if pictured:
-            first = pictures_in(folders[pictured[0]])
-            yield PictureSource("frames", root, {composed(stem(path)): [path] for path in first}, own)
+            # An image of the first frame may be missing.
+            fullest = max((pictures_in(folders[name]) for name in pictured[:COMPARED]), key=len)
+            yield PictureSource("frames", root, {composed(stem(path)): [path] for path in fullest}, own)
     for place in VIDEOS:
         root = capture / place
         videos: dict[str, list[Path]] = {}
@@ -172,26 +176,29 @@ def size_of_pictures(capture: Path, camera: str, where: str) -> tuple[int, int]:
         if source.kind == "videos":
             with closing(Video(path)) as video:
                 return video.size
-        files = pictures_in(path) if source.kind == "images" else [path]
+        if source.kind == "images":
+            files = pictures_in(path)
+        else:
+            files = [file for of in frame_folders(source.root, {camera: name}).values() for file in of.values()]
         if files:
-            return image_size(files[0])
+            return image_size(files)
     for place in IMAGES:
         for path in pictures_in(capture / place):
             if composed(path.stem) == composed(camera):
-                return image_size(path)
+                return image_size([path])
     raise CaptureError(
         f"{where} has no image size, and {capture} contains no images or video of the camera to read it from; put them "
         f"in images/{camera}/ or videos/{camera}.mp4, or add the size to the file"
     )
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Returns (width, height) of an image file.
+def image_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Returns the usual (width, height) of the images of a camera.
 
     Raises:
-        CaptureError: if the file cannot be read.
+        CaptureError: if none of them can be read.
     """
     try:
-        return picture_size(path)
+        return usual_size(paths)[1]
     except ImageError as fault:
         raise CaptureError(str(fault)) from fault

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -145,14 +146,15 @@ def _imported(
     found, resized = fit_to_pictures(found, raw, size_mismatch)
     masks = folder / "masks"
     files = masks_of(masks, found) if use_masks and masks.is_dir() else {}
+    given: Sequence[Mapping[str, Path]] = list(files.values())
     if files and isinstance(raw, PictureFiles):
-        raw.check_same_frames(files)
+        given = raw.masks(files)
     elif files and len(files) != raw.frame_count:
         raise CaptureError(
             f"{masks} contains masks for {len(files)} of {raw.frame_count} frames; add one for every image, "
             "or use --no-masks"
         )
-    reader = ImportedPictures(found, raw, masks=list(files.values()), encoding=encoding)
+    reader = ImportedPictures(found, raw, masks=given, encoding=encoding)
     capture = Capture(
         folder.resolve().name,
         reader.rig,

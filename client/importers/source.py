@@ -46,19 +46,27 @@ class RawReader(Protocol):
 
     @property
     def sizes(self) -> Mapping[str, Size]:
-        """(width, height) of each camera's images, keyed by camera name."""
+        """(width, height) of the images of each camera that has a readable one, keyed by camera name."""
 
     def time(self, index: int) -> float | None:
         """Returns the frame's time in seconds, or None if unknown."""
 
     def path(self, camera: str) -> Path:
-        """Returns the first file of a camera, for messages."""
+        """Returns a file of a camera in `sizes`, for messages."""
 
     def file(self, index: int, camera: str) -> bytes | None:
-        """Returns an image as the contents of an 8-bit JPEG, PNG or WebP file, or None if it has to be encoded."""
+        """Returns an image as the contents of an 8-bit JPEG, PNG or WebP file, or None if it has to be encoded.
+
+        Raises:
+            ImageError: if the file is missing, cannot be decoded or has another size.
+        """
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Returns the decoded image [H, W, 3] of a camera and frame."""
+        """Returns the decoded image [H, W, 3] of a camera and frame.
+
+        Raises:
+            ImageError, CaptureError: if the image is missing or damaged.
+        """
 
 
 class ImportedPictures:
@@ -126,7 +134,8 @@ class ImportedPictures:
         The original is used if it is a JPEG, PNG or WebP file and the camera has no distortion. 16-bit images are
         converted to 8 bits.
         """
-        if self._undistorters[camera].lens.is_pinhole:
+        lens = self._undistorters[camera].lens
+        if lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
                 return file
@@ -150,7 +159,10 @@ def fit_to_pictures(
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:
-        size = raw.sizes[lens.name]
+        size = raw.sizes.get(lens.name)
+        if size is None:
+            cameras.append(lens)
+            continue
         k, remark = adapt_intrinsics(
             lens.intrinsics,
             (lens.width, lens.height),

@@ -12,6 +12,7 @@ import numpy as np
 from client.importers.calibration import Calibration
 from client.importers.source import Picture
 from client.importers.video.reader import Video
+from scas4d_core.cameras import minimum_cameras
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.images import mixed_colours
 
@@ -28,26 +29,36 @@ ALIKE = 0.05
 class Videos:
     """Reader for one video per camera, with a common frame rate and start time.
 
-    The shortest video determines the number of frames.
+    The capture ends when fewer than half of the cameras have another frame. A camera whose video cannot be read, or
+    ends before, has no image in the other frames.
+
+    Attributes:
+        sizes: (width, height) of the pictures of each readable video, keyed by camera name.
 
     Raises:
-        CaptureError: if the frame rates differ, or the frame times of two videos are more than half a frame apart.
+        CaptureError: if fewer than half of the videos can be read, the frame rates differ, or the frame times of two
+            videos are more than half a frame apart.
     """
 
     def __init__(self, calibration: Calibration, files: Mapping[str, Path]) -> None:
         # The first time, opening a video decodes it to make its index.
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="videos") as pool:
-            opened = pool.map(lambda camera: Video(files[camera]), calibration.names)
-            self._videos = dict(zip(calibration.names, opened, strict=True))
-        self.frame_count = min(len(video) for video in self._videos.values())
-        first = self._videos[calibration.names[0]]
+            opened = dict(
+                zip(calibration.names, pool.map(_open, (files[camera] for camera in calibration.names)), strict=True)
+            )
+        self._videos = {camera: video for camera, video in opened.items() if isinstance(video, Video)}
+        self._faults = {camera: fault for camera, fault in opened.items() if isinstance(fault, CaptureError)}
+        least = minimum_cameras(len(opened))
+        if len(self._videos) < least:
+            raise next(iter(self._faults.values()))
+        self.frame_count = sorted(map(len, self._videos.values()), reverse=True)[least - 1]
+        first = next(video for video in self._videos.values() if len(video) >= self.frame_count)
         self.fps: float | None = first.fps or None
         self._times = first.times
         for video in self._videos.values():
             self._check_together(video, first)
         self.remarks = [
-            f"{video.path.name} has {len(video) - self.frame_count} more frames than the shortest video; they are "
-            "ignored"
+            f"{video.path.name} has {len(video) - self.frame_count} more frames than most videos; they are ignored"
             for video in self._videos.values()
             if len(video) > self.frame_count
         ]
@@ -63,8 +74,8 @@ class Videos:
         """
         remarks = []
         for lens in calibration.cameras:
-            video = self._videos[lens.name]
-            if np.array_equal(video.turn, np.eye(2)):
+            video = self._videos.get(lens.name)
+            if video is None or np.array_equal(video.turn, np.eye(2)):
                 continue
             width, height = video.size
             if (width - height) * (lens.width - lens.height) < 0:
@@ -84,7 +95,7 @@ class Videos:
         return [f"{', '.join(names)}: {remark}" for remark, names in files.items()]
 
     def _check_together(self, video: Video, first: Video) -> None:
-        count = self.frame_count
+        count = min(len(video), len(first))
         if count > 1 and np.isclose(video.interval, first.interval, rtol=ALIKE):
             apart = np.abs(video.times[:count] - first.times[:count])
             late = int(np.argmax(apart > first.interval / 2))
@@ -106,7 +117,7 @@ class Videos:
         return float(self._times[index])
 
     def path(self, camera: str) -> Path:
-        """Returns the video file of a camera."""
+        """Returns the video file of a camera in `sizes`."""
         return self._videos[camera].path
 
     def file(self, index: int, camera: str) -> None:
@@ -114,5 +125,22 @@ class Videos:
         return None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Returns the decoded image [H, W, 3] of a camera and frame."""
-        return self._videos[camera].frame(index)
+        """Returns the decoded image [H, W, 3] of a camera and frame.
+
+        Raises:
+            CaptureError: if the video cannot be read, has ended, or the frame is damaged.
+        """
+        if camera in self._faults:
+            raise self._faults[camera]
+        video = self._videos[camera]
+        if index >= len(video):
+            raise CaptureError(f"{video.path} {video.end}")
+        return video.frame(index)
+
+
+def _open(path: Path) -> Video | CaptureError:
+    """Returns a video, or the reason why it cannot be read."""
+    try:
+        return Video(path)
+    except CaptureError as fault:
+        return fault

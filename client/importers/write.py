@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from scas4d_core.cameras import Camera
-from scas4d_core.captures import Capture, CaptureError
+from client.left_out import LeftOut
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.captures import Capture, CaptureError, ImageError
 
 OnProgress = Callable[[str, int, int], None]
 
@@ -26,23 +27,30 @@ def write_dynamic3dgs(
     *,
     frames: int | None = None,
     on_progress: OnProgress | None = None,
-) -> None:
+    on_message: Callable[[str], None] | None = None,
+) -> LeftOut:
     """Writes a capture in the Dynamic3DGaussians layout.
 
     Images are written to `ims/`, masks to `seg/`, points to `init_pt_cld.npz`, and cameras to `train_meta.json` and
-    `test_meta.json`. The camera files are written last, so an incomplete folder is not recognized as a capture.
+    `test_meta.json`. The camera files are written last, so an incomplete folder is not recognized as a capture. Images
+    that cannot be used are not written, and commands that read the folder go on without them.
 
     Args:
         source: capture to write; its test cameras are written to `test_meta.json`.
         out: output folder, new or empty.
         frames: number of frames; None for all.
         on_progress: callback that receives ("frames", done, total).
+        on_message: callback that receives a message for each image that cannot be used.
+
+    Returns:
+        A record of the images that cannot be used.
 
     Raises:
         CaptureError: if the folder is not empty, or the frames are not evenly spaced in time.
 
     >>> from client.importers.open_source import open_source
-    >>> write_dynamic3dgs(open_source(folder, test=("1",)), out, frames=2)
+    >>> write_dynamic3dgs(open_source(folder, test=("1",)), out, frames=2).images
+    0
     >>> sorted(path.name for path in out.iterdir())
     ['ims', 'init_pt_cld.npz', 'seg', 'test_meta.json', 'train_meta.json']
     """
@@ -54,16 +62,28 @@ def write_dynamic3dgs(
     ends: dict[tuple[str, int], str] = {}
     fps = _rate(source, count)
 
-    def write(index: int, name: str) -> None:
-        picture, mask = source.encoded_image(index, name), source.encoded_mask(index, name)
+    left_out = LeftOut(Rig(tuple(cameras)), minimum=1)
+
+    def write(index: int, name: str) -> str | None:
+        """Writes the files of a camera, or returns why they cannot be used."""
+        try:
+            picture, mask = source.encoded_image(index, name), source.encoded_mask(index, name)
+        except (ImageError, CaptureError) as fault:
+            ends[name, index] = ".png"  # there is no file
+            return str(fault)
         ends[name, index] = end = _end_of(picture)
         _put(out / "ims" / name / f"{index:06d}{end}", picture)
         if mask is not None:
             _put(out / "seg" / name / f"{index:06d}.png", mask)
+        return None
 
+    names = [camera.name for camera in cameras]
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for index in range(count):
-            list(pool.map(write, [index] * len(cameras), [camera.name for camera in cameras]))
+            faults = zip(names, pool.map(write, [index] * len(names), names), strict=True)
+            for message in left_out.record(index, {name: fault for name, fault in faults if fault is not None}):
+                if on_message is not None:
+                    on_message(message)
             if on_progress is not None:
                 on_progress("frames", index + 1, count)
     points = source.points
@@ -73,6 +93,7 @@ def write_dynamic3dgs(
     if held_out:
         _write_meta(out / "test_meta.json", held_out, count, ends, fps)
     _write_meta(out / "train_meta.json", source.full_rig.cameras, count, ends, fps)
+    return left_out
 
 
 def _rate(source: Capture, count: int) -> float:
@@ -123,4 +144,7 @@ def _end_of(picture: bytes) -> str:
 
 def _put(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    try:
+        path.write_bytes(data)
+    except OSError as fault:  # a full disk, for which Python does not name the file
+        raise OSError(fault.errno, fault.strerror, str(path)) from fault

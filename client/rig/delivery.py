@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
+from client.left_out import LeftOut
 from client.wire import SceneStatus
 
 
@@ -60,11 +61,13 @@ class Delivery:
     Attributes:
         scene: scene id.
         lateness: sending delays and waiting times.
-        lost: indices of frames that the rig lost and declared missing.
+        lost: indices of frames that the rig lost, or that have too few usable images, and that were declared missing.
+        left_out: record of the images that cannot be used.
         status: scene status after the last frame; None while the push is running.
     """
 
     scene: str
+    left_out: LeftOut
     lateness: Lateness = field(default_factory=Lateness)
     lost: list[int] = field(default_factory=list)
     status: SceneStatus | None = None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 from client.calls import NewFrame
-from client.errors import FrameGap, error_of_problem
+from client.errors import FrameGap, InvalidRequest, TooLarge, error_of_problem
 from client.ingest import IngestSocket
 from client.rig.delivery import Delivery
 from client.rig.pace import Pace
@@ -140,10 +140,20 @@ class Sender:
         return last
 
     def _send_batch(self, first: int, last: int) -> None:
-        frames = []
+        frames: list[NewFrame] = []
         for index in range(first, last + 1):
             files = self._sequence.files(index)
-            frames.append(NewFrame(index, files.images, files.masks, files.time))
+            if files.unusable:  # a batch contains only frames with the images of all cameras
+                self._send_frames(frames)
+                frames = []
+                self._send_files(index, files)
+            else:
+                frames.append(NewFrame(index, files.images, files.masks, files.time))
+        self._send_frames(frames)
+
+    def _send_frames(self, frames: list[NewFrame]) -> None:
+        if not frames:
+            return
         for frame, answer in zip(frames, self._way.batch(frames), strict=True):
             if answer.missing and answer.problem is not None:
                 self._delivery.lost.append(frame.index)
@@ -159,33 +169,55 @@ class Sender:
         return due
 
     def _send(self, index: int) -> None:
-        id = self._delivery.scene
-        if self._cameras is None:
-            if self._pace.drops(index):
-                self._lose(index)
-                return
-            files = self._sequence.files(index)
+        if self._cameras is None and self._pace.drops(index):
+            self._lose(index, "lost by the rig simulator")
+            self._on_message(f"frame {index}: lost by the rig, declared missing")
+            return
+        self._send_files(index, self._sequence.files(index))
+
+    def _send_files(self, index: int, files: EncodedFrame) -> None:
+        """Sends a frame without the images that cannot be used or are lost, or declares it missing."""
+        left_out = self._delivery.left_out
+        while not left_out.is_too_much(files.unusable):
+            try:
+                self._send_usable(index, files)
+                break
+            except (InvalidRequest, TooLarge) as refusal:
+                name = (refusal.problem.field or "").removeprefix("mask.")
+                if name not in files.images:
+                    raise
+                files = files.without(name, f"refused by the service: {refusal.problem.detail}")
+                if left_out.is_too_much(files.unusable):
+                    raise
+        else:
+            self._lose(index, "too few of its images can be used")
+        for message in left_out.record(index, files.unusable):
+            self._on_message(message)
+
+    def _send_usable(self, index: int, files: EncodedFrame) -> None:
+        if self._cameras is None and not files.unusable:
             self._way.frame(index, files)
             return
-        files = self._sequence.files(index)
-        sending = [name for name in files.images if not self._pace.drops(index, name)]
-        if not sending:
-            self._lose(index)
+        sending = [name for name in files.images if self._cameras is None or not self._pace.drops(index, name)]
+        if len(sending) < self._delivery.left_out.minimum:
+            self._lose(index, "lost by the rig simulator")
+            self._on_message(f"frame {index}: lost by the rig, declared missing")
             return
-        list(self._cameras.map(lambda name: self._send_camera(index, name, files), sending))
+        send = map if self._cameras is None else self._cameras.map
+        list(send(lambda name: self._send_camera(index, name, files), sending))
         if len(sending) < len(files.images):
-            self._client.close_frame(id, index)
             lost = ", ".join(name for name in files.images if name not in sending)
             self._on_message(f"frame {index}: the rig lost the images of {lost}; closed without them")
+        if len(sending) < len(self._sequence.source.full_rig):
+            self._client.close_frame(self._delivery.scene, index)
 
     def _send_camera(self, index: int, name: str, files: EncodedFrame) -> None:
         time.sleep(self._pace.delay(index, name))
         self._way.camera(index, name, files)
 
-    def _lose(self, index: int) -> None:
-        self._client.declare_missing(self._delivery.scene, index, reason="lost by the rig simulator")
+    def _lose(self, index: int, reason: str) -> None:
+        self._client.declare_missing(self._delivery.scene, index, reason=reason)
         self._delivery.lost.append(index)
-        self._on_message(f"frame {index}: lost by the rig, declared missing")
 
     def close(self) -> None:
         """Stops the threads."""

@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from scas4d_core.captures import Capture
+from client.left_out import LeftOut
+from scas4d_core.captures import Capture, CaptureError, ImageError
 
 FOREVER = 10**9
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """Encoded images and masks of a frame, keyed by camera name, with the frame time in seconds."""
+    """Encoded images and masks of a frame, keyed by camera name, with the frame time in seconds.
+
+    `unusable` has the reason for each camera whose image or mask cannot be used.
+    """
 
     time: float
     images: dict[str, bytes]
     masks: dict[str, bytes]
+    unusable: dict[str, str]
+
+    def without(self, camera: str, reason: str) -> EncodedFrame:
+        """Returns the frame without the image and mask of a camera."""
+        images, masks = (
+            {name: file for name, file in of.items() if name != camera} for of in (self.images, self.masks)
+        )
+        return replace(self, images=images, masks=masks, unusable={**self.unusable, camera: reason})
 
 
 def ping_pong(index: int, count: int) -> int:
@@ -65,21 +77,54 @@ class Sequence:
 
     def files(self, index: int) -> EncodedFrame:
         """Returns the files of a frame, and starts to read the next frame in the background."""
-        future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
-        files = future.result()
+        files = self.read_ahead(index)
         if index + 1 < len(self):
             self._ahead = index + 1, self._reader.submit(self._files, index + 1)
         return files
 
+    def read_ahead(self, index: int) -> EncodedFrame:
+        """Reads a frame and keeps it for the next call of `files`."""
+        if self._ahead is None or self._ahead[0] != index:
+            self._ahead = index, self._reader.submit(self._files, index)
+        return self._ahead[1].result()
+
+    def first_usable(self, left_out: LeftOut) -> int:
+        """Returns the index of the first frame with enough usable images, and keeps this frame for `files`.
+
+        Raises:
+            CaptureError: if there is no such frame. The message names an image and the reason.
+        """
+        reasons: dict[str, str] = {}
+        for index in range(self._last + 1):
+            unusable = self.read_ahead(index).unusable
+            if not left_out.is_too_much(unusable):
+                return index
+            reasons = reasons or unusable
+        camera, reason = next(iter(reasons.items()))
+        raise CaptureError(
+            f"{self.source.name} has no frame with usable images of {left_out.minimum} of {len(self.source.full_rig)} "
+            f"cameras; the first fault, of camera {camera}: {reason}"
+        )
+
     def _files(self, index: int) -> EncodedFrame:
         place, names = self.capture_index(index), self.source.full_rig.names
-        images = dict(
-            zip(names, self._pool.map(lambda name: self.source.encoded_image(place, name), names), strict=True)
-        )
-        files = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
-        masks = {name: mask for name, mask in files.items() if mask is not None}
+        images, masks, unusable = dict[str, bytes](), dict[str, bytes](), dict[str, str]()
+        for name, files in zip(names, self._pool.map(lambda name: self._camera_files(place, name), names), strict=True):
+            if isinstance(files, str):
+                unusable[name] = files
+                continue
+            images[name], mask = files
+            if mask is not None:
+                masks[name] = mask
         # The service accepts masks for all cameras or for none.
-        return EncodedFrame(self.time(index), images, masks if len(masks) == len(images) else {})
+        return EncodedFrame(self.time(index), images, masks if len(masks) == len(images) else {}, unusable)
+
+    def _camera_files(self, place: int, name: str) -> tuple[bytes, bytes | None] | str:
+        """Returns a camera's image and mask, or the reason why they cannot be used."""
+        try:
+            return self.source.encoded_image(place, name), self.source.encoded_mask(place, name)
+        except (ImageError, CaptureError) as fault:
+            return str(fault)
 
     def close(self) -> None:
         """Stops the threads."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
+from client.errors import ServiceError, ServiceUnreachable
+from client.left_out import LeftOut
 from client.retries import Retry
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace
@@ -44,7 +46,10 @@ def push(
 ) -> Delivery:
     """Creates a scene, sends its point cloud and all frames at the given pace, and waits until the last is finished.
 
-    The rig's clock starts when frame 0 is finished. Service restarts are tolerated within the client's outage
+    Cameras whose image cannot be used are left out, and so are frames with fewer usable images than the scene requires.
+    A scene that was created here is deleted if an error occurs before its first frame is accepted.
+
+    The rig's clock starts when the first frame is finished. Service restarts are tolerated within the client's outage
     timeout. Sending then continues with the frame that the service expects.
 
     Args:
@@ -74,6 +79,7 @@ def push(
 
     Raises:
         ValueError: `batch` is invalid.
+        CaptureError: no frame of the capture has enough usable images.
         ServiceError, ServiceUnreachable: a request failed.
         RuntimeError: the scene failed, or its cameras differ from the capture's.
 
@@ -92,6 +98,8 @@ def push(
         stack.callback(sequence.close)
         count = min(frames or len(sequence), len(sequence))
         if scene is None:
+            left_out = LeftOut(source.full_rig, None if ingest is None else ingest.minimum_cameras)
+            sequence.first_usable(left_out)  # before the scene is created
             status = client.create_scene(
                 source.full_rig,
                 name=escaped(source.name)[:MAX_NAME] if name is None else name,
@@ -101,22 +109,26 @@ def push(
                 ingest=ingest,
                 nodes=nodes,
             )
+            stack.push(_DeleteIfEmpty(client, status.id, on_message))
             if source.points is not None and start == 0:
                 client.put_points(status.id, source.points)
         else:
             status = client.scene(scene)
             _check_cameras(status, source)
+            left_out = LeftOut(source.full_rig, status.ingest.minimum_cameras)
             on_message(f"scene {scene} continues with frame {status.next_frame}")
-        delivery = Delivery(status.id)
+        delivery = Delivery(status.id, left_out)
         way = Sockets(client, status.id) if websocket else Requests(client, status.id)
         stack.callback(way.close)
         sender = Sender(client, way, sequence, pace or Pace(), delivery, on_message, per_camera, batch)
         stack.callback(sender.close)
         stack.enter_context(_record_retries(client, delivery.lateness, on_message))
+        is_first = status.next_frame == 0
         try:
             for index in sender.send_all(status.next_frame, count):
-                if index == 0:
-                    _follow(client, status.id, 0, count, on_progress)
+                if is_first and index not in delivery.lost:
+                    is_first = False
+                    _follow(client, status.id, index, count, on_progress)
                     sender.start_clock()
                 else:
                     on_progress("frames", _finished(client.scene(status.id)), count)
@@ -125,6 +137,8 @@ def push(
             last = next((index for index in reversed(range(count)) if index not in delivery.lost), 0)
             _follow(client, status.id, last, count, on_progress)
         except KeyboardInterrupt:  # how users stop an endless loop
+            if is_first and scene is None:
+                raise
             on_message("interrupted")
             delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
         delivery.status = client.scene(status.id)
@@ -164,6 +178,29 @@ class _record_retries:
             self._before(retry)
 
 
+class _DeleteIfEmpty:
+    """Context manager that deletes a new scene after an error if no frame of it has been accepted."""
+
+    def __init__(self, client: Client, scene: str, on_message: OnMessage) -> None:
+        self._client = client
+        self._scene = scene
+        self._on_message = on_message
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            return
+        if not issubclass(kind, ServiceUnreachable):  # which has been retried long enough
+            with suppress(ServiceError, ServiceUnreachable):
+                status = self._client.scene(self._scene)
+                if status.next_frame == status.missing:
+                    self._client.delete_scene(self._scene)
+                return
+        self._on_message(f"scene {self._scene} may be empty; if so: scas4d scenes delete {self._scene}")
+
+
 def _check_cameras(status: SceneStatus, source: Capture) -> None:
     if set(status.cameras) != set(source.full_rig.names):
         raise RuntimeError(
@@ -179,7 +216,7 @@ def _follow(client: Client, id: str, index: int, count: int, on_progress: OnProg
             raise RuntimeError(f"scene {id} failed: {status.error}")
         if status.progress is not None:
             on_progress(status.progress.stage, status.progress.done, status.progress.total)
-        elif index == 0 and not _finished(status):
+        elif status.queued and not status.committed:
             waits = f"starting the scene: {status.error}" if status.error else "starting the scene"
             on_progress(waits, 0, 1)
         else:

@@ -13,6 +13,7 @@ from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.ground_truth import GroundTruth
 from scas4d_core.captures.images import resize_area, resize_mask, scaled_size
+from scas4d_core.captures.picture_file import ImageError
 from scas4d_core.captures.reader import PictureReader
 
 
@@ -113,6 +114,29 @@ class Capture:
         """
         return self._frame(index, self.full_rig)
 
+    def usable_frame(self, index: int) -> tuple[Frame, dict[str, str]]:
+        """Returns one frame with the training cameras whose image and mask can be used.
+
+        Returns:
+            The frame with decoded images and masks, and the reason for each camera that was left
+            out, keyed by camera name. The reason names the file.
+
+        Raises:
+            IndexError: if the frame does not exist.
+        """
+        frame = self.frame(index)
+        images, masks, left_out = {}, {}, {}
+        for name in frame.images:
+            try:
+                image = frame.images[name]
+                if name in frame.masks:
+                    masks[name] = frame.masks[name]
+            except (ImageError, CaptureError) as fault:
+                left_out[name] = str(fault)
+            else:
+                images[name] = image
+        return replace(frame, images=images, masks=masks), left_out
+
     def test_frame(self, index: int) -> Frame:
         """Returns the test images of one frame, and their masks if available.
 
@@ -135,7 +159,7 @@ class Capture:
         Raises:
             IndexError: if the frame does not exist.
             KeyError: if the camera does not exist.
-            CaptureError: if the file cannot be read.
+            ImageError, CaptureError: if the file is missing, or is not an image of the camera's size.
         """
         self._check(index)
         return self.pictures.encoded_image(index, camera)
@@ -147,7 +171,7 @@ class Capture:
 
         Raises:
             IndexError: if the frame does not exist.
-            CaptureError: if the file cannot be read.
+            ImageError, CaptureError: if the file is missing, or is not a mask of the camera's size.
         """
         self._check(index)
         return self.pictures.encoded_mask(index, camera)

@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.cameras import CAMERA_NAME, Camera, CameraError, Rig
+from scas4d_core.cameras import CAMERA_NAME, Camera, CameraError, Rig, minimum_cameras
 from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.files import CaptureError, read_json, read_npz
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.captures.ground_truth import read_extent, read_ground_truth
-from scas4d_core.captures.images import describe_pictures, picture_size, scaled_size
+from scas4d_core.captures.images import describe_pictures, scaled_size, usual_size
 from scas4d_core.captures.picture_file import ImageError
 from scas4d_core.captures.reader import FileReader, Files
 from scas4d_core.captures.size_mismatch import SizeMismatch, adapt_intrinsics
@@ -92,7 +92,8 @@ def read_dynamic3dgs(
         masks = [_masks(folder, one, required=one is train) for one in given]
     images = _merge_files([one.images for one in given])
     try:
-        depth, described = describe_pictures(images, bit_depth)
+        usual = {name: file for one in given for name, file in one.usual.items()}
+        depth, described = describe_pictures(usual, images, bit_depth)
     except ImageError as fault:
         raise CaptureError(str(fault)) from fault
     return Capture(
@@ -120,6 +121,7 @@ class _Cameras:
     images: tuple[Files, ...]
     relative: tuple[dict[str, PurePosixPath], ...]
     fps: Any
+    usual: Files
     remarks: list[str]
 
 
@@ -139,25 +141,32 @@ def _read_cameras(folder: Path, file: str, size_mismatch: SizeMismatch | None) -
         raise CaptureError(f"{path}: {fault}") from fault
     relative = _relative_paths(path, meta["fn"], len(meta["cam_id"]), names)
     images = tuple({name: folder / "ims" / file for name, file in frame.items()} for frame in relative)
-    for frame in images:
-        absent = next((file for file in frame.values() if not file.is_file()), None)
-        if absent:
-            raise CaptureError(f"{absent}: no such file (listed in {file})")
-    fitted = [_adapt_camera(camera, images[0][camera.name], size_mismatch) for camera in rig.cameras]
-    remarks = [remark for _, remark in fitted if remark is not None]
-    return _Cameras(Rig(tuple(camera for camera, _ in fitted)), images, relative, meta.get("fps", 30.0), remarks)
-
-
-def _adapt_camera(camera: Camera, picture: Path, size_mismatch: SizeMismatch | None) -> tuple[Camera, str | None]:
-    try:
-        size = picture_size(picture)
-    except ImageError as fault:
-        raise CaptureError(str(fault)) from fault
-    calibrated = (camera.width, camera.height)
-    k, remark = adapt_intrinsics(
-        camera.intrinsics, calibrated, size, camera=camera.name, where=str(picture), size_mismatch=size_mismatch
-    )
-    return replace(camera, intrinsics=k, width=size[0], height=size[1]), remark
+    least = minimum_cameras(len(names))
+    if all(sum(file.is_file() for file in frame.values()) < least for frame in images):
+        absent = next(file for file in images[0].values() if not file.is_file())
+        raise CaptureError(f"{absent}: no such file (listed in {file})")
+    cameras, usual, remarks, faults = [], dict[str, Path](), [], []
+    for camera in rig.cameras:
+        calibrated = (camera.width, camera.height)
+        try:
+            usual[camera.name], size = usual_size((of[camera.name] for of in images), calibrated)
+        except ImageError as error:  # the camera is left out of every frame
+            faults.append(error)
+            cameras.append(camera)
+            continue
+        k, remark = adapt_intrinsics(
+            camera.intrinsics,
+            calibrated,
+            size,
+            camera=camera.name,
+            where=str(usual[camera.name]),
+            size_mismatch=size_mismatch,
+        )
+        cameras.append(replace(camera, intrinsics=k, width=size[0], height=size[1]))
+        remarks += [] if remark is None else [remark]
+    if len(usual) < least:
+        raise CaptureError(str(faults[0])) from faults[0]
+    return _Cameras(Rig(tuple(cameras)), images, relative, meta.get("fps", 30.0), usual, remarks)
 
 
 def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
@@ -232,12 +241,13 @@ def _relative_paths(path: Path, fn: Any, frames: int, names: list[str]) -> tuple
 
 def _masks(folder: Path, cameras: _Cameras, *, required: bool) -> tuple[Files, ...]:
     frames = []
-    for relative in cameras.relative:
+    for relative, images in zip(cameras.relative, cameras.images, strict=True):
         files = {name: folder / "seg" / file.with_suffix(".png") for name, file in relative.items()}
         absent = [name for name, file in files.items() if not file.is_file()]
-        if absent and required:
+        without = [name for name in absent if images[name].is_file()]
+        if without and required:
             raise CaptureError(
-                f"{files[absent[0]]}: no mask for camera {absent[0]}; provide masks for all training cameras and "
+                f"{files[without[0]]}: no mask for camera {without[0]}; provide masks for all training cameras and "
                 "frames, or ignore all masks (use_masks=False)"
             )
         frames.append({name: file for name, file in files.items() if name not in absent})

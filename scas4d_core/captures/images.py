@@ -24,7 +24,8 @@ A mask is 1 where the stored value of any channel is nonzero. Masks with alpha o
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -43,6 +44,8 @@ MASK_FORMATS = ("PNG", "BMP")
 EXIF_ORIENTATION = 0x0112
 SAMPLED_FRAMES = 8
 """Number of frames, evenly spaced over the capture, whose values determine the bit depth."""
+SIZES = 5
+"""Number of images to compare if the first one does not have the calibrated size."""
 
 Size = tuple[int, int]
 Source = bytes | memoryview | Path
@@ -199,6 +202,38 @@ def picture_size(path: Path) -> Size:
         return picture.size
 
 
+def usual_size(paths: Iterable[Path], calibrated: Size | None = None) -> tuple[Path, Size]:
+    """Returns the first image of a camera that has the camera's usual size, and this size.
+
+    The usual size is the calibrated size if one of the first images has it, or else the most common size among them.
+    Images that cannot be read are ignored. The pixels are not decoded.
+
+    Args:
+        paths: images of a camera.
+        calibrated: (width, height) for which the camera was calibrated, or None if unknown.
+
+    Raises:
+        ImageError: if no image can be read.
+    """
+    sizes: dict[Path, Size] = {}
+    fault = ImageError("there is no image")
+    for number, path in enumerate(paths):
+        try:
+            size = picture_size(path)
+        except ImageError as error:
+            fault = error if number == 0 else fault
+            continue
+        if size == calibrated:
+            return path, size
+        sizes[path] = size
+        if len(sizes) == SIZES:
+            break
+    if not sizes:
+        raise fault
+    common = Counter(sizes.values()).most_common(1)[0][0]
+    return next(path for path, size in sizes.items() if size == common), common
+
+
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     """Resizes an image [H, W, C] to (width, height) by area averaging.
 
@@ -228,16 +263,17 @@ def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     return resized
 
 
-def eight_bit_file(data: bytes, name: str = "picture", bit_depth: int | None = None) -> bytes:
+def eight_bit_file(data: bytes, size: Size | None = None, name: str = "picture", bit_depth: int | None = None) -> bytes:
     """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG file.
 
     Args:
         data: contents of the file.
+        size: required (width, height); not checked if None.
         name: name of the image in error messages.
         bit_depth: see `decode_image`.
 
     Raises:
-        ImageError: if the image must be re-encoded but cannot be decoded.
+        ImageError: if the image cannot be decoded, or has another size.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
@@ -246,32 +282,34 @@ def eight_bit_file(data: bytes, name: str = "picture", bit_depth: int | None = N
     """
     sent = data.startswith((b"\xff\xd8", b"\x89PNG")) or data[8:12] == b"WEBP"
     if sent and not is_sixteen_bit(data):
+        check_image(data, size=size, name=name)
         return data
     file = io.BytesIO()
-    Image.fromarray(decode_image(data, bit_depth=bit_depth, name=name)).save(file, "PNG", compress_level=1)
+    Image.fromarray(decode_image(data, size=size, bit_depth=bit_depth, name=name)).save(file, "PNG", compress_level=1)
     return file.getvalue()
 
 
 def describe_pictures(
-    frames: Sequence[Mapping[str, Path]], bit_depth: int | None = None
+    first: Mapping[str, Path], frames: Sequence[Mapping[str, Path]], bit_depth: int | None = None
 ) -> tuple[int | None, list[str]]:
     """Returns the bit depth of a capture's 16-bit images, and remarks for the user on its images.
 
     The remarks concern 16-bit images, files with several images, and greyscale cameras in a colour rig. They are based
-    on the headers of the first frame's files. Of 16-bit cameras, the images of several frames are decoded.
+    on the header of one file of each camera. Of 16-bit cameras, the images of several frames are decoded.
 
     Args:
-        frames: the image files of each frame, keyed by camera name.
+        first: a readable image file of each camera.
+        frames: the image files of each frame, keyed by camera name. Missing files are absent.
         bit_depth: number of bits that the values of 16-bit images use; None to find it (`find_bit_depth`).
 
     Returns:
         The bit depth, or None if there are no 16-bit images, and the remarks.
 
     Raises:
-        ImageError: if an image of the first frame cannot be read, or is rotated.
+        ImageError: if an image in ``first`` cannot be read, or is rotated.
     """
     grey, several, deep = {}, [], []
-    for camera, path in frames[0].items():
+    for camera, path in first.items():
         with _errors_of(str(path)), _open(path) as picture:
             grey[camera] = picture.mode in ("1", "L", "LA", "I;16")
             _check_orientation(picture)
@@ -286,7 +324,7 @@ def describe_pictures(
     depth = bit_depth
     if depth is None:
         sampled = frames[:: -(-len(frames) // SAMPLED_FRAMES)]
-        depth = find_bit_depth(frame[camera] for frame in sampled for camera in deep)
+        depth = find_bit_depth(frame[camera] for frame in sampled for camera in deep if camera in frame)
     remarks.append(
         f"{_listed(deep)}: 16-bit images are converted to 8 bits from a bit depth of {depth}"
         + ("" if bit_depth else ", which was found from their values; if it is wrong, set --bit-depth")

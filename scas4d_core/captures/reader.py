@@ -40,25 +40,34 @@ class PictureReader(Protocol):
         """Returns a decoded image, [H, W, 3] sRGB values.
 
         Raises:
-            ImageError: if the image cannot be decoded, or its size differs from that of its camera.
+            ImageError, CaptureError: if the image is missing, cannot be decoded, or its size differs
+                from that of its camera.
         """
 
     def has_mask(self, index: int, camera: str) -> bool:
         """Returns whether an image has a mask."""
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Returns a decoded mask, [H, W], 1 on the foreground."""
+        """Returns a decoded mask, [H, W], 1 on the foreground.
+
+        Raises:
+            ImageError: if the mask cannot be decoded, or its size differs from that of its camera.
+        """
 
     def encoded_image(self, index: int, camera: str) -> bytes:
         """Returns an image as the bytes of an 8-bit file: JPEG, PNG or WebP.
 
         Raises:
             KeyError: if the camera does not exist.
-            CaptureError: if the file cannot be read.
+            ImageError, CaptureError: as for `image`.
         """
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Returns a mask as the bytes of a PNG or BMP file, or None if the image has no mask."""
+        """Returns a mask as the bytes of a PNG or BMP file, or None if the image has no mask.
+
+        Raises:
+            ImageError, CaptureError: as for `mask`.
+        """
 
 
 class FileReader:
@@ -102,11 +111,16 @@ class FileReader:
     def encoded_image(self, index: int, camera: str) -> bytes:
         """Returns an 8-bit JPEG, PNG or WebP file unchanged, and any other image as an 8-bit PNG."""
         path = self.images[index][camera]
-        return eight_bit_file(read_bytes(path), str(path), self._bit_depth)
+        return eight_bit_file(read_bytes(path), self._sizes[camera], str(path), self._bit_depth)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
         """Returns the unchanged mask file, or None if the image has no mask file."""
-        return read_bytes(self.masks[index][camera]) if self.has_mask(index, camera) else None
+        if not self.has_mask(index, camera):
+            return None
+        path = self.masks[index][camera]
+        data = read_bytes(path)
+        decode_mask(data, size=self._sizes[camera], name=str(path))  # raises an error if the file is damaged
+        return data
 
 
 def read_bytes(path: Path) -> bytes:

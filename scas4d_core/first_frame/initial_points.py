@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import InitialPoints
+from scas4d_core.first_frame.image_warnings import image_warnings
 from scas4d_core.first_frame.points.agreement import PointSearch, find_agreeing_points
 from scas4d_core.first_frame.points.merging import SPACING
 from scas4d_core.first_frame.points.plane import plane_points
@@ -150,7 +151,11 @@ def initial_points(
     distances = stage_distances(before, known, rig.radius)
     confirmed = 0.0 if points is None else points.coverage
     if points is None or confirmed <= LITTLE_COVERAGE:
-        points = merge_points(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
+        try:
+            volume = shared_volume(before, distances, seed)
+        except InitialPointsError as error:  # what the images show precedes what may follow from it
+            raise InitialPointsError("; ".join([*image_warnings(images, masks), str(error)])) from error
+        points = merge_points(points, volume, "volume", before, 4 * spacing)
     # A plain backdrop needs no points, because it is rendered as the background colour.
     if before is views and not first.backdrop:
         points = merge_points(points, surroundings(before, distances), "surroundings", before, 0.0)

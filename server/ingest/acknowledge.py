@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from client.wire import FrameHead, FrameReceipt, FrameState, SceneCreate, SceneState
-from scas4d_core.cameras import Rig
+from scas4d_core.cameras import Rig, minimum_cameras
 from scas4d_core.frame_times import ROWS, time_warnings
 from server import counters
 from server.hub import Publisher
@@ -72,13 +72,12 @@ class IngestRules:
     def of(cls, request: SceneCreate, settings: ServerSettings) -> IngestRules:
         """Returns the rules in a request to create a scene, with missing values taken from the service's settings."""
         rig, ingest = request.rig.rig(), request.ingest
-        least = ingest.minimum_cameras
         return cls(
             rig,
             request.frames_per_second,
             queue_frames=ingest.queue_frames or settings.queue_frames,
             when_full=ingest.when_full,
-            minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
+            minimum_cameras=minimum_cameras(len(rig), ingest.minimum_cameras),
             open_frame_seconds=ingest.open_frame_seconds,
         )
 

@@ -14,9 +14,9 @@ COUNT = 24
 BUMPED_FROM = 5
 """Frame from which the reports say that camera c2 was bumped."""
 OFF = tuple(
-    f"the calibration of camera 'c{number}' seems to be inaccurate: its matching features are {number + 3}.4 px from "
-    "their epipolar lines (median of 212), compared with 0.6 px for the rig; set static.refine_calibration to refine "
-    "it using the images of frame 0"
+    f"matching features of camera 'c{number}' are {number + 3}.4 px from their epipolar lines (median of 212), "
+    "compared with 0.6 px for the rig: the calibration may be inaccurate, or images may belong to another camera or "
+    "time; set static.refine_calibration to refine the calibration using the images of frame 0"
     for number in range(4)
 )
 """Warnings of a frame 0 that is a guess (``fakes.GUESSED``), beside the one that says so."""

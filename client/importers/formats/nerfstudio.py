@@ -96,7 +96,7 @@ def read_transforms(paths: Sequence[Path], capture: Path) -> Calibration:
                 unposed.append(view)
         if path == paths[0]:
             training = [*(view.path for view in views.values()), *unposed]
-        if fps is None and "fps" in file.meta:
+        if fps is None and file.meta.get("fps") is not None:
             fps = positive(str(path), file.meta, "fps")
     read = calibration(paths[0], list(views.values()), fps=fps, unposed=unposed, training=training)
     remarks = [f"read {', '.join(path.name for path in paths)}"] if len(paths) > 1 else []
@@ -162,7 +162,7 @@ def _size(file: _File, where: str, given: Mapping[str, Any], path: PurePosixPath
         return whole(where, given, "w"), whole(where, given, "h")
     picture = find_picture(file.capture, file.path, str(path))
     if picture is not None:
-        return image_size(picture)
+        return image_size([picture])
     try:
         return size_of_pictures(file.capture, path.parent.name, where)
     except CaptureError:

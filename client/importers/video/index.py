@@ -11,10 +11,11 @@ import hashlib
 import io
 import os
 import zlib
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from client.importers.extras import pyav
 from client.importers.video.stream import VideoStream
 from scas4d_core.captures import CaptureError
 
-VERSION = 1
+VERSION = 2
 """Version of the cached files. Files of other versions are not found, because their names differ."""
 NO_STAMP = np.iinfo(np.int64).min
 """Timestamp of frames that have none."""
@@ -35,6 +36,8 @@ FIXED_POINT = 1 << 16
 @dataclass(frozen=True, eq=False)
 class VideoIndex:
     """Visible frames of a video, in the order in which decoding from the start returns them.
+
+    The index ends before the first frame that is lost, because the decoder does not tell how many are lost.
 
     Attributes:
         stamps: [T] int64 timestamps in units of the stream's time base; `NO_STAMP` if a frame has none.
@@ -49,6 +52,7 @@ class VideoIndex:
         spaced: whether `seconds` are computed from `rate`, because the timestamps do not increase.
         interlaced: whether any frame is interlaced.
         transfer: transfer characteristics, as numbered by ITU-T H.273.
+        lost: whether a frame after the last one is lost, and the video goes on after it.
         turn: [2, 2] int8 matrix that the metadata apply to pixel positions (x, y); the identity if there is none.
     """
 
@@ -64,6 +68,7 @@ class VideoIndex:
     spaced: bool
     interlaced: bool
     transfer: int
+    lost: bool
     turn: NDArray[np.int8]
 
     def __len__(self) -> int:
@@ -74,8 +79,8 @@ def video_index(path: Path) -> VideoIndex:
     """Returns the index of a video from the cache. If the cache does not contain it, decodes the video and adds it.
 
     Raises:
-        CaptureError: if the file cannot be read, has no frames, is damaged between two frames, changes its size, or is
-            turned by an angle other than a multiple of 90°.
+        CaptureError: if the file cannot be read, has no frames, changes its size, or is turned by an angle other than a
+            multiple of 90°.
         MissingExtraError: if PyAV is not installed.
     """
     cached = _cached_file(path)
@@ -93,8 +98,12 @@ def video_index(path: Path) -> VideoIndex:
 
 
 def cache_folder() -> Path:
-    """Returns the folder of the cached indices: scas4d/videos in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scas4d" / "videos"
+    """Returns the folder of the cached indices: scas4d/videos in the user's cache folder, or the temporary folder."""
+    given = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return Path(given or Path.home() / ".cache") / "scas4d" / "videos"
+    except RuntimeError:  # a user without a home folder, as in some containers
+        return Path(gettempdir()) / "scas4d" / "videos"
 
 
 def _cached_file(path: Path) -> Path:
@@ -121,7 +130,7 @@ def _decoded_index(path: Path) -> VideoIndex:
     first: Any = None
     interlaced = False
     try:
-        for frame in video.frames():
+        for frame in _readable(video.frames()):
             if frame is None:
                 failures.append(len(stamps))
                 continue
@@ -139,27 +148,42 @@ def _decoded_index(path: Path) -> VideoIndex:
         if not stamps:
             raise CaptureError(f"{path} has no frames that can be decoded")
         # Recordings often begin or end within a frame. Between two frames, a packet that fails is a lost frame.
-        lost = [place for place in failures if 0 < place < len(stamps)]
-        if lost:
-            raise CaptureError(f"{path}: frame {lost[0]} cannot be decoded; repair the video, or cut it there")
-        seconds, spaced, rate = _times(np.array(stamps, np.int64), video.stream)
+        count = next((place for place in failures if 0 < place < len(stamps)), len(stamps))
+        seconds, spaced, rate = _times(np.array(stamps[:count], np.int64), video.stream)
         return VideoIndex(
-            stamps=np.array(stamps, np.int64),
+            stamps=np.array(stamps[:count], np.int64),
             seconds=seconds,
             rate=rate,
-            checksums=np.array(checksums, np.uint32),
-            keys=np.array(keys),
-            damaged=np.array(damaged),
+            checksums=np.array(checksums[:count], np.uint32),
+            keys=np.array(keys[:count]),
+            damaged=np.array(damaged[:count]),
             width=first.width,
             height=first.height,
             grey=first.format.name.startswith("gray"),
             spaced=spaced,
             interlaced=interlaced,
             transfer=int(video.stream.codec_context.color_trc),
+            lost=count < len(stamps),
             turn=_turn(first, path),
         )
     finally:
         video.close()
+
+
+def _readable(frames: Iterator[Any]) -> Iterator[Any]:
+    """Yields the frames up to an error in the file, as if the file ended there.
+
+    Raises:
+        CaptureError: if there is no frame before the error.
+    """
+    some = False
+    try:
+        for frame in frames:
+            yield frame
+            some = some or frame is not None
+    except CaptureError:
+        if not some:
+            raise
 
 
 def _times(stamps: NDArray[np.int64], stream: Any) -> tuple[NDArray[np.float64], bool, float]:

@@ -43,8 +43,8 @@ def conversion_remarks(index: VideoIndex) -> list[str]:
     if index.damaged.any():
         first = int(np.argmax(index.damaged))
         remarks.append(
-            f"{int(index.damaged.sum())} damaged frames, first frame {first} at {index.seconds[first]:.3f} s; reading "
-            "them is an error"
+            f"{int(index.damaged.sum())} damaged frames, first frame {first} at {index.seconds[first]:.3f} s; they are "
+            "left out"
         )
     if index.spaced:
         remarks.append(f"video without increasing timestamps: its frames are spaced evenly, {index.rate:g} per second")

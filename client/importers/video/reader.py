@@ -76,6 +76,13 @@ class Video:
         return int(width), int(height)
 
     @property
+    def end(self) -> str:
+        """What follows the last frame, for messages that start with the path."""
+        if self._index.lost:
+            return f"is not used from frame {len(self)} on, which cannot be decoded"
+        return f"ends after {len(self)} frames"
+
+    @property
     def interval(self) -> float:
         """Median interval between consecutive frames in seconds, which dropped frames do not affect."""
         return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0

@@ -53,12 +53,25 @@ class Matches:
             at least 1.
         pixels: [K, 2] feature positions of each camera.
         pairs: maps each pair of camera indices to the [M, 2] indices of their matching features.
+        descriptors: [K, 128] descriptors of the features of each camera; empty if unknown.
     """
 
     cameras: tuple[Camera, ...]
     scale: Float
     pixels: list[Float]
     pairs: dict[Pair, NDArray[np.intp]]
+    descriptors: Sequence[NDArray[np.float32]] = ()
+
+    def with_exchanged_images(self, a: int, b: int) -> Matches:
+        """Returns the matches after exchanging the images of two cameras, which must have the same size."""
+        pixels, descriptors = list(self.pixels), list(self.descriptors)
+        pixels[a], pixels[b] = pixels[b], pixels[a]
+        descriptors[a], descriptors[b] = descriptors[b], descriptors[a]
+        again = {
+            pair: _mutual_matches(descriptors[pair[0]], descriptors[pair[1]]) if {a, b} & {*pair} else rows
+            for pair, rows in self.pairs.items()
+        }
+        return replace(self, pixels=pixels, descriptors=descriptors, pairs=again)
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Matches:
         """Returns the same matches for a different calibration with the same image sizes."""
@@ -109,7 +122,8 @@ def match_by_appearance(views: Sequence[PosedPicture]) -> Matches:
         for a, b in neighbour_pairs(Rig(tuple(view.camera for view in small)))
     }
     scale = np.array([view.camera.width / less.camera.width for view, less in zip(views, small, strict=True)])
-    return Matches(tuple(view.camera for view in small), scale, [uv for uv, _ in feature_sets], pairs)
+    pixels, descriptors = map(list, zip(*feature_sets, strict=True))
+    return Matches(tuple(view.camera for view in small), scale, pixels, pairs, descriptors)
 
 
 def _downscale(view: PosedPicture) -> PosedPicture:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from scas4d_core.first_frame.calibration.bundle import NOISE, build_tracks, bund
 from scas4d_core.first_frame.calibration.matches import Matches, epipolar_distances, match_by_appearance
 from scas4d_core.first_frame.calibration.report import CalibrationReport, CameraResidual, RefinedCamera, Refinement
 from scas4d_core.first_frame.calibration.residuals import MAX_RESIDUAL, MIN_INLIERS, NEAR, measure_residuals
+from scas4d_core.first_frame.image_warnings import image_warnings
 from scas4d_core.posed_pictures import Float, InitialPointsError, collect_views
 from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
@@ -23,6 +25,8 @@ MIN_CAMERAS = 3
 """Minimum number of cameras for a refinement. With only two cameras, either camera could be off."""
 STANDARD_ERRORS = 2.0
 """Number of standard errors by which a refinement must reduce the loss of held-out matches."""
+MAX_EXCHANGED = 6
+"""Maximum number of cameras among which exchanged images are searched for."""
 MIN_HELD_OUT = 20
 """Minimum number of held-out matches for a meaningful standard error."""
 
@@ -46,6 +50,9 @@ def calibrate_first_frame(
         return None
     on_progress(Progress("calibration", 0, 1))
     calibration = check_calibration(rig, frame.images, refine=settings.refine_calibration)
+    if calibration is not None:
+        seen = image_warnings(frame.images, frame.masks)
+        calibration = replace(calibration, warnings=[*seen, *calibration.warnings])
     on_progress(Progress("calibration", 1, 1))
     return calibration
 
@@ -91,20 +98,43 @@ def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], 
     if not known:
         return []
     usual = float(np.median(list(known.values())))
-    remedy = "set static.refine_calibration to refine it using the images of frame 0"
+    causes = (
+        "the calibration may be inaccurate, or images may belong to another camera or time; set "
+        "static.refine_calibration to refine the calibration using the images of frame 0"
+    )
     inside = [known[camera.name] / scale for camera, scale in zip(matches.cameras, matches.scale, strict=True)
               if camera.name in known]  # fmt: skip
     if float(np.median(inside)) > MAX_RESIDUAL:
         return [
-            f"the calibration seems to be inaccurate: matching features are {usual:.1f} px from their epipolar lines "
-            f"(median over {len(known)} cameras); {remedy}"
+            f"matching features are {usual:.1f} px from their epipolar lines (median over {len(known)} cameras): "
+            f"{causes}"
         ]
+    exchanged = _exchanged(matches, [name for name in cameras if name not in known or name in off])
     return [
-        f"the calibration of camera {name!r} seems to be inaccurate: its matching features are {known[name]:.1f} px "
-        f"from their epipolar lines (median of {cameras[name].matches}), compared with {usual:.1f} px for the rig; "
-        f"{remedy}"
+        f"the images of cameras {one!r} and {other!r} seem to be exchanged: their features agree with those of the "
+        "other cameras only if they are exchanged"
+        for one, other in exchanged
+    ] + [
+        f"matching features of camera {name!r} are {cameras[name].pixels:.1f} px from their epipolar lines (median of "
+        f"{cameras[name].matches}), compared with {usual:.1f} px for the rig: {causes}"
         for name in off
+        if not any(name in pair for pair in exchanged)
     ]
+
+
+def _exchanged(matches: Matches, suspects: Sequence[str]) -> list[tuple[str, str]]:
+    """Returns the pairs of suspects whose features agree with the other cameras if their images are exchanged."""
+    names = [camera.name for camera in matches.cameras]
+    sizes = [(camera.width, camera.height) for camera in matches.cameras]
+    pairs = []
+    for one, other in combinations(suspects[:MAX_EXCHANGED], 2):
+        a, b = names.index(one), names.index(other)
+        if sizes[a] != sizes[b] or not matches.descriptors:
+            continue
+        fits, off = measure_residuals(matches.with_exchanged_images(a, b))
+        if all(name not in off and np.isfinite(fits[name].pixels) for name in (one, other)):
+            pairs.append((one, other))
+    return pairs
 
 
 def refine_rig(rig: Rig, matches: Matches) -> Refinement:

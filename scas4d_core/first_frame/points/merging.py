@@ -75,8 +75,8 @@ def merge_candidates(
         needed = np.concatenate([needed, np.full(len(new), views_needed, dtype=np.intp)])
     if len(points) == 0:
         raise InitialPointsError(
-            "images: no point is confirmed by enough cameras; check that the calibration matches the images, "
-            "or provide a point cloud"
+            "images: no point is confirmed by enough cameras; provide a point cloud, or check that the calibration "
+            "belongs to the images"
         )
     visible = visible_from(views, points, fine)
     foreground = labelled_share(labelled, points, visible)
@@ -108,8 +108,8 @@ def merge_candidates(
         scale *= 1.15
     if not chosen.any():
         raise InitialPointsError(
-            "images: every candidate point contradicts the cameras; check that the calibration matches the images, "
-            "or provide a point cloud"
+            "images: the cameras do not agree on the colour of any point; provide a point cloud, or check that the "
+            "calibration belongs to the images"
         )
     return InitialPoints(points[chosen], seen.colours[chosen], None if foreground is None else foreground[chosen])
 

@@ -40,7 +40,7 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         seed: random seed of the samples.
 
     Raises:
-        InitialPointsError: if no two cameras look at the same place.
+        InitialPointsError: if no two cameras look at the same place, or the masks leave no place.
 
     >>> from scas4d_core.cameras import Camera
     >>> def seen(x):
@@ -61,6 +61,11 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         drawn.append(view.camera.unproject(uv, depth))
     points = np.concatenate(drawn)
     inside, free = np.stack([_seen(view, points) for view in views], axis=1)
+    if free.any(axis=0).all():
+        raise InitialPointsError(
+            "images: no place is in the foreground of all images that show it, according to the masks or, without "
+            "masks, to the plain background; provide a point cloud or other masks"
+        )
     points, inside = points[~free.any(axis=0)], inside[:, ~free.any(axis=0)]
     # Three cameras agree by chance less often than two.
     for needed in (3, 2):
@@ -69,8 +74,9 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
             break
     else:
         raise InitialPointsError(
-            "images: no two cameras see the same place; check that the calibration matches the images, and that the "
-            "poses have the direction that the format requires (world to camera; transforms.json: camera to world)"
+            "poses: no two cameras see the same place; if their images overlap, check that the poses belong to these "
+            "cameras and have the direction that the format requires (world to camera; transforms.json: camera to "
+            "world); otherwise provide a point cloud"
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]

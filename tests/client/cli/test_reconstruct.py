@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -16,6 +17,7 @@ from client.cli.evaluate import evaluate
 from client.cli.reconstruct import reconstruct
 from client.importers.open_source import CaptureOptions, open_source
 from client.pictures import psnr
+from scas4d_core.captures import CaptureError
 from scas4d_core.compact import CompactReader
 from scas4d_core.query.ply import read_ply
 from scas4d_core.storage.history import History
@@ -42,12 +44,36 @@ def test_it_leaves_pictures_states_and_a_ply_each_time_it_is_run(capture_folder,
     assert [path.name for path in sorted((tmp_path / "camera_2").iterdir())] == [f"{t:06d}.png" for t in range(3)]
 
 
+@pytest.mark.parametrize("frame", [0, 1])
+def test_images_that_cannot_be_used_are_left_out(capture_folder, tmp_path, capsys, frame):
+    folder = shutil.copytree(capture_folder, tmp_path / "tiny")
+    broken = [folder / f"ims/{camera}/{frame:06d}.png" for camera in (0, 1, 2)]
+    for path in (broken[0], broken[2]):  # a training and the test camera
+        path.write_bytes(path.read_bytes()[:45])
+    reconstruct(open_source(folder), tmp_path / "out", frames=3, preset="scas4d", changes=CHANGES)
+    assert History.load(tmp_path / "out/states").indices == [0, 1, 2]
+    said = capsys.readouterr().out
+    assert f"frame {frame}, without camera 0: {broken[0]}: the PNG file is truncated" in said
+    assert f"frame {frame}, not compared with camera 2: {broken[2]}: the PNG file is truncated" in said
+    assert said.rstrip().endswith("1 image could not be used; no frame was left out")
+    broken[1].write_bytes(b"")
+    with pytest.raises(CaptureError, match="2 images could not be used; 1 frame left out"):
+        reconstruct(open_source(folder), tmp_path / "out", frames=3, preset="scas4d", changes=CHANGES)
+    history = History.load(tmp_path / "out/states")
+    assert history.indices == [index for index in range(3) if index != frame]
+    with pytest.raises(CaptureError, match="truncated .*; scores need every frame"):
+        evaluate(folder, tmp_path / "scores", frames=3, changes=CHANGES, report=lambda line: None)
+
+
 def test_scores_are_printed_and_not_measured_twice(capture_folder, tmp_path):
     said: list[str] = []
     row = evaluate(capture_folder, tmp_path, frames=2, changes=CHANGES, report=said.append)
     assert (row["updates"], row["iterations"], row["capture"]) == (1, 2, capture_folder.name)
     assert np.isfinite(row["psnr"])
-    assert re.fullmatch(r" +frame +1/1 +[\d.]+ dB +[\d.]+ s", said[2])
+    warned = [line.strip() for line in said if line.strip().startswith("all ")]
+    assert [line.split("; ")[0] for line in warned] == ["all 2 images are black (0, 1)", warned[1].split("; ")[0]]
+    assert warned[1].startswith("all masks are full")
+    assert any(re.fullmatch(r" +frame +1/1 +[\d.]+ dB +[\d.]+ s", line) for line in said)
     assert "Median seconds per update, by stage" in said[-1]
     assert f"| {capture_folder.name} | scas4d | 2 | static.iterations=2 |" in said[-1]
     assert (tmp_path / "table.md").read_text() == said[-1] + "\n"

@@ -129,7 +129,9 @@ def test_the_files_that_the_calibration_names(tmp_path):
         Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "photos" / f"{name}.png")
     assert open_source(tmp_path).frame_count == 1
     (tmp_path / "photos/cam10.png").unlink()
-    with pytest.raises(CaptureError, match=r"photos/cam10.png: no such file, although .*transforms.json lists it"):
+    assert "camera 'cam10' has no image" in open_source(tmp_path).usable_frame(0)[1]["cam10"]
+    (tmp_path / "photos/cam2.png").unlink()
+    with pytest.raises(CaptureError, match=r"photos/cam.*.png: no such file, although .*transforms.json lists it"):
         open_source(tmp_path)
 
 
@@ -225,12 +227,19 @@ def test_a_colmap_model_is_found(tmp_path, place):
         assert open_source(tmp_path, calibration=elsewhere).rig.names == source.rig.names
 
 
-def cut(folder):
-    (folder / "images/cam2/000001.png").unlink()
+def named_otherwise(folder):
+    for path in (folder / "images/cam2").iterdir():
+        path.rename(path.with_stem(f"2{path.stem}"))
 
 
 def resize(folder):
-    Image.new("RGB", (WIDTH - 8, HEIGHT)).save(folder / "images/cam10/000000.png")
+    for path in (folder / "images/cam10").iterdir():
+        Image.new("RGB", (WIDTH - 8, HEIGHT)).save(path)
+
+
+def break_two_cameras(folder):
+    for path in (*(folder / "images/cam1").iterdir(), *(folder / "images/cam2").iterdir()):
+        path.write_bytes(b"x")
 
 
 def video(folder):
@@ -246,7 +255,7 @@ def empty(folder):
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (cut, r"images/cam2 has no images for 1 of 2 frames \(000001\), but 'cam1' has"),
+        (named_otherwise, r"images/cam2 has no images for 2 of 4 frames \(000000, 000001\), but 'cam1' has"),
         (
             resize,
             r"cam10/000000.png is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--size-mismatch",
@@ -258,7 +267,7 @@ def empty(folder):
         ),
         (lambda f: (f / "images/cam1/000000.tif").write_bytes(b""), r"000000.tif: .tif is not supported; use JPEG"),
         (lambda f: (f / "images/cam1/000000.jpg").write_bytes(b""), r"000000.png and 000000.jpg are the same frame"),
-        (lambda f: (f / "images/cam1/000000.png").write_bytes(b"x"), r"cam1/000000.png cannot be read as an image"),
+        (break_two_cameras, r"cam1/000000.png cannot be read as an image"),
         (lambda f: (f / "transforms.json").unlink(), r"unknown capture layout: .*: train_meta.json .*--calibration"),
         (video, r"contains images \(images/\) and videos \(videos/\); .*--pictures images"),
         (lambda f: (f / "masks").mkdir(), r"masks/cam1: no such folder"),

@@ -270,6 +270,16 @@ def test_the_index_is_made_once(tmp_path, monkeypatch, video_cache):
     assert len(Video(path)) == FRAMES + 5
 
 
+def test_a_user_without_a_home_has_a_cache_too(monkeypatch):
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.undo()  # the fixture that replaces the folder
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", home)
+    assert video_index.cache_folder().parts[-2:] == ("scas4d", "videos")
+
+
 def test_a_colon_in_a_relative_path_is_no_protocol(tmp_path, monkeypatch):
     encode(tmp_path / "day:1" / "a.mp4", "libx264")
     monkeypatch.chdir(tmp_path)

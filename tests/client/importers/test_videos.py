@@ -137,7 +137,7 @@ def test_a_longer_video_is_cut_and_said_so(rig_of_videos):
     film(rig_of_videos / "videos/cam2.mp4", range(FRAMES + 2))
     source = open_source(rig_of_videos)
     assert source.frame_count == FRAMES
-    assert list(source.remarks) == ["cam2.mp4 has 2 more frames than the shortest video; they are ignored"]
+    assert list(source.remarks) == ["cam2.mp4 has 2 more frames than most videos; they are ignored"]
 
 
 @pytest.mark.parametrize(
@@ -154,8 +154,7 @@ def test_a_longer_video_is_cut_and_said_so(rig_of_videos):
             r"no video of camera 'cam2' of .*transforms.json, but it contains two, .* name each video after its camera",
         ),
         (lambda f: (f / "cam2.mkv").write_bytes(b"x"), r"contains cam2.mkv and cam2.mp4 for the same camera"),
-        (lambda f: (f / "cam2.mp4").write_bytes(b"no video at all"), r"cam2.mp4 cannot be read as video"),
-        (lambda f: (f / "cam2.mp4").write_bytes(b""), r"cam2.mp4 cannot be read as video"),
+        (lambda f: [(f / f"{name}.mp4").write_bytes(b"") for name in NAMES[:2]], r"mp4 cannot be read as video"),
     ],
 )
 def test_what_does_not_belong_together_is_named(rig_of_videos, damage, said):
@@ -164,16 +163,12 @@ def test_what_does_not_belong_together_is_named(rig_of_videos, damage, said):
         open_source(rig_of_videos)
 
 
-def test_a_damaged_video_says_which_frame(tmp_path):
+def test_a_damaged_video_ends_before_the_frame_that_is_lost(tmp_path):
     path = film(tmp_path / "a.mkv", range(60))
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
     data[middle : middle + len(data) // 4] = bytes(len(data) // 4)
     path.write_bytes(data)
-
-    def all_frames():
-        video = Video(path)
-        return [number(video.frame(index)) for index in range(60)]
-
-    with pytest.raises(CaptureError, match=r"a.mkv(: frame \d+| cannot be read)"):
-        assert all_frames() == list(range(60))
+    video = Video(path)
+    assert 12 < len(video) < 60
+    assert [number(video.frame(index)) for index in range(len(video))] == list(range(len(video)))

@@ -99,9 +99,11 @@ def test_cameras_of_different_sizes_are_written_and_read(tmp_path):
 
 
 def test_a_folder_that_was_not_finished_is_no_capture(distorted, tmp_path):
-    (distorted / "images/cam10/1.png").write_bytes(b"damaged")
-    with pytest.raises(ValueError, match=r"images/cam10/1.png: not a JPEG"):
-        write_dynamic3dgs(open_source(distorted), tmp_path / "out")
+    def interrupt(stage, done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_dynamic3dgs(open_source(distorted), tmp_path / "out", on_progress=interrupt)
     with pytest.raises(CaptureError, match="unknown capture layout"):
         open_capture(tmp_path / "out")
 

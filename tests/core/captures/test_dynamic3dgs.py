@@ -211,7 +211,7 @@ ELSEWHERE[1][0][3] = 0.01
         ({"fn": [["0/000000.png", "../../secret.png", "a.png"]] * 3}, r"secret\.png' points outside ims/"),
         ({"fn": [["0/000000.png", "/etc/passwd", "a.png"]] * 3}, "points outside ims/"),
         (
-            {"fn": [["0/000000.png", "1/000000.png", "3/000009.png"]] * 3},
+            {"fn": [["0/000000.png", "1/000009.png", "3/000009.png"]] * 3},
             r"000009\.png: no such file \(listed in train_meta",
         ),
     ],

@@ -142,7 +142,7 @@ def test_of_several_images_in_a_file_the_first_is_used_with_a_remark(tmp_path, k
     path.write_bytes(encoded(first, kind, save_all=True, append_images=[second]))
     assert np.abs(decode_image(path).astype(int) - 10).max() <= 2
     check_image(path)
-    assert describe_pictures([{"north": path}])[1] == [
+    assert describe_pictures({"north": path}, [{"north": path}])[1] == [
         "camera 'north': files contain several images; only the first of each file is used"
     ]
 

@@ -26,7 +26,7 @@ def test_whole_files_are_images_unless_a_rule_refuses_them(name):
         check_image(data, size=(WIDTH - 1, HEIGHT))
 
 
-@pytest.mark.parametrize("name", whole_files().keys() - {"MPO"})
+@pytest.mark.parametrize("name", [name for name in whole_files() if name != "MPO"])
 def test_every_cut_is_refused(name):
     data = whole_files()[name]
     for length in {*range(0, len(data), 7), *range(len(data) - 16, len(data))}:

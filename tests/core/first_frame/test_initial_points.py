@@ -274,9 +274,25 @@ def test_cameras_that_see_nothing_in_common_are_refused(scene):
             for camera in scene.ring(2).cameras
         )
     )
-    images = {name: np.full((128, 128, 3), 9, np.uint8) for name in rig.names}
-    with pytest.raises(InitialPointsError, match="no two cameras see the same place"):
+    rng = np.random.default_rng(0)
+    images = {name: rng.integers(0, 256, (128, 128, 3)).astype(np.uint8) for name in rig.names}
+    with pytest.raises(InitialPointsError, match=r"^poses: no two cameras see the same place"):
         initial_points(rig, images, {}, stereo=False)
+    images = {name: np.full((128, 128, 3), 9, np.uint8) for name in rig.names}
+    with pytest.raises(InitialPointsError, match=r"^all 2 images are black .*; images: no place is in the foreground"):
+        initial_points(rig, images, {}, stereo=False)
+
+
+def test_empty_masks_are_named_and_not_the_calibration(scene):
+    rig = scene.ring(3)
+    images = {name: np.full((128, 128, 3), 9, np.uint8) for name in rig.names}
+    masks = {name: np.zeros((128, 128), np.uint8) for name in rig.names}
+    with pytest.raises(InitialPointsError) as caught:
+        initial_points(rig, images, masks, stereo=False)
+    said = str(caught.value)
+    assert said.startswith("all 3 images are black (")
+    assert "all masks are empty" in said
+    assert "calibration" not in said
 
 
 def test_points_that_one_way_labels_and_another_does_not_have_no_labels():

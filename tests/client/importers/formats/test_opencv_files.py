@@ -47,6 +47,8 @@ def test_sizes_are_those_of_the_pictures(tmp_path):
     source = open_source(tmp_path)
     assert (source.frame_count, source.rig["cam1"].width, source.rig["cam1"].height) == (2, WIDTH, HEIGHT)
     (tmp_path / "images/cam2/000000.png").write_bytes(b"no picture")
+    assert open_source(tmp_path).rig["cam2"].width == WIDTH  # from its other image
+    (tmp_path / "images/cam2/000001.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match=r"cam2/000000.png cannot be read as an image"):
         open_source(tmp_path)
 

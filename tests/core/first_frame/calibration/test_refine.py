@@ -105,6 +105,23 @@ def test_what_matches_held_out_do_not_bear_out_is_refused(disturbed, images, mon
     assert "held-out matches did not decrease" in found.text
 
 
+@pytest.mark.parametrize(("one", "other"), [("0", "1"), ("5", "16"), ("1", "12")])
+def test_exchanged_images_are_named_and_the_calibration_is_not_blamed(sample, images, one, other):
+    swapped = {**images, one: images[other], other: images[one]}
+    (said,) = check_calibration(sample.rig, swapped, refine=False).warnings
+    assert said.startswith(f"the images of cameras {one!r} and {other!r} seem to be exchanged")
+    assert "calibration" not in said
+
+
+def test_what_all_images_show_precedes_what_may_be_wrong(sample, images):
+    frame = replace(sample.frame(0), images=dict.fromkeys(images, images["0"]), masks={})
+    said = refine.calibrate_first_frame(
+        sample.rig, frame, Settings().static, lambda progress: None, measured=True
+    ).warnings
+    assert said[0].startswith(f"all {len(images)} images are identical (0, 1, 2, 3, 5, 6, 7, 9 and 8 more)")
+    assert said[1].startswith("matching features are ")
+
+
 def test_two_cameras_are_not_refined(sample, images):
     rig = Rig(sample.rig.cameras[:2])
     found = check_calibration(rig, images, refine=True)

@@ -1,0 +1,208 @@
+"""The rig simulator and the commands with images that cannot be used, and scenes that never got a frame."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from running import HEIGHT, WIDTH
+from typer.testing import CliRunner
+from waiting import HANG_S
+
+from client.cli.main import app
+from client.errors import InvalidRequest, ServiceUnreachable
+from client.importers.open_source import open_source
+from client.left_out import LeftOut
+from client.rig import push
+from client.sdk import Client
+from client.wire import IngestSettings, ProblemDetails
+from scas4d_core.captures import Capture, CaptureError
+
+
+@pytest.fixture
+def client(service):
+    with Client(service.url, busy_timeout=HANG_S) as client:
+        yield client
+        for status in client.scenes():
+            client.delete_scene(status.id)
+
+
+@pytest.fixture
+def folder(capture_folder, tmp_path):
+    return shutil.copytree(capture_folder, tmp_path / "tiny")
+
+
+def spoil(folder, camera, frame):
+    path = folder / f"ims/{camera}/{frame:06d}.png"
+    path.write_bytes(path.read_bytes()[:45])
+
+
+WAYS = [{}, {"websocket": True}, {"per_camera": True}, {"per_camera": True, "websocket": True}, {"batch": 3}]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("frame", [0, 2])
+def test_a_frame_goes_on_without_a_camera(client, folder, way, frame):
+    spoil(folder, 1, frame)
+    said = []
+    delivery = push(open_source(folder), client, on_message=said.append, **way)
+    reports = [client.frame(delivery.scene, index) for index in range(4)]
+    assert [report.state for report in reports] == ["committed"] * 4
+    assert [report.used_cameras for report in reports] == [
+        ["0"] if index == frame else ["0", "1"] for index in range(4)
+    ]
+    assert (delivery.left_out.images, delivery.left_out.frames, delivery.lost) == (1, [], [])
+    (sentence,) = said
+    assert re.match(rf"frame {frame}, without camera 1: .*ims/1/00000{frame}.png: the PNG file is truncated", sentence)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("frame", [0, 2])
+def test_a_frame_below_the_minimum_is_left_out_and_the_next_one_starts(client, folder, way, frame):
+    spoil(folder, 0, frame)
+    said = []
+    rules = IngestSettings(minimum_cameras=2)
+    delivery = push(open_source(folder), client, ingest=rules, on_message=said.append, **way)
+    states = [client.frame(delivery.scene, index).state for index in range(4)]
+    assert states == ["missing" if index == frame else "committed" for index in range(4)]
+    assert delivery.left_out.frames == delivery.lost == [frame]
+    assert said[-1] == f"frame {frame} is left out: 1 of 2 images can be used, and at least 2 are required"
+    assert "1 frame left out, because fewer than 2 of 2 cameras had a usable image" in delivery.left_out.summary
+
+
+def test_the_minimum_of_an_existing_scene_applies(client, folder):
+    spoil(folder, 0, 2)
+    scene = client.create_scene(open_source(folder).rig, ingest=IngestSettings(minimum_cameras=2)).id
+    assert push(open_source(folder), client, scene=scene).lost == [2]
+
+
+def test_a_capture_without_usable_frames_makes_no_scene(client, folder):
+    for frame in range(4):
+        spoil(folder, 0, frame)
+    with pytest.raises(CaptureError, match=r"no frame with usable images of 2 of 2 cameras; .* camera 0: .*000000.png"):
+        push(open_source(folder), client, ingest=IngestSettings(minimum_cameras=2))
+    assert client.scenes() == []
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_scene_without_a_frame_is_deleted_after_an_error(client, folder, monkeypatch, way):
+    capture = open_source(folder)
+    refused = InvalidRequest(ProblemDetails(title="", status=422, detail="not now", field="time"))
+    for name in ("put_frame", "put_camera"):
+        monkeypatch.setattr(
+            f"client.rig.sender.{'IngestSocket' if way.get('websocket') else 'Client'}.{name}", _raise(refused)
+        )
+    with pytest.raises(InvalidRequest, match="not now"):
+        push(capture, client, **way)
+    assert client.scenes() == []
+
+
+def test_points_that_are_refused_leave_no_scene(client, folder):
+    cloud = np.zeros((5, 7), np.float32)
+    cloud[:, 2] = -1e6  # behind all cameras
+    np.savez(folder / "init_pt_cld.npz", data=cloud)
+    with pytest.raises(InvalidRequest, match="behind all cameras"):
+        push(open_source(folder), client)
+    assert client.scenes() == []
+
+
+def test_an_older_scene_and_one_with_frames_are_kept_after_an_error(client, folder, monkeypatch):
+    capture = open_source(folder)
+    older = client.create_scene(capture.rig).id
+    for name in ("put_frame",):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"client.rig.sender.Client.{name}", _raise(RuntimeError("later")))
+            with pytest.raises(RuntimeError, match="later"):
+                push(capture, client, scene=older)
+    assert [status.id for status in client.scenes()] == [older]
+    put_frame = Client.put_frame
+
+    def only_first(self, scene, index, *arguments, **named):
+        if index:
+            raise RuntimeError("later")
+        return put_frame(self, scene, index, *arguments, **named)
+
+    monkeypatch.setattr("client.rig.sender.Client.put_frame", only_first)
+    with pytest.raises(RuntimeError, match="later"):
+        push(capture, client)
+    assert len(client.scenes()) == 2
+
+
+def test_a_scene_that_cannot_be_deleted_is_named(client, folder, monkeypatch):
+    said = []
+    monkeypatch.setattr("client.rig.sender.Client.put_frame", _raise(ServiceUnreachable("gone")))
+    with pytest.raises(ServiceUnreachable, match="gone"):
+        push(open_source(folder), client, on_message=said.append)
+    (status,) = client.scenes()
+    assert said == [f"scene {status.id} may be empty; if so: scas4d scenes delete {status.id}"]
+
+
+def _raise(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+def test_push_says_how_many_images_were_left_out(service, client, folder):
+    spoil(folder, 1, 3)
+    done = CliRunner().invoke(app, ["push", str(folder), "--url", service.url])
+    assert done.exit_code == 0, done.output
+    assert "frame 3, without camera 1: " in done.output
+    assert "4 of 4 frames committed" in done.output
+    assert done.output.rstrip().endswith("1 image could not be used; no frame was left out")
+    spoil(folder, 0, 3)
+    done = CliRunner().invoke(app, ["push", str(folder), "--url", service.url])
+    assert done.exit_code == 1
+    assert "3 of 4 frames committed" in done.output
+    assert str(done.exception).startswith("2 images could not be used; 1 frame left out")
+
+
+def test_import_says_how_many_images_were_left_out(folder, tmp_path):
+    spoil(folder, 1, 3)
+    done = CliRunner().invoke(app, ["import", str(folder), str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    assert "frame 3, without camera 1: " in done.output
+    assert "1 image could not be used" in done.output
+    assert not (tmp_path / "out/ims/1/000003.png").exists()
+
+
+def test_a_lasting_reason_is_said_once():
+    from running import make_rig
+
+    left_out = LeftOut(make_rig(4))
+    assert left_out.record(0, {"c0": "a.mp4 ends after 0 frames"}) == [
+        "frame 0, without camera c0: a.mp4 ends after 0 frames"
+    ]
+    assert left_out.record(1, {"c0": "a.mp4 ends after 0 frames"}) == []
+    assert left_out.record(1, {"c1": "sent again"}) == []
+    assert left_out.record(2, {"c0": "a.mp4 ends after 0 frames", "c1": "1/2.png: no such file"}) == [
+        "frame 2, without camera c1: 1/2.png: no such file"
+    ]
+    assert (left_out.images, left_out.frames) == (4, [])
+    assert LeftOut(make_rig(4)).summary is None
+
+
+def test_a_picture_that_the_service_refuses_is_left_out(client, folder, monkeypatch):
+    (folder / "ims/1/000002.png").write_bytes(b"unknown to the client")
+    own = Capture.encoded_image
+
+    def unchecked(self, index, camera):
+        return b"unknown" if (index, camera) == (2, "1") else own(self, index, camera)
+
+    monkeypatch.setattr(Capture, "encoded_image", unchecked)
+    said = []
+    delivery = push(open_source(folder), client, on_message=said.append)
+    assert client.frame(delivery.scene, 2).used_cameras == ["0"]
+    assert said[0].startswith("frame 2, without camera 1: refused by the service: 1: not a JPEG, PNG, WebP")
+    with pytest.raises(InvalidRequest, match="not a JPEG"):
+        push(open_source(folder), client, ingest=IngestSettings(minimum_cameras=2))
+
+
+def test_a_picture_of_another_size_is_left_out(client, folder):
+    Image.new("RGB", (WIDTH, HEIGHT - 2)).save(folder / "ims/1/000001.png")
+    delivery = push(open_source(folder), client)
+    assert client.frame(delivery.scene, 1).used_cameras == ["0"]
