@@ -209,7 +209,7 @@ class CalibrationModel(Model):
 
 
 class PairsModel(Model):
-    """Number of Gaussians blended into a pixel, counted in a sample of the pixels of at most four cameras.
+    """Number of Gaussians blended into a pixel, counted in a sample of the pixels of at most two cameras.
 
     The number determines the time of an iteration.
     """

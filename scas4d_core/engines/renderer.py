@@ -25,7 +25,7 @@ PRIOR_PIXELS = 1.0
 """Constant, in pixels, that ``Renderer.step_colours`` adds to each Gaussian's total blending weight. It keeps the
 colours of barely visible Gaussians almost unchanged."""
 
-PAIR_CAMERAS, PAIR_STEP = 4, 4
+PAIR_CAMERAS, PAIR_STEP = 2, 4
 """Maximum number of cameras, and step between the rows and columns, that ``pair_counts`` examines."""
 
 
