@@ -97,13 +97,11 @@ class FitScalars(NamedTuple):
         rates: [15] float32 Adam learning rate of each column. A column with rate 0 is not updated.
         gloss: factor that scales the learning rates of the gloss.
         colour_shift: whether to compute ``FitLoss.colour_shift``.
-        decay: amount subtracted from all log scales after the Adam step, i.e. decoupled weight decay of the scales.
     """
 
     rates: Array
     gloss: float = 1.0
     colour_shift: bool = False
-    decay: float = 0.0
 
 
 class FitLoss(NamedTuple):

@@ -20,7 +20,6 @@ from scas4d_core.engines.fit import (
     FitScalars,
 )  # fmt: skip
 from scas4d_core.engines.limits import scene_limits
-from scas4d_core.engines.renderer import pair_counts
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule
 from scas4d_core.first_frame.points.surroundings import Stage
@@ -62,11 +61,6 @@ RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION, RATE_EXPOSURE = 2.5e-3, 5e
 """Adam learning rates of colours, opacity logits, log scales, quaternions, and the cameras' gain and
 offset. The values are those of 3DGS, but twice as large for quaternions. 3DGS has no gain and
 offset."""
-SCALE_DECAY, DECAY_UNTIL, DEEP = 2e-3, 0.8, 12.0
-"""Decay of the log scales in the first iteration, i.e. decoupled weight decay (Loshchilov & Hutter 2019); fraction of
-the iterations over which it falls linearly to zero; and mean number of Gaussians blended into a pixel above which it is
-applied. Where few cameras constrain a scene, large, faint Gaussians would otherwise form deep stacks and take most of
-the time of each iteration."""
 WEIGHT_MASK = 3.0
 """Weight of the mask loss if there are masks. In frame 0, the mask loss only trains the labels."""
 SPLIT_SHRINK = 1.6
@@ -107,7 +101,7 @@ class StaticTrainer:
         renderer = renderer_of(device, scene.background_rgb, scene_limits(scene.near, self.radius))
         engine = fit_engine_of(renderer, WEIGHT_MASK)
         self.fit = GaussianFit(engine, views, parameters, exposures=self.exposures, statistics=True)
-        self._last, self._deep = float(settings.iterations), False
+        self._last = float(settings.iterations)
         self.cameras: dict[str, CameraFit] = {}
         self._start, self._until = len(parameters), int(DENSIFY_UNTIL * settings.iterations)
         self.schedule = FitSchedule(settings.iterations, limit or TimeLimit(None), self._expected)
@@ -139,7 +133,7 @@ class StaticTrainer:
         """Ends an iteration: records the fit of its view, and takes all steps that are due.
 
         The possible steps are density control, removal of Gaussians that are hardly seen, the
-        stopping rule, the count of pairs per pixel, and the exposure check.
+        stopping rule, and the exposure check.
         """
         settings, schedule, until = self.settings, self.schedule, self._until
         if last.colour_shift is not None:
@@ -151,9 +145,6 @@ class StaticTrainer:
         if now.ended > until and self._last == settings.iterations and self._has_converged():
             self._last = min(self._last, now.ended + len(self.views) * schedule.stride)
             self.remove_unseen()
-        if now.passes(DENSIFY_EVERY) and now.begun < DECAY_UNTIL * settings.iterations:
-            cameras = [view.camera for view in self.views]
-            self._deep = pair_counts(self.fit.renderer, self.gaussians(), cameras).mean > DEEP
         if settings.exposure == "auto" and now.reaches(round(TRIAL * settings.iterations)):
             self.exposures.assess()
         schedule.end_iteration(len(self.fit))
@@ -180,16 +171,14 @@ class StaticTrainer:
         return bool(before - now < self.settings.stop_gain * before)
 
     def scalars(self, now: FitStep) -> FitScalars:
-        """Returns the learning rates and the decay of scales for an iteration.
+        """Returns the learning rates for an iteration.
 
         The last iterations also measure the colour shift of each camera.
         """
         # A shortened fit may end in the middle of a pass, but two passes include every view.
         rounds = 1 if self.schedule.stride == 1 else 2 * self.schedule.stride
         ending = now.begun >= self._last - len(self.views) * rounds
-        share = now.begun / self.settings.iterations
-        decay = SCALE_DECAY * max(0.0, 1 - share / DECAY_UNTIL) if self._deep else 0.0
-        return FitScalars(self._rates(now.begun), 1 - 0.9 * share, ending, decay)
+        return FitScalars(self._rates(now.begun), 1 - 0.9 * now.begun / self.settings.iterations, ending)
 
     def _rates(self, at: float) -> Array:
         share = at / max(self.settings.iterations - 1, 1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scas4d_core.engines.cpu.gloss import GlossShading, features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import EngineError
-from scas4d_core.engines.fit import COLOUR, SCALE, FitLoss, FitScalars, FitTable
+from scas4d_core.engines.fit import COLOUR, FitLoss, FitScalars, FitTable
 from scas4d_core.engines.renderer import Gradients
 from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
@@ -105,8 +105,6 @@ class CpuFitEngine:
         adam(
             table.parameters, self._gradients, *moments, scalars.rates, EVERY_ROW, table.beta1, table.beta2, table.steps
         )
-        if scalars.decay:
-            table.parameters[:, SCALE] -= np.float32(scalars.decay)
         loss = self.renderer.image_part + self.renderer.mask_part
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 

@@ -91,7 +91,6 @@ def step_parameters(
     g_factors: wp.array[wp.mat33],
     g_features: wp.array[wp.vec4],
     adam: Adam,
-    decay: wp.float32,
     parameters: wp.array2d[wp.float32],
     screen_gradients: wp.array[wp.float32],
     rendered: wp.array[wp.int32],
@@ -105,7 +104,6 @@ def step_parameters(
         splats, records: rasterizer buffers after the backward pass; see ``projection``.
         g_means, g_factors, g_features: [fixed + N] gradients of the rendering loss.
         adam: optimizer for the parameters.
-        decay: amount subtracted from the log scales; see ``engines.fit.FitScalars``.
         screen_gradients, rendered: [N] statistics, accumulated; see ``engines.fit.RenderingStatistics``.
     """
     i = wp.tid()
@@ -136,8 +134,6 @@ def step_parameters(
         along = wp.where(wp.abs(parameters[i, 7 + k]) <= LARGEST, along, 0.0)
         step_element(adam, parameters, i, k, g_mean[k])
         step_element(adam, parameters, i, 7 + k, along)
-        if adam.scalars[0] > 0.0:
-            parameters[i, 7 + k] = parameters[i, 7 + k] - decay
         step_element(adam, parameters, i, 11 + k, g_feature[k])
     for k in range(4):
         step_element(adam, parameters, i, 3 + k, g_q[k])

@@ -155,15 +155,15 @@ class WarpFitEngine:
         for place in range(2):
             steps += IDLE if gloss is None else gloss.optimizers[place].next_scalars(scalars.gloss)
         self._stepped = True
-        row = self._launch(shapes, steps, scalars.decay)
+        row = self._launch(shapes, steps)
         while self._rasterizer.grow(row[PAIRS]):
-            row = self._launch(shapes, steps, scalars.decay)
+            row = self._launch(shapes, steps)
         shift = tuple(row[SHIFT : SHIFT + LABEL].tolist()) if scalars.colour_shift else None
         psnr = psnr_of(row[SQUARES], seen.camera.width * seen.camera.height)
         exposure_gradient = self._exposure_gradient[: len(seen.target)]
         return FitLoss(view, row[IMAGE_LOSS] + row[MASK_LOSS], psnr, exposure_gradient, shift)
 
-    def _launch(self, shapes: _Shapes, scalars: Sequence[float], decay: float) -> NDArray[np.float64]:
+    def _launch(self, shapes: _Shapes, scalars: Sequence[float]) -> NDArray[np.float64]:
         """Runs an iteration and returns its log row. If the tile lists are too small, no parameter is updated."""
         device, gloss, rasterizer = self._device, self._gloss, self._rasterizer
         self._scalars.assign(np.array(scalars, np.float32))
@@ -193,7 +193,7 @@ class WarpFitEngine:
             gloss.shade_backward(cameras, view, fitted.means, None, fitted.features, own, add=False)
             gloss.step()
         drawn = [rasterizer.splats, rasterizer.records, shapes.factors, shapes.opacities, shapes.features]
-        inputs = [shapes.fixed, cameras, view, *drawn, g_means, g_factors, g_features, self._optimizer.adam, decay]
+        inputs = [shapes.fixed, cameras, view, *drawn, g_means, g_factors, g_features, self._optimizer.adam]
         inputs += [self._parameters, self._screen, self._rendered]
         wp.launch(step_parameters, self._count, inputs, device=device)
         self._factors = fitted.factors

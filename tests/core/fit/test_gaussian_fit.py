@@ -99,16 +99,6 @@ def test_columns_whose_rate_is_zero_stay_bit_for_bit(columns: slice) -> None:
     assert (after[:, columns] != before[:, columns]).any()
 
 
-def test_decay_lowers_log_scales_after_the_adam_step() -> None:
-    plain, decaying = make_fit(), make_fit()
-    plain.run([0], lambda now: FitScalars(ALL))
-    decaying.run([0], lambda now: FitScalars(ALL, decay=0.01))
-    expected = plain.table.parameters.copy()
-    expected[:, SCALE] -= np.float32(0.01)
-    assert_repeated(decaying.table.parameters, expected)
-    assert_repeated(decaying.table.first, plain.table.first)
-
-
 def test_colours_that_learn_alone_have_the_bits_that_they_have_beside_the_rest() -> None:
     alone, together = make_fit(), make_fit()
     alone.run([0], lambda now: only(COLOUR, 1e-3))
