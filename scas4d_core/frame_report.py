@@ -15,6 +15,8 @@ import numpy as np
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import grey_among
 from scas4d_core.engines.engine import REPORT
+from scas4d_core.engines.renderer import PairCounts, Renderer, pair_counts
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.calibration.report import CalibrationReport
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.frame_outcome import (
@@ -70,6 +72,7 @@ class FrameReport:
             when the view was rendered; NaN if not measured.
         moving: number of moving Gaussians.
         gaussians: number of Gaussians that are not retired.
+        pairs: number of Gaussians blended into a pixel, or None if the frame was rejected.
         cameras: fit of each camera's image when last rendered. A poor fit may reveal a camera that
             was bumped.
         used: cameras from which the update learnt; empty for a rejected or skipped frame.
@@ -114,6 +117,7 @@ class FrameReport:
     psnr: float
     moving: int
     gaussians: int
+    pairs: PairCounts | None = None
     cameras: dict[str, CameraFit] = field(default_factory=dict)
     used: list[str] = field(default_factory=list)
     dropped: dict[str, str] = field(default_factory=dict)
@@ -172,6 +176,8 @@ def report_of_first(
     result: StaticResult,
     names: Sequence[str],
     moving: int,
+    renderer: Renderer,
+    cameras: Sequence[CameraArrays],
     seconds: dict[str, float],
     dropped: Mapping[str, str] | None,
     calibration: CalibrationReport | None = None,
@@ -183,6 +189,7 @@ def report_of_first(
         result: fit of the first frame.
         names: names of the rig's cameras.
         moving: number of Gaussians in the hierarchy.
+        renderer, cameras: see ``report_of_update``.
         seconds: duration of each stage in seconds.
         dropped: maps each camera excluded by the caller to the reason.
         calibration: comparison of the calibration with the images, or None if there was none.
@@ -196,6 +203,7 @@ def report_of_first(
         psnr=_last(result.psnr),
         moving=moving,
         gaussians=len(result.gaussians),
+        pairs=pair_counts(renderer, result.gaussians, cameras),
         cameras=result.cameras,
         used=[name for name in names if name in frame.images],
         dropped=dict(dropped or {}),
@@ -214,6 +222,8 @@ def report_of_update(
     before: Gaussians,
     left_out: Mapping[str, str],
     names: Sequence[str],
+    renderer: Renderer,
+    cameras: Sequence[CameraArrays],
     watch: Stopwatch,
     dropped: Mapping[str, str] | None,
     postponed: Sequence[str] = (),
@@ -226,6 +236,8 @@ def report_of_update(
         before: previously committed state.
         left_out: maps each camera excluded by the brightness check to the reason.
         names: names of the rig's cameras.
+        renderer: renderer of the scene.
+        cameras: cameras in which the Gaussians blended into a pixel are counted.
         watch: stopwatch with the stages "decode", "judge", "update" and optionally "presence".
         dropped: maps each camera excluded by the caller to the reason.
         postponed: descriptions of work for which the time budget was too short.
@@ -248,6 +260,7 @@ def report_of_update(
         psnr=_last(trace.psnr),
         moving=int(gaussians.moving.sum()),
         gaussians=int(gaussians.present.sum()),
+        pairs=None if result.outcome.rejected else pair_counts(renderer, gaussians, cameras),
         cameras={
             name: CameraFit(psnr=fit["psnr"], colour_shift=fit["colour_shift"], health=result.health.get(name, 1.0))
             for name, fit in trace.cameras.items()

@@ -29,7 +29,7 @@ from scas4d_core.effects.switches import committed_arrays, encode_switches
 from scas4d_core.engines.choose import renderer_of, resolve_device
 from scas4d_core.engines.engine import REPORT
 from scas4d_core.engines.limits import rig_limits
-from scas4d_core.engines.views import TrainingView
+from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.errors import StepError
 from scas4d_core.first_frame.calibration.refine import calibrate_first_frame
 from scas4d_core.first_frame.calibration.report import CalibrationReport, effective_rig
@@ -197,7 +197,9 @@ class Reconstruction(CommittedScene):
         load = {} if started is None else {"load": began - started}
         stages = {"calibration": checked - began, "fit": fitted - checked, "prepare": perf_counter() - fitted}
         rows = len(self._prepared.updater.hierarchy.rows)
-        report = report_of_first(frame, result, self.rig.names, rows, {**load, **stages}, dropped, calibration)
+        report = report_of_first(
+            frame, result, self.rig.names, rows, self._renderer, self._cameras, {**load, **stages}, dropped, calibration
+        )
         psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
         past = replace(
             with_first_figures(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time
@@ -437,8 +439,13 @@ class Reconstruction(CommittedScene):
     def _report(self, context: FrameContext) -> FrameReport:
         return report_of_update(
             context.frame, context.result, self.history.newest, context.frame_input.left_out, self.rig.names,
-            context.watch, context.dropped, context.birth_fit_time.postponed,
+            self._renderer, self._cameras, context.watch, context.dropped, context.birth_fit_time.postponed,
         )  # fmt: skip
+
+    @property
+    def _cameras(self) -> list[CameraArrays]:
+        """Cameras at their current poses."""
+        return [CameraArrays.of(camera) for camera in self._factory.posed.cameras]
 
     def _commit_update(self, context: FrameContext, report: FrameReport, defer: Defer, defer_cleanup: Defer) -> None:
         """Commits the frame with the Gaussians added in it, and updates the time budget."""

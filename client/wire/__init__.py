@@ -18,6 +18,7 @@ from client.wire.frames import (
     FrameReportModel,
     FrameState,
     MissingRequest,
+    PairsModel,
     RefinedCameraModel,
     RefinementModel,
 )
@@ -108,6 +109,7 @@ __all__ = [
     "MissingRequest",
     "Model",
     "Node",
+    "PairsModel",
     "PartsModel",
     "Pixel",
     "PointKind",

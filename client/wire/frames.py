@@ -214,6 +214,16 @@ class CalibrationModel(Model):
     )
 
 
+class PairsModel(Model):
+    """Number of Gaussians blended into a pixel, counted in a sample of the pixels of at most two cameras.
+
+    The number determines the time of an iteration.
+    """
+
+    mean: float
+    percentile_99: int
+
+
 class FrameReportModel(Model):
     """Report of one frame: its state, times, errors and metrics."""
 
@@ -330,6 +340,9 @@ class FrameReportModel(Model):
     )
     moving: int | None = None
     gaussians: int | None = Field(default=None, description="Number of Gaussians present, excluding retired ones.")
+    pairs: PairsModel | None = Field(
+        default=None, description="Number of Gaussians blended into a pixel; null for a rejected frame."
+    )
     born: int = Field(default=0, description="Number of Gaussians added in this frame.")
     retired: int = Field(
         default=0, description="Number of Gaussians that left the scene in this frame. Their ids are never reused."

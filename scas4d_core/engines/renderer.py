@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import log10
 from typing import NamedTuple, Protocol
 
@@ -23,6 +24,9 @@ BLOCK = 4
 PRIOR_PIXELS = 1.0
 """Constant, in pixels, that ``Renderer.step_colours`` adds to each Gaussian's total blending weight. It keeps the
 colours of barely visible Gaussians almost unchanged."""
+
+PAIR_CAMERAS, PAIR_STEP = 2, 4
+"""Maximum number of cameras, and step between the rows and columns, that ``pair_counts`` examines."""
 
 
 class Picture(NamedTuple):
@@ -169,6 +173,17 @@ class Renderer(Protocol):
         The mask covers the image padded to a multiple of 32 pixels.
         """
 
+    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+        """Returns the number of Gaussians that are blended into each pixel, which determines the rendering time.
+
+        Gaussians behind the one that finishes a pixel do not count.
+
+        Args:
+            state: Gaussians to render.
+            camera: camera in kernel format.
+            every: step between the rows and columns to count. With 1, the result is [H, W].
+        """
+
 
 class ResidualRenderer(Protocol):
     """Renderer that computes the residuals of one view at a time."""
@@ -187,6 +202,36 @@ class ResidualRenderer(Protocol):
         Returns:
             [N, 3] weighted sums of the RGB residuals before exposure, and [N] sums of the weights, in pixels.
         """
+
+
+@dataclass(frozen=True)
+class PairCounts:
+    """Statistics of the number of Gaussians that are blended into a pixel.
+
+    Attributes:
+        mean: mean over the pixels.
+        percentile_99: number that 99% of the pixels do not exceed.
+    """
+
+    mean: float
+    percentile_99: int
+
+
+def pair_counts(renderer: Renderer, state: Gaussians, cameras: Sequence[CameraArrays]) -> PairCounts:
+    """Counts the Gaussians blended into a sample of the pixels of at most ``PAIR_CAMERAS`` cameras.
+
+    >>> from scas4d_core.cameras import Camera
+    >>> from scas4d_core.engines.choose import renderer_of
+    >>> from scas4d_core.engines.limits import DEFAULT
+    >>> state = Gaussians.of_points([[0, 0, 2], [0, 0, 3]], radius=10, colours=[1, 0, 0])
+    >>> camera = Camera("front", [[100, 0, 16], [0, 100, 16], [0, 0, 1]], np.eye(4), 32, 32)
+    >>> pair_counts(renderer_of("cpu", (0, 0, 0), DEFAULT), state, [CameraArrays.of(camera)])
+    PairCounts(mean=2.0, percentile_99=2)
+    """
+    chosen = cameras[:: -(-len(cameras) // PAIR_CAMERAS)]
+    pairs = np.concatenate([renderer.pairs_per_pixel(state, camera, PAIR_STEP).ravel() for camera in chosen])
+    below = np.cumsum(np.bincount(pairs))
+    return PairCounts(float(pairs.mean()), int(np.searchsorted(below, 0.99 * len(pairs))))
 
 
 def colour_step(

@@ -54,6 +54,10 @@ class NullRenderer(CpuRenderer):
         """Returns zeros: no Gaussian is in a changed pixel."""
         return np.zeros((len(state), len(planes)), np.float32)
 
+    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+        """Returns zeros."""
+        return np.zeros((-(-camera.height // every), -(-camera.width // every)), np.int32)
+
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:

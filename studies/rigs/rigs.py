@@ -24,6 +24,7 @@ from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture, Frame
+from scas4d_core.engines.choose import renderer_of
 from scas4d_core.engines.limits import rig_limits
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.frame_outcome import Candidate
@@ -32,7 +33,6 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import compile_in_processes
 from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
-from studies.rigs.pairs import pairs_per_pixel
 
 ENOUGH_TO_HOLD_OUT = 5
 """Minimum number of cameras for holding one out. With fewer, each camera sees content that no other camera sees."""
@@ -134,10 +134,11 @@ def measured(
         seconds.append(time.perf_counter() - began)
         held += report.outcome.rejected
         unmoved += report.candidate is Candidate.PREVIOUS
-    cameras, limits = scene.rig.cameras, rig_limits(settings.scene.near, scene.world, given.rig.cameras)
+    cameras = [CameraArrays.of(camera) for camera in scene.rig.cameras]
+    renderer = renderer_of("cpu", (0, 0, 0), rig_limits(settings.scene.near, scene.world, given.rig.cameras))
     pairs, pairs_last = (
-        pairs_per_pixel(scene.history.gaussians(index), [CameraArrays.of(camera) for camera in cameras], limits)
-        for index in (0, count - 1)
+        np.concatenate([renderer.pairs_per_pixel(state, camera).ravel() for camera in cameras])
+        for state in map(scene.history.gaussians, (0, count - 1))
     )
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {

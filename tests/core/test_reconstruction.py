@@ -92,6 +92,8 @@ def test_frames_are_committed_and_reported(stepped: tuple[Reconstruction, list[F
         assert len(report.loss) == iterations
         assert report.gaussians == len(scene.history.gaussians(10))
         assert report.moving == scene.history.gaussians(10).moving.sum()
+        assert report.pairs is not None
+        assert 0 < report.pairs.mean < report.pairs.percentile_99
         assert 20 < report.psnr < 60
         assert all(seconds >= 0 for seconds in report.seconds.values())
         assert {"decode", "cascade", "render", "adam"} <= set(report.seconds)

@@ -22,6 +22,7 @@ from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import balance, feature_gradients, projection, tiles
 from scas4d_core.kernels import blend as blend_kernels
+from scas4d_core.kernels import pairs as pair_kernels
 from scas4d_core.kernels.jit import threads
 from scas4d_core.kernels.projection import TILE
 
@@ -319,6 +320,17 @@ class CpuRasterizer:
         feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, gradients, guard_counts)
         self.guards.add(projection.COUNTED_GUARDS_BACKWARD, guard_counts)
         return gradients
+
+    def pairs_per_pixel(self) -> Array:
+        """Returns the number of Gaussians [H, W] that the last forward pass blended into each pixel."""
+        last = self._last
+        height, width = last.camera.height, last.camera.width
+        pairs = self._buffer("pairs_per_pixel", last.transmittance.shape)
+        pair_kernels.count_pairs(
+            last.splats, last.starts, last.items, last.covers, last.tile_order, last.shares, (width, height),
+            self.limits, pairs,
+        )  # fmt: skip
+        return pairs[:height, :width]
 
     @property
     def planes(self) -> Array:

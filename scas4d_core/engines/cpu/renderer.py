@@ -153,6 +153,11 @@ class CpuRenderer:
         )
         return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
 
+    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+        """See ``Renderer.pairs_per_pixel``."""
+        self.render(state, camera, state.features(state.colours))
+        return self.rasterizer.pairs_per_pixel()[::every, ::every].astype(np.int32)
+
     # Losses of iterations, for arrays that are updated in place.
 
     def load_state(self, previous: Gaussians) -> None:

@@ -82,12 +82,14 @@ class Rendered(NamedTuple):
     Attributes:
         features: [H, W, C] rendered features, including the background.
         alpha: [H, W] alpha in [0, 1], one minus the remaining transmittance.
+        pairs: [H, W] number of Gaussians blended into each pixel.
         means: [N, 2] projected means, in pixels. Adaptive density control uses their gradient.
         depths: [N] depths along z, in metres.
     """
 
     features: Tensor
     alpha: Tensor
+    pairs: Tensor
     means: Tensor
     depths: Tensor
 
@@ -129,8 +131,8 @@ def _composite(
     features: Tensor,
     background: Tensor,
     limits: Limits,
-) -> tuple[Tensor, Tensor]:
-    """Composites depth-sorted Gaussians at pixel centres [P, 2], and returns features [P, C] and alpha [P]."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Composites depth-sorted Gaussians at pixel centres [P, 2], and returns features [P, C], alpha and pairs [P]."""
     d = pixels[:, None] - means
     a, b, c = conics.unbind(-1)
     power = -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
@@ -142,7 +144,8 @@ def _composite(
     passed = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)
     remaining = passed[:, -1]
-    return (alpha * before) @ features + remaining[:, None] * background, 1 - remaining
+    pairs = (alpha > 0).sum(dim=1)
+    return (alpha * before) @ features + remaining[:, None] * background, 1 - remaining, pairs
 
 
 def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
@@ -205,7 +208,8 @@ def render(
     shape = (camera.height, camera.width)
     if len(order) == 0:
         empty = background.expand(*shape, -1) + 0 * features.sum()
-        return Rendered(empty, means.new_zeros(shape), projected.means, projected.depths)
+        none = means.new_zeros(shape, dtype=torch.int64)
+        return Rendered(empty, means.new_zeros(shape), none, projected.means, projected.depths)
     (xx, xy), (_, yy) = (row.unbind(-1) for row in projected.covariances[order].unbind(-2))
     conics = torch.stack([yy, -xy, xx], dim=-1) / (xx * yy - xy * xy)[:, None]
     drawn = (projected.means[order], conics, opacities[order], features[order], background, limits)
@@ -215,5 +219,5 @@ def render(
     else:
         parts = [checkpoint(_composite, strip, *drawn, use_reentrant=False) for strip in strips]
     picture = torch.cat([part[0] for part in parts]).reshape(*shape, -1)
-    alpha = torch.cat([part[1] for part in parts]).reshape(shape)
-    return Rendered(picture, alpha, projected.means, projected.depths)
+    alpha, pairs = (torch.cat([part[place] for part in parts]).reshape(shape) for place in (1, 2))
+    return Rendered(picture, alpha, pairs, projected.means, projected.depths)

@@ -128,6 +128,12 @@ class TorchRenderer:
         blocks: NDArray[np.bool_] = padded.reshape(height, BLOCK, width, BLOCK).any(dim=3).any(dim=1).numpy()
         return blocks
 
+    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+        """See ``Renderer.pairs_per_pixel``."""
+        drawn = self._drawn(state, camera, self._seen(state, camera), None)
+        pairs: NDArray[np.int32] = drawn.pairs[::every, ::every].numpy().astype(np.int32)
+        return pairs
+
     def _seen(self, state: Gaussians, camera: CameraArrays) -> Tensor:
         """Returns the features [N, 4] of a state as seen by a camera: RGB including gloss, and label."""
         gloss = None if state.gloss is None else leaf(state.gloss)

@@ -174,6 +174,41 @@ def draw_entries(
     return light
 
 
+@wp.kernel
+def count_pairs(
+    raster: Raster,
+    splats: wp.array[wp.vec4],
+    items: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    every: wp.int32,
+    pairs: wp.array2d[wp.int32],
+) -> None:
+    """Counts the Gaussians that are blended into pixels, with one thread per pixel.
+
+    Args:
+        raster, splats, items, starts: see ``blend_segments``.
+        every: step between the rows and columns that are counted.
+        pairs: [rows, columns] output.
+    """
+    row, column = wp.tid()
+    y = row * every
+    x = column * every
+    tile = (y // TILE) * raster.tiles_x + x // TILE
+    passed = wp.float32(1.0)
+    count = wp.int32(0)
+    entry = starts[tile]
+    while entry < starts[tile + 1] and passed >= raster.stop:
+        first = load(splats, 2 * items[entry])
+        second = load(splats, 2 * items[entry] + 1)
+        power = power_at(first, second, wp.float32(x) + 0.5 - first[0], wp.float32(y) + 0.5 - first[1])
+        if power >= raster.log_floor:
+            passed -= wp.min(fast_exp(power), raster.alpha_cap) * passed
+            if passed >= raster.stop:
+                count += 1
+        entry += 1
+    pairs[row, column] = count
+
+
 @wp.kernel(launch_bounds=(PIXELS, 3))
 def blend_segments(
     raster: Raster,

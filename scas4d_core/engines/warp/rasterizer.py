@@ -144,6 +144,11 @@ class Rasterizer:
         inputs = [*given, background, *state, self._begun, self.planes]
         wp.launch(blend.join_segments, self._tiles * PIXELS, inputs, device=self._device, block_dim=PIXELS)
 
+    def count_pairs(self, every: int, pairs: wp.array) -> None:
+        """Counts the projected Gaussians that are blended into pixels; see ``blend.count_pairs``."""
+        inputs = [self._raster, self.splats, self.items, self.starts, every, pairs]
+        wp.launch(blend.count_pairs, pairs.shape, inputs, device=self._device)
+
     def carry_back(self, cameras: wp.array, view: wp.array, features: wp.array) -> None:
         """Backpropagates ``g_planes`` to ``records``. See ``draw`` for the arguments."""
         given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]

@@ -348,6 +348,15 @@ class WarpRenderer:
         blocks: NDArray[np.bool_] = marks.numpy() != 0
         return blocks
 
+    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+        """See ``Renderer.pairs_per_pixel``."""
+        self._project(state, camera, self._camera(camera), [features_on(self._copies, state)])
+        shape = -(-camera.height // every), -(-camera.width // every)
+        pairs = wp.empty(shape, dtype=wp.int32, device=self.device)
+        self._rasterizer.count_pairs(every, pairs)
+        counted: NDArray[np.int32] = pairs.numpy()
+        return counted
+
     def _camera(self, camera: CameraArrays) -> wp.array:
         return wp.array([camera_of(camera)], dtype=Camera, device=self.device)
 

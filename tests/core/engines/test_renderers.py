@@ -7,11 +7,13 @@ import pytest
 from engine_cases import apart, case, gaussians, rig
 from scipy.spatial.transform import Rotation
 
+from scas4d_core.cameras import Camera
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
-from scas4d_core.engines.renderer import Renderer, levels
+from scas4d_core.engines.renderer import Renderer, levels, pair_counts
 from scas4d_core.engines.torch.renderer import TorchRenderer
 from scas4d_core.engines.views import LABEL, CameraArrays
+from scas4d_core.gaussians import Gaussians
 
 BACKGROUND, LIMITS = (0.1, 0.2, 0.3), Limits(near=0.2)
 TRUE = TorchRenderer(BACKGROUND, LIMITS)
@@ -95,6 +97,32 @@ def test_sums_over_pixels(tested: Renderer) -> None:
     mine, true = (renderer.gather(state, CAMERA, planes) for renderer in (tested, TRUE))
     assert mine.shape == (len(state), 3)
     assert apart(mine, true) < CLOSE
+
+
+def test_pairs_per_pixel(tested: Renderer) -> None:
+    state = gaussians()
+    large = state.replace(factors=2 * state.factors)
+    dense = large.replace(opacities=np.full(len(state), 0.95, np.float32))  # finishes pixels early
+    for each in (state, large, dense):
+        mine, true = (renderer.pairs_per_pixel(each, CAMERA) for renderer in (tested, TRUE))
+        assert mine.dtype == np.int32
+        assert np.mean(mine != true) < 0.005  # float32 against float64 at the edges of supports
+        assert np.abs(mine - true).max() <= 1
+    assert (true < TRUE.pairs_per_pixel(large, CAMERA)).any()
+
+
+def test_gaussians_behind_a_finished_pixel_do_not_count_as_pairs(tested: Renderer) -> None:
+    row = Gaussians.of_points([[0, 0, 2 + 0.1 * i] for i in range(30)], radius=0.2)
+    camera = CameraArrays.of(Camera("front", [[60, 0, 20], [0, 60, 25], [0, 0, 1]], np.eye(4), 40, 50))
+    assert tested.pairs_per_pixel(row, camera)[25, 20] == 4  # each leaves 0.11, and a fifth would leave less than 1e-4
+    faint = row.replace(opacities=np.full(30, 0.01, np.float32))
+    pairs = tested.pairs_per_pixel(faint, camera)
+    assert pairs.shape == (50, 40)
+    assert pairs[25, 20] == 30
+    np.testing.assert_array_equal(tested.pairs_per_pixel(faint, camera, 4), pairs[::4, ::4])
+    counts = pair_counts(tested, faint, [camera] * 7)
+    assert counts.mean == pytest.approx(pairs[::4, ::4].mean())
+    assert counts.percentile_99 == np.percentile(pairs[::4, ::4], 99, method="inverted_cdf")
 
 
 @pytest.mark.parametrize("glossy", [False, True])
