@@ -26,6 +26,10 @@ PICTURE_SUFFIXES = (
     ".jpg", ".jpeg", ".png", ".webp", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".exr", ".dng", ".raw", ".heic", ".gif",
     ".jp2", ".avif",
 )  # fmt: skip
+VIDEO_SUFFIXES = (
+    ".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf", ".wmv", ".flv",
+    ".3gp", ".h264", ".hevc", ".mjpeg",
+)  # fmt: skip
 SPLITS = ("train", "val", "test")
 LISTED = 20
 """Number of names that a remark lists."""
@@ -112,8 +116,8 @@ def listed(names: Sequence[str]) -> str:
 
 
 def stem(path: PurePath) -> str:
-    """Returns the file name without the extension of an image format. Some tools omit the extension."""
-    return path.stem if path.suffix.lower() in PICTURE_SUFFIXES else path.name
+    """Returns the file name without the extension of an image or video format. Some tools omit the extension."""
+    return path.stem if path.suffix.lower() in (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES) else path.name
 
 
 def calibration(

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from client.importers.calibration import Calibration, composed, listed, natural, stem
+from client.importers.calibration import VIDEO_SUFFIXES, Calibration, composed, listed, natural, stem
 from client.importers.pictures import READ, frame_folders, readable_entries
 from client.importers.video.reader import Video
-from client.importers.videos import ENDS
 from scas4d_core.captures import CaptureError, ImageError
 from scas4d_core.captures.images import usual_size
 
@@ -79,7 +78,7 @@ def picture_sources(capture: Path) -> Iterator[PictureSource]:
         root = capture / place
         videos: dict[str, list[Path]] = {}
         for path in sorted(root.iterdir() if root.is_dir() else ()):
-            if path.suffix.lower() in ENDS and path.is_file() and not path.name.startswith("."):
+            if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and not path.name.startswith("."):
                 videos.setdefault(composed(path.stem), []).append(path)
         if videos:
             yield PictureSource("videos", root, videos, own=True)

@@ -16,10 +16,6 @@ from scas4d_core.cameras import minimum_cameras
 from scas4d_core.captures import CaptureError
 from scas4d_core.captures.images import mixed_colours
 
-ENDS = (
-    *(".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf", ".wmv", ".flv"),
-    *(".3gp", ".h264", ".hevc", ".mjpeg"),
-)
 RATE_TOLERANCE = 1e-3
 """Maximum relative difference between the frame rates of two cameras, roughly that between 29.97 and 30."""
 ALIKE = 0.05

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.calibration import PICTURE_SUFFIXES, Calibration, calibration_of_cameras
+from client.importers.calibration import Calibration, calibration_of_cameras, stem
 from client.importers.formats.documents import number, read_xml, whole
 from client.importers.formats.opencv_camera import numbers
 from client.importers.lens import LensCamera, lens_camera
@@ -78,8 +78,8 @@ def read_metashape(path: Path) -> Calibration:
 def _label(camera: Element) -> str:
     """Returns the name of a camera, which Metashape takes from the image, in some versions with its extension."""
     label = camera.get("label") or f"camera {camera.get('id')}"
-    end = f".{label.rpartition('.')[2].lower()}"
-    return label[: -len(end)] if end in PICTURE_SUFFIXES else label
+    path = PurePosixPath(label)
+    return label.removesuffix(path.suffix) if stem(path) != path.name else label
 
 
 def _posed(camera: Element) -> bool:

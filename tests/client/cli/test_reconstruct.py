@@ -61,7 +61,7 @@ def test_images_that_cannot_be_used_are_left_out(capture_folder, tmp_path, capsy
         reconstruct(open_source(folder), tmp_path / "out", frames=3, preset="scas4d", changes=CHANGES)
     history = History.load(tmp_path / "out/states")
     assert history.indices == [index for index in range(3) if index != frame]
-    with pytest.raises(CaptureError, match="truncated .*; scores need every frame"):
+    with pytest.raises(CaptureError, match=r"truncated .*; scores need every frame"):
         evaluate(folder, tmp_path / "scores", frames=3, changes=CHANGES, report=lambda line: None)
 
 

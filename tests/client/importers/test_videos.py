@@ -122,6 +122,14 @@ def test_a_rig_of_videos_is_a_source(rig_of_videos):
     assert open_source(rig_of_videos).encoded_image(5, "cam1").startswith(b"\xff\xd8")
 
 
+@pytest.mark.parametrize("path", ["videos/{}.mp4", "./{}.MOV", "{}"])
+def test_a_calibration_may_name_videos(rig_of_videos, path):
+    write(rig_of_videos / "transforms.json", transforms(lenses("PINHOLE"), "PINHOLE", path=path))
+    capture = open_source(rig_of_videos)
+    assert set(capture.rig.names) == set(NAMES)
+    assert number(capture.frame(1).images[NAMES[0]]) == 1
+
+
 def test_frames_of_videos_reach_the_reconstruction_scaled(rig_of_videos):
     capture = open_source(rig_of_videos, image_scale=0.5, test=("cam2",))
     assert (capture.rig.names, capture.test_rig.names) == (("cam1", "cam10"), ("cam2",))
