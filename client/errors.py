@@ -140,11 +140,12 @@ def unreachable(url: str, error: Exception, attempts: int = 1) -> ServiceUnreach
 def _proxy_of(url: str) -> str | None:
     """Returns the address of the proxy that the environment sets for a URL, without its password, or None."""
     target = httpx.URL(url)
-    proxies = urllib.request.getproxies()
-    proxy = proxies.get(target.scheme, proxies.get("all"))
-    if not proxy or urllib.request.proxy_bypass(target.host):
+    if urllib.request.proxy_bypass(target.host):
         return None
-    return proxy.rsplit("@", 1)[-1]
+    proxies = urllib.request.getproxies()
+    kinds = {"ws": ("ws", "socks", "https", "http"), "wss": ("wss", "socks", "https")}  # as in websockets.proxy
+    proxy = next(filter(None, map(proxies.get, kinds.get(target.scheme, (target.scheme, "all")))), None)
+    return None if proxy is None else proxy.rsplit("@", 1)[-1]
 
 
 BY_STATUS: dict[int, type[ServiceError]] = {

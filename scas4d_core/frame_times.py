@@ -101,10 +101,8 @@ def time_warnings(frames: Sequence[FrameTime], fps: float) -> list[str]:
     newest, warnings = frames[-1], []
     steps = [(later.sent - earlier.sent) / (later.index - earlier.index) for earlier, later in pairwise(frames)]
     step = median_low([step for step in steps if step > 0] or [0.0])
-    unit, unix = (
-        _unit(step * fps),
-        next((name for name, scale in UNITS.items() if 1e9 <= newest.sent / scale < 1e10), ""),
-    )
+    unit = _unit(step * fps)
+    unix = next((name for name, scale in UNITS.items() if 1e9 <= newest.sent / scale < 1e10), "")
     if step == 0 and unix:
         unit = unix
     if unit != "seconds" or unix == "seconds":

@@ -146,7 +146,7 @@ def _lacks_only_cameras(client: Client, status: SceneStatus) -> bool:
         bool(report.dropped_cameras)
         and not report.degraded
         and status.error is not None
-        and (status.error.startswith(f"frame {report.index} "))
+        and status.error.startswith(f"frame {report.index} ")
     )
 
 

@@ -119,7 +119,8 @@ class PictureFiles:
         last = self._last.get(camera, -1)
         if 0 <= last < index:
             raise ImageError(f"{self._files[last][camera]} is its last image")
-        raise ImageError(f"camera {camera!r} has no image that belongs to {next(iter(files.values()))}")
+        there = next(iter(files.values()), None)
+        raise ImageError(f"camera {camera!r} has no image that belongs to {there or f'frame {self._names[index]!r}'}")
 
     def masks(self, masks: Frames) -> list[Mapping[str, Path]]:
         """Returns the masks of each frame [T], keyed by camera name.
@@ -178,10 +179,12 @@ def frames_of_cameras(folders: Mapping[str, Path], *, what: str = "images") -> d
 def _without_common_frame(frames: Frames, cameras: Sequence[str]) -> str | None:
     """Returns a camera that has none of the frames of which most cameras have a file, or None if there is no such one.
 
-    Its files are probably named differently. A camera that lacks single files is not returned.
+    Its files are probably named differently. A camera that lacks single files is not returned. Of several such cameras,
+    the one with the fewest files is returned.
     """
     common = [files for files in frames.values() if 2 * len(files) > len(cameras)]
-    return next((camera for camera in cameras if not any(camera in files for files in common)), None)
+    alone = [camera for camera in cameras if not any(camera in files for files in common)]
+    return min(alone, key=lambda camera: sum(camera in files for files in frames.values()), default=None)
 
 
 def frames_of_folders(root: Path, stems: Mapping[str, str]) -> dict[str, dict[str, Path]]:

@@ -132,9 +132,12 @@ class Sender:
             index = last + 1
 
     def _last_of_batch(self, index: int, count: int) -> int:
-        """Returns the last frame to send together with frame `index`; frame 0 and lost frames are on their own."""
+        """Returns the last frame to send together with frame `index`.
+
+        Lost frames and the first frame that is not lost are sent on their own.
+        """
         last = index
-        if index > 0 and self._cameras is None and not self._pace.drops(index):
+        if index > len(self._delivery.lost) and self._cameras is None and not self._pace.drops(index):
             while last + 1 < min(index + self._batch, count) and not self._pace.drops(last + 1):
                 last += 1
         return last

@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from client.cli import main
-from client.errors import NotFound, ServiceUnreachable
+from client.errors import NotFound, ServiceUnreachable, unreachable
 from client.ingest import IngestSocket
 from client.sdk import Client
 
@@ -89,6 +89,9 @@ def test_a_proxy_of_the_environment_is_named(closed_port, monkeypatch):
     assert text.endswith(f"through the proxy 127.0.0.1:{closed_port}, from the environment")
     assert "secret" not in text
     assert not refused
+    websocket = unreachable("ws://scas4d.example/v1/scenes/s/stream", ConnectionRefusedError(111, "refused"))
+    assert str(websocket).endswith(f"through the proxy 127.0.0.1:{closed_port}, from the environment")
+    assert not websocket.refused
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from rigs import NAMES, lenses, transforms, write, write_pictures
 
 from client.importers.calibration import natural
 from client.importers.open_source import open_source
+from client.importers.pictures import frames_of_cameras
 from scas4d_core.captures import CaptureError, ImageError, decode_image, decode_mask
 
 
@@ -143,6 +144,28 @@ def timed(tmp_path, times=(0.0, 0.04, 0.1)):
         meta["frames"] += [one | {"time": time} for one in more]
     write_pictures(tmp_path / "images", frames=[f"{t:06d}" for t in range(len(times))])
     return meta
+
+
+def test_a_listed_frame_without_any_file_has_no_usable_image(tmp_path):
+    write(tmp_path / "transforms.json", timed(tmp_path))
+    for camera in NAMES:
+        (tmp_path / f"images/{camera}/000001.png").unlink()
+    source = open_source(tmp_path)
+    assert source.frame_count == 3
+    assert source.usable_frame(1)[1] == {
+        camera: f"camera {camera!r} has no image that belongs to frame '000001'" for camera in NAMES
+    }
+    assert source.usable_frame(2)[1] == {}
+
+
+def test_of_cameras_without_common_frames_the_one_with_the_fewest_files_is_named(tmp_path):
+    folders = {"a": ("0", "1", "2"), "b": ("0",), "c": ("1",), "d": ("2",)}
+    for camera, frames in folders.items():
+        (tmp_path / camera).mkdir()
+        for frame in frames:
+            (tmp_path / camera / f"{frame}.png").touch()
+    with pytest.raises(CaptureError, match=r"b has no images for 2 of 3 frames \(1, 2\), but 'a' has them"):
+        frames_of_cameras({camera: tmp_path / camera for camera in folders})
 
 
 def test_times_of_the_calibration_are_taken(tmp_path):
