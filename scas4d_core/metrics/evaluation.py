@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from numpy.typing import NDArray
 from scas4d_core import metrics
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import Capture
-from scas4d_core.query.tracks import depth_tolerance
 
 if TYPE_CHECKING:
     from scas4d_core.query.committed import CommittedScene
@@ -107,19 +105,12 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
     sorted_errors = metrics.error_by_confidence(tracks.positions, points, tracks.confidence, moving, extent)
     at_last = metrics.track_error_3d(tracks.positions[[0, -1]], points[[0, -1]], moving, extent)
 
-    tolerance = depth_tolerance(reconstruction.history, reconstruction.world, indices[0])
     centroids = reconstruction.world.to_user(reconstruction.history.stacked("means", list(indices)))
     by_camera: list[Scores] = []
     seen_anywhere, visible_anywhere = np.zeros((2, *points.shape[:2]), bool)
     for camera in rig.cameras:
-
-        @cache  # two sets of tracks need the depth of each frame
-        def depth(camera: Camera, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
-            view = reconstruction.render(camera, index)
-            return view.depth, view.alpha
-
         (true_uv, true_depth), visible = camera.project(points), truth.visible_in(camera.name)[list(indices)]
-        seen = tracks.with_visibility(camera, depth, tolerance).visibility[camera.name]
+        seen = reconstruction.with_visibility(tracks, camera, indices[0]).visibility[camera.name]
         seen_anywhere |= seen
         visible_anywhere |= visible
         scores: Scores = {"visibility_accuracy": metrics.visibility_accuracy(seen, visible)}
@@ -133,7 +124,6 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
                 metrics.median_trajectory_error(measured_tracks.pixels(camera), uv, counted, diagonal)
             )
             scores["mte_2d_oracle"] = _finite(metrics.median_trajectory_error(oracle, uv, counted, diagonal))
-            measured_tracks = measured_tracks.with_visibility(camera, depth, tolerance)
             distances = np.linalg.norm(measured_tracks.positions - points[:, asked], axis=-1)
             thresholds = metrics.tapvid_thresholds(true_depth[:, asked], (camera.fx, camera.fy))
             scores |= _benchmark("tapvid", distances, measured_tracks.visibility[camera.name], counted, thresholds)
