@@ -101,7 +101,6 @@ class AttemptStart:
         samples: samples of the moving Gaussians, each with [S] int64 indices in hierarchy order.
             ``StepScalars.sample`` selects one of them.
         gains: [cameras, 3] initial camera gains, in the plan's camera order, or None if gains are not estimated.
-        curve: whether to compute terms that only affect the reported loss, not the state.
         lap: callback that receives the name of each stage when the stage ends. The stages depend on the engine.
     """
 
@@ -115,7 +114,6 @@ class AttemptStart:
     beta2: float
     samples: Sequence[NDArray[np.int64]]
     gains: Array | None = None
-    curve: bool = True
     lap: Callable[[str], None] = lambda stage: None
 
     @property

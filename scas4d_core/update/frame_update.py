@@ -46,13 +46,10 @@ class FrameUpdate:
         settings: settings of the updates.
         plan: plan of the updates.
         hierarchy: hierarchy of the moving Gaussians.
-        curve: whether to compute loss terms that only the report needs, and that affect neither state nor evidence.
 
     Raises:
         EngineError: if the engine does not support the plan.
     """
-
-    curve = True
 
     def __init__(self, engine: UpdateEngine, built: PlanBuilder, neighbours: Neighbours | None) -> None:
         self.settings, self.hierarchy = built.update, built.hierarchy
@@ -168,7 +165,7 @@ class FrameUpdate:
         return AttemptStart(
             layers=rates.layers, position=rates.position, rotation=rates.rotation, scale=rates.scale,
             colour=moving, static_colour=static, beta1=rates.beta1, beta2=rates.beta2,
-            samples=samples, gains=gains, curve=self.curve, lap=watch.lap,
+            samples=samples, gains=gains, lap=watch.lap,
         )  # fmt: skip
 
     def _step(self, rates: Rates, iteration: int, planned: int, planned_before: int, samples: int) -> StepScalars:

@@ -103,19 +103,17 @@ def _report(rows: Sequence[Row]) -> list[str]:
     lines = [
         "## Cost of the report",
         "",
-        "The stage `report` of a `scas4d` update comprises stage timers, losses that only the curve requires, colour",
-        "shifts, and assembling, writing and publishing the report. *With : without* is the CPU time ratio of the same",
-        "updates with and without the optional work in the iterations, run in alternation; median and quartiles.",
+        "The stage `report` of a `scas4d` update comprises stage timers, colour shifts, and assembling, writing and",
+        "publishing the report.",
         "",
-        "| capture | updates | report ms | report: % of an update | worst update | with : without | |",
-        "|---|---|---|---|---|---|---|",
+        "| capture | updates | report ms | report: % of an update | worst update | |",
+        "|---|---|---|---|---|---|",
     ]
     for row in rows:
         verdict = "reached" if row["share"] <= TARGET else "**missed**"
-        low, high = row["ratio_quartiles"]
         lines.append(
             f"| {row['capture']} | {row['updates']} | {row['milliseconds']:.1f} | {100 * row['share']:.2f}% "
-            f"| {100 * row['share_worst']:.2f}% | {row['ratio']:.3f} ({low:.3f} to {high:.3f}) | {verdict} |"
+            f"| {100 * row['share_worst']:.2f}% | {verdict} |"
         )
     return [*lines, "", f"Target: at most {100 * TARGET:.0f}% of an update.", ""]
 

@@ -17,7 +17,6 @@ wp.set_module_options({"enable_backward": False})
 def step_colours(
     adam: Adam,
     weight: wp.float32,
-    reported: wp.int32,
     learned: wp.array[wp.int32],
     before: wp.array2d[wp.float32],
     g_features: wp.array2d[wp.float32],
@@ -31,7 +30,6 @@ def step_colours(
     Args:
         adam: optimizer for the colours.
         weight: weight of each element's absolute change.
-        reported: 1 to add the soft-colour loss to ``losses``, which only the report needs, otherwise 0.
         learned: [N] flags, 1 for Gaussians whose colours are learned, otherwise 0.
         before: [N, 4] features of Θ_{t−1}.
         g_features: [N, 4] gradients of the rendering losses.
@@ -47,8 +45,7 @@ def step_colours(
         g = g_features[i, k]
         if change != 0.0:
             g += weight * wp.sign(change)
-            if reported == 1:
-                wp.atomic_add(losses, iteration[0], weight * wp.abs(change))
+            wp.atomic_add(losses, iteration[0], weight * wp.abs(change))
     gradients[i, k] = g
     step_element(adam, features, i, k, g)
 
@@ -86,7 +83,6 @@ class WarpColours:
 
     def begin(self, start: AttemptStart) -> None:
         """Starts an attempt, with zero moments."""
-        self._reported = int(start.curve)
         by_row = self.optimizer.adam.by_row
         by_row.fill_(start.static_colour if self._static else 0.0)
         wp.launch(set_rows, len(self._rows), [self._rows, start.colour, by_row], device=self._device)
@@ -96,5 +92,5 @@ class WarpColours:
         self, before: wp.array, g_features: wp.array, features: wp.array, iteration: wp.array, losses: wp.array
     ) -> None:
         """Performs one optimization step; see ``step_colours``."""
-        given = [self.optimizer.adam, self._weight, self._reported, self._learned, before, g_features, features]
+        given = [self.optimizer.adam, self._weight, self._learned, before, g_features, features]
         wp.launch(step_colours, (self._count, 3), [*given, self.gradients, iteration, losses], device=self._device)

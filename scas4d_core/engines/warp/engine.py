@@ -167,7 +167,7 @@ class WarpEngine:
         """See ``UpdateEngine.begin``."""
         self._start = start
         replaced = self._deformation.begin(start)
-        captured_for = start.beta1, start.beta2, start.gains is None, start.curve
+        captured_for = start.beta1, start.beta2, start.gains is None
         if replaced or captured_for != self._captured_for:
             self._graphs.forget()
         self._captured_for = captured_for
