@@ -73,6 +73,19 @@ def test_a_frame_below_the_minimum_is_left_out_and_the_next_one_starts(client, f
     assert "1 frame left out, because fewer than 2 of 2 cameras had a usable image" in delivery.left_out.summary
 
 
+def test_the_first_frame_of_a_scene_is_sent_on_its_own(client, folder, monkeypatch):
+    spoil(folder, 0, 0)
+    batches, put_frames = [], Client.put_frames
+
+    def record(self, scene, frames):
+        batches.append([frame.index for frame in frames])
+        return put_frames(self, scene, frames)
+
+    monkeypatch.setattr("client.rig.sender.Client.put_frames", record)
+    push(open_source(folder), client, ingest=IngestSettings(minimum_cameras=2), batch=3)
+    assert batches == [[2, 3]]
+
+
 def test_the_minimum_of_an_existing_scene_applies(client, folder):
     spoil(folder, 0, 2)
     scene = client.create_scene(open_source(folder).rig, ingest=IngestSettings(minimum_cameras=2)).id
@@ -112,11 +125,10 @@ def test_points_that_are_refused_leave_no_scene(client, folder):
 def test_an_older_scene_and_one_with_frames_are_kept_after_an_error(client, folder, monkeypatch):
     capture = open_source(folder)
     older = client.create_scene(capture.rig).id
-    for name in ("put_frame",):
-        with monkeypatch.context() as patch:
-            patch.setattr(f"client.rig.sender.Client.{name}", _raise(RuntimeError("later")))
-            with pytest.raises(RuntimeError, match="later"):
-                push(capture, client, scene=older)
+    with monkeypatch.context() as patch:
+        patch.setattr("client.rig.sender.Client.put_frame", _raise(RuntimeError("later")))
+        with pytest.raises(RuntimeError, match="later"):
+            push(capture, client, scene=older)
     assert [status.id for status in client.scenes()] == [older]
     put_frame = Client.put_frame
 
