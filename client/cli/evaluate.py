@@ -195,6 +195,9 @@ def measure(
 
     Returns:
         The reconstruction and the measured row.
+
+    Raises:
+        CaptureError, ImageError: if an image to score cannot be used, or a frame has too few usable images.
     """
     truth, given = job.open_truth(), job.open_given()
     unseen = given.full_test_rig is not None
@@ -211,6 +214,8 @@ def measure(
     def note(message: str) -> None:
         if left_out.frames:
             raise CaptureError(f"{given.name}: {message}; scores need every frame")
+        if not unseen:
+            raise CaptureError(f"{given.name}: {message}; scores of training cameras need every image")
         report(f"    {message}")
 
     with Bars(Console(stderr=True)) as bars:

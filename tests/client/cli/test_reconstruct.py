@@ -65,6 +65,16 @@ def test_images_that_cannot_be_used_are_left_out(capture_folder, tmp_path, capsy
         evaluate(folder, tmp_path / "scores", frames=3, changes=CHANGES, report=lambda line: None)
 
 
+def test_scores_of_training_cameras_need_every_image(capture_folder, tmp_path):
+    folder = shutil.copytree(capture_folder, tmp_path / "tiny")
+    (folder / "test_meta.json").unlink()
+    (folder / "ims/0/000001.png").write_bytes(b"")
+    said: list[str] = []
+    with pytest.raises(CaptureError, match=r"frame 1, without camera 0: .*; scores of training cameras need every"):
+        evaluate(folder, tmp_path / "scores", frames=3, changes=CHANGES, report=said.append)
+    assert any("frame   0/2" in line for line in said)
+
+
 def test_scores_are_printed_and_not_measured_twice(capture_folder, tmp_path):
     said: list[str] = []
     row = evaluate(capture_folder, tmp_path, frames=2, changes=CHANGES, report=said.append)
