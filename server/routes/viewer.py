@@ -29,9 +29,9 @@ async def page(request: Request) -> Response:
 
 @router.get("/")
 @router.get("/viewer")
-async def elsewhere() -> Response:
+async def elsewhere(request: Request) -> Response:
     """Redirects to the viewer page, with a relative URL because a proxy may serve the page under a path prefix."""
-    return RedirectResponse("viewer/")
+    return RedirectResponse(f"viewer/?{request.url.query}" if request.url.query else "viewer/")
 
 
 @router.get("/viewer/{name:path}")

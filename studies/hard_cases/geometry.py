@@ -184,7 +184,8 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
         blend(
             splats, features, (0,), np.arange(tiles + 1) * len(order), np.tile(order, tiles),
             np.full(tiles * len(order), 2**64 - 1, np.uint64), np.full(tiles, 2**64 - 1, np.uint64),
-            np.arange(tiles), 1, (view.width, view.height), black, rasterizer.limits, image, transmittance,
+            np.arange(tiles), np.array([0, tiles]), (view.width, view.height), black, rasterizer.limits, image,
+            transmittance,
         )  # fmt: skip
         changed += int((image[:, : view.height, : view.width] != picture).any(axis=0).sum())
     return [f"culling changes {changed} pixels"] if changed else []

@@ -47,8 +47,8 @@ PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "held_back": (
         (
             "engines/cpu/deformation.py",
-            "sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)",
-            "sound: NDArray[np.bool_] = np.ones(len(held), bool)",
+            "find_finite(np.ascontiguousarray(previous.means), np.ascontiguousarray(previous.factors), moving, sound)",
+            "sound[:] = True",
         ),
     ),
     "left_out_of_hierarchy": (

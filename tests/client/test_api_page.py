@@ -130,10 +130,8 @@ def test_the_dump_of_a_frame_is_what_the_client_sends():
     (shown,) = [text for _, language, text in FENCE.findall(PAGE) if not language and "S4DF" in text]
     first, *rest = frame_chunks(7, {"a": b"\xff\xd8\xff", "b": b"\x89P"}, {"a": b"M"}, 0.25)
     assert shown == dump(b"".join([first, *rest]))
-    assert (
-        f"H = {len(first) - 8}; the header ends at offset 8 + {len(first) - 8} = {len(first)} (`{len(first):x}`)"
-        in PAGE
-    )
+    assert f"H is {len(first) - 8} (`{len(first) - 8:02x} 00 00 00`)" in PAGE
+    assert f"begins at offset {len(first)} (`{len(first):x}`)" in PAGE
 
 
 def test_the_head_and_its_limits_are_those_of_the_wire():

@@ -151,4 +151,5 @@ def test_a_gpu_that_is_not_there_is_refused_with_the_reason(http):
 
 
 def test_addresses_of_the_page_may_have_parameters(service):
-    assert httpx.get(f"{service.url}/?from=mail", timeout=HANG_S).status_code == 200
+    response = httpx.get(f"{service.url}/?from=mail", timeout=HANG_S, follow_redirects=True)
+    assert (response.status_code, str(response.url)) == (200, f"{service.url}/viewer/?from=mail")
