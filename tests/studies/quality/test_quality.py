@@ -16,7 +16,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import evaluation as measures
 from scas4d_core.query.parts import parts
-from scas4d_core.query.tracks import tracks_of_pixels, tracks_of_points
+from scas4d_core.query.tracks import depth_tolerance, tracks_of_pixels, tracks_of_points
 from scas4d_core.storage.history import History
 from studies.quality import quality
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
@@ -114,7 +114,7 @@ class Perfect:
     fitted = 0
 
     @classmethod
-    def start(cls, rig, frame, settings, *, points=None, progress=None, static=None, history=None):
+    def start(cls, rig, frame, settings, *, points=None, progress=None, static=None, history=None, dropped=None):
         self = cls()
         self.world, self.history = WorldFrame(np.zeros(3)), History()
         self._commit(0)
@@ -122,7 +122,7 @@ class Perfect:
         cls.fitted = cls.fitted + (static is None)
         return self
 
-    def step(self, frame):
+    def step(self, frame, *, dropped=None, started=None):
         self._commit(frame.index)
         return types.SimpleNamespace(seconds={"render": 0.5, "losses": 0.25}, moving=2, gaussians=3, alarms=[])
 
@@ -153,12 +153,15 @@ class Perfect:
     def tracks_of_points(self, points, index, indices):
         return tracks_of_points(self.history, self.world, points, index, indices)
 
-    def tracks_of_pixels(self, camera, uv, index, indices):
-        def depth(seen_by, at):
-            view = self.render(seen_by, at)
-            return view.depth, view.alpha
+    def _depth(self, camera, index):
+        view = self.render(camera, index)
+        return view.depth, view.alpha
 
-        return tracks_of_pixels(self.history, self.world, camera, uv, index, indices, depth)
+    def tracks_of_pixels(self, camera, uv, index, indices):
+        return tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
+
+    def with_visibility(self, tracks, camera, index):
+        return tracks.with_visibility(camera, self._depth, depth_tolerance(self.history, self.world, index))
 
     def parts(self, count=None):
         return parts(self.history, count)
@@ -341,7 +344,11 @@ def test_frame_0_is_shared_by_those_who_see_the_same(capture_folder):
     for same in (["update.clusters=[64]"], ["update.iterations=2000"]):
         assert first_frame_key(capture, settings_of("scas4d", changes=same)) == name
     assert first_frame_key(capture, settings_of("dynamic3dgs", 300)) == name
-    later = FileReader(capture.pictures.images[1:], capture.pictures.masks, {})
+    later = FileReader(
+        capture.pictures.images[1:],
+        capture.pictures.masks,
+        {camera.name: (camera.width, camera.height) for camera in capture.full_rig.cameras},
+    )
     others = {
         name,
         first_frame_key(open_capture(capture_folder, use_masks=False), settings),
