@@ -122,7 +122,7 @@ class Perfect:
         cls.fitted = cls.fitted + (static is None)
         return self
 
-    def step(self, frame, *, dropped=None, started=None):
+    def step(self, frame, dropped=None, started=None):
         self._commit(frame.index)
         return types.SimpleNamespace(seconds={"render": 0.5, "losses": 0.25}, moving=2, gaussians=3, alarms=[])
 
@@ -153,15 +153,15 @@ class Perfect:
     def tracks_of_points(self, points, index, indices):
         return tracks_of_points(self.history, self.world, points, index, indices)
 
-    def _depth(self, camera, index):
-        view = self.render(camera, index)
-        return view.depth, view.alpha
-
     def tracks_of_pixels(self, camera, uv, index, indices):
         return tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
 
     def with_visibility(self, tracks, camera, index):
         return tracks.with_visibility(camera, self._depth, depth_tolerance(self.history, self.world, index))
+
+    def _depth(self, seen_by, at):
+        view = self.render(seen_by, at)
+        return view.depth, view.alpha
 
     def parts(self, count=None):
         return parts(self.history, count)
