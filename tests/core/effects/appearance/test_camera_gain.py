@@ -137,14 +137,3 @@ def test_an_attempt_starts_from_the_exposures_of_the_frame_and_not_from_those_of
     for view, gain in zip(first.views, first.carried[NAME]["gains"], strict=True):
         np.testing.assert_array_equal(view.exposure[:3], gain_to_exposure(gain))
         assert not (view.exposure[:3] == [1, 0]).all()
-
-
-def test_evidence_is_the_same_where_no_report_is_told() -> None:
-    said = []
-    for tells in (True, False):
-        scene = started("auto", told=True)
-        scene._prepared.updater.curve = tells  # type: ignore[attr-defined]
-        scene.step(shot(1, GAINS))
-        said.append(scene._prepared.carried.switches[NAME])
-    assert said[0] == said[1]
-    assert said[0].on
