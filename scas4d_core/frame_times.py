@@ -56,8 +56,8 @@ def time_after(previous: FrameTime | None, index: int, sent: float, fps: float) 
 
     The sent time is used if it is later than the previous frame by ``SHORTEST_STEP`` to ``LONGEST_STEP``. Otherwise,
     the frame follows the previous one by the difference of their sent times or, if that is no such step either, by the
-    interval at the frame rate. Thus, a single wrong timestamp affects one frame, and a clock that was set shifts all
-    later times.
+    interval at the frame rate. Thus, a timestamp that is too early or more than a day late affects one frame. A clock
+    that was set, or a timestamp that is less than a day late, shifts all later times.
 
     Args:
         previous: the previous frame that has a time, or None.

@@ -78,8 +78,8 @@ class StateCompactor:
             return
         if self._compaction is None:
             self._compaction = Compaction(history, lambda: self._head(history), exact)
-        if self._compaction.due > 2 * BEHIND:
-            self.wait()
+        if self._writing is not None and self._compaction.due > 2 * BEHIND:
+            wait([self._writing[1]])
         if not self._finish():
             return
         if self._writing is None and (due := self._compaction.due) and (due > BEHIND or not waits()):
