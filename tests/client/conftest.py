@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, Running, fake_settings, make_rig
+from waiting import HANG_S
+
+from client.sdk import Client
 
 FRAMES = 4
 
@@ -25,6 +28,15 @@ def service(tmp_path_factory):
     running = Running(fake_settings(tmp_path_factory.mktemp("data")))
     yield running
     running.stop()
+
+
+@pytest.fixture
+def client(service):
+    """A client of the service, whose scenes are deleted afterwards."""
+    with Client(service.url, busy_timeout=HANG_S) as client:
+        yield client
+        for status in client.scenes():
+            client.delete_scene(status.id)
 
 
 @pytest.fixture(scope="session")

@@ -22,14 +22,6 @@ def capture(capture_folder):
     return open_capture(capture_folder)
 
 
-@pytest.fixture
-def client(service):
-    with Client(service.url, busy_timeout=HANG_S) as client:
-        yield client
-        for status in client.scenes():
-            client.delete_scene(status.id)
-
-
 def test_losses_and_lateness_are_the_same_every_time():
     pace = Pace(fps=5, jitter=0.1, drop=0.3, seed=4)
     lost = [index for index in range(1000) if pace.drops(index)]

@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH
 from typer.testing import CliRunner
-from waiting import HANG_S
 
 from client.cli.main import app
 from client.errors import InvalidRequest, ServiceUnreachable
@@ -20,14 +19,6 @@ from client.rig import push
 from client.sdk import Client
 from client.wire import IngestSettings, ProblemDetails
 from scas4d_core.captures import Capture, CaptureError
-
-
-@pytest.fixture
-def client(service):
-    with Client(service.url, busy_timeout=HANG_S) as client:
-        yield client
-        for status in client.scenes():
-            client.delete_scene(status.id)
 
 
 @pytest.fixture
