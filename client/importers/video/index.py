@@ -37,7 +37,7 @@ FIXED_POINT = 1 << 16
 class VideoIndex:
     """Visible frames of a video, in the order in which decoding from the start returns them.
 
-    The index ends before the first frame that is lost, because the decoder does not tell how many are lost.
+    The index ends before the first frame that is lost, because the decoder does not report how many are lost.
 
     Attributes:
         stamps: [T] int64 timestamps in units of the stream's time base; `NO_STAMP` if a frame has none.
