@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 FIRST_DB = -9.0
-"""Offset from a camera's usual level, when first rendered, below which it is excluded at once. Clean captures reach
--6.1."""
+"""Offset from a camera's usual level, when first rendered, below which it is compared with the others again, in one
+state. If the offset is still below this value, the camera is excluded at once. First renderings of clean captures reach
+-7.7, because some cameras are rendered before the update has followed the motion."""
 LAST_DB = -5.0
-"""Same as ``FIRST_DB``, but when last rendered. The camera is then excluded starting with the next frame. Clean
-captures reach -3.7, and cameras that moved by one or two pixels reach -6 to -15."""
-NEAR_DB = -4.0
+"""Offset when last rendered, without errors that other cameras confirm (``confirmed_errors``), below which a camera is
+excluded starting with the next frame. Cameras that moved by one or two pixels reach -6 to -15."""
+NEAR_DB = -3.0
 """Offset below which a camera is suspect. Its usual level is then not updated, so a lasting fault remains visible. Two
-consecutive suspect frames raise an alarm. Clean captures reach -3.7."""
-FITS_DB = -4.0
+consecutive suspect frames raise an alarm. Without confirmed errors, clean captures reach -3.2."""
+FITS_DB = -3.0
 """Offset above which an excluded camera is accepted again. Until then, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""

@@ -6,9 +6,10 @@ fits the frame (``outliers``), the previous state is kept and the report states 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from math import nan
 from time import perf_counter
 
@@ -27,6 +28,7 @@ from scas4d_core.robust.checks import (
     measure_light_gain,
     with_light_gain,
 )
+from scas4d_core.robust.confirmed_errors import credited_decibels
 from scas4d_core.robust.first_motion import OrderResult, best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shift_moving
@@ -269,7 +271,7 @@ class FrameSolver:
         return replace(
             template,
             stopping=stopping,
-            gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.reject_outliers else None,
+            gate=partial(self._find_outliers, given) if settings.reject_outliers else None,
             compare=settings.reject_outliers or settings.stop_gain > 0,
             skip_below=skip_below if settings.skip_tolerance > -1 and template is AS_CONFIGURED else None,
             confirm_skip=lambda: mean_is_within(self._full_size_errors(given.views, given.state), skip_below),
@@ -356,10 +358,13 @@ class FrameSolver:
     def _accepted(self, given: UpdateInput, result: UpdateResult) -> Solved:
         trace, psnr = result.trace, result.trace.fits
         with self._time_checks():
-            # In short updates, a camera may have been last rendered long before the end, so misfits are checked again.
-            off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
-            again = [view for view in result.views or given.views if view.name in off]
-            psnr |= self._psnr_by_camera([*again, *given.suspects], result.gaussians)
+            # In short updates, a camera may have been last rendered long before the end, so it is rendered again.
+            off, views = outliers.offsets(given.past, psnr), result.views or given.views
+            doubtful = [view for view in views if view.name in off and outliers.in_doubt(given.past, off[view.name])]
+            doubtful += given.suspects
+            psnr |= self._psnr_by_camera(doubtful, result.gaussians)
+            names = [view.name for view in doubtful]
+            psnr = self._with_credit(given.past, psnr, names, [*views, *given.suspects], result.gaussians)
         moved = trace.kept is not Candidate.PREVIOUS or given.past.updates > 0
         past = outliers.past_after_update(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
@@ -373,6 +378,46 @@ class FrameSolver:
     def _full_size_errors(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         with self._time_checks():
             return committed_errors(self._factory.rig, self._renderer, views, state)
+
+    def _find_outliers(
+        self, given: UpdateInput, first: Mapping[str, float], current: Callable[[], Gaussians]
+    ) -> Mapping[str, str]:
+        """Returns the cameras that contradict the others, with the reasons; see ``AttemptOptions.gate``.
+
+        The first renderings are from different iterations. The cameras that fit worst are therefore compared with the
+        others again, in one state.
+        """
+        doubtful = outliers.misfits(given.past, first, outliers.FIRST_DB)
+        if not doubtful:
+            return {}
+        state = current()
+        psnr = self._psnr_by_camera(given.views, state)
+        psnr = self._with_credit(given.past, psnr, doubtful, given.views, state)
+        out = outliers.misfits(given.past, psnr, outliers.FIRST_DB)
+        return {name: reason for name, reason in out.items() if name in doubtful}
+
+    def _with_credit(
+        self,
+        past: Past,
+        psnr: Mapping[str, float],
+        doubtful: Collection[str],
+        views: Sequence[TrainingView],
+        state: Gaussians,
+    ) -> dict[str, float]:
+        """Returns the PSNR of each camera in dB, for doubtful ones without the errors that other cameras confirm.
+
+        A credited camera fits at most as usual, so it does not change what is usual for the others.
+
+        Args:
+            past: usual values of the cameras.
+            psnr: PSNR of each camera in dB.
+            doubtful: names of the cameras that may be faulty.
+            views: views of the frame.
+            state: state to compare the views with.
+        """
+        low = {name: -off for name, off in outliers.offsets(past, psnr).items() if name in doubtful and off < 0}
+        credits = credited_decibels(low, views, self._factory, self._renderer, state) if low else {}
+        return {**psnr, **{name: psnr[name] + min(credit, low[name]) for name, credit in credits.items()}}
 
     def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """Returns the PSNR of a state in each view in dB, keyed by camera name."""

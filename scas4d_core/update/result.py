@@ -18,8 +18,9 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
-Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Function that takes the first PSNR of each camera in dB, and returns the cameras to exclude, with the reasons."""
+Gate = Callable[[Mapping[str, float], Callable[[], Gaussians]], Mapping[str, str]]
+"""Function that returns the cameras to exclude, with the reasons. It takes the first PSNR of each camera in dB, and a
+function that returns the current state of the attempt."""
 
 
 class Stopwatch:

@@ -379,16 +379,26 @@ FITTED = gone(BEFORE, 0.08)
 """The truth of frame 1."""
 
 
-@pytest.mark.parametrize(("end", "out"), [(FITTED, 0), (gone(BEFORE, 0.5), 1)])
-def test_a_camera_that_was_rendered_long_before_the_end_is_looked_at_again(
-    end: Gaussians, out: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("shift", "out"), [(0, 0), (8, 1)])
+def test_a_camera_that_was_rendered_long_before_the_end_is_rendered_again(
+    shift: int, out: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a short update the last picture of some cameras is that of its start."""
+    """In a short update, the last rendering of some cameras is from its start."""
     level = float(np.median([_shown(view) for view in VIEWS]))
-    fake, past = Fake(met(level, end)), replace(PAST, updates=5, level=level)
+    fake, past = Fake(met(level, FITTED)), replace(PAST, updates=5, level=level)
     met_early = {NAMES[0]: camera_fit(level - 9)}
     changed(fake, monkeypatch, lambda trace: replace(trace, cameras={**trace.cameras, **met_early}))
-    assert solve(fake, given(past))[1].frames_left_out[NAMES[0]] == out
+    views = [FACTORY.retouched(VIEWS[0], np.roll(VIEWS[0].target, shift, axis=2)), *VIEWS[1:]]
+    assert solve(fake, replace(given(past), views=views))[1].frames_left_out[NAMES[0]] == out
+
+
+def test_a_state_that_is_wrong_in_all_images_is_not_held_against_one_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    level = float(np.median([_shown(view) for view in VIEWS]))
+    fake, past = Fake(met(level, gone(BEFORE, 0.5))), replace(PAST, updates=5, level=level)
+    changed(fake, monkeypatch, lambda trace: replace(trace, cameras={**trace.cameras, NAMES[0]: camera_fit(level - 9)}))
+    result, after = solve(fake, given(past))
+    assert after.frames_left_out[NAMES[0]] == 0
+    assert not [alarm for alarm in result.alarms if alarm.camera is not None]
 
 
 def test_suspects_are_looked_at_in_the_light_that_the_colours_are_in() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from time import perf_counter
 from typing import Any
 
@@ -356,8 +356,9 @@ def test_cameras_are_judged_once_all_were_seen() -> None:
         asked: list[int] = []
         updater, _ = prepare(SETTINGS.model_copy(update={"iterations": 2 * len(views), "views": each}))
 
-        def gate(first: Any, asked: list[int] = asked) -> dict[str, str]:
+        def gate(first: Any, current: Callable[[], Gaussians], asked: list[int] = asked) -> dict[str, str]:
             asked.append(len(first))
+            assert np.isfinite(current().means).all()
             return {}
 
         updater.run(BEFORE, views, None, 1.0, 1, AttemptOptions(stopping=Stopping(2 * len(views)), gate=gate))

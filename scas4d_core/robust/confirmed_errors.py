@@ -1,0 +1,182 @@
+"""Errors in a camera's image that other cameras confirm.
+
+A camera that has moved, is dirty or lags contradicts the other cameras, which fit as usual. An object that enters the
+scene, or an update that lags behind, causes errors as well, but in every camera that sees the place. Such errors must
+not count against the camera that sees them best.
+
+For each erroneous cell of an image, points along its ray are projected into the other cameras. If most cameras that see
+a point have errors there, the errors of the cell are confirmed. A connected region of errors is confirmed as a whole if
+a part of it is, because other images often show only part of an object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label, maximum_filter
+
+from scas4d_core.cameras import Camera, Rig
+from scas4d_core.engines.renderer import Renderer, psnr_of
+from scas4d_core.engines.views import LABEL, TrainingView
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.posed_pictures import pixels_inside
+from scas4d_core.update.view_factory import ViewFactory
+
+CELLS = 64
+"""Maximum number of cells along the longer side of an image."""
+SMALLEST = 2
+"""Minimum edge of a cell, in pixels. Errors of single pixels are noise."""
+RENDERED = 128
+"""Images are halved while their longer side has at least twice this number of pixels."""
+USUAL_PERCENTILE = 75
+"""Percentile of the squared errors of an image's opaque cells that counts as usual. An object that covers less than a
+quarter of an image does not change it."""
+DISTINCT = 8.0
+"""Squared error above which a cell is erroneous, relative to the usual error in the other images."""
+ROUNDING = 1 / 255**2
+"""Lower bound on the usual error: images have 8 bits."""
+LARGEST = 300
+"""Maximum number of erroneous cells that are tested, starting with the largest errors."""
+DEPTHS = 64
+"""Number of points per ray. Their ratio is 5%, which shifts a projection by about a cell."""
+NEAREST, FARTHEST = 0.12, 3.0
+"""Range of depths along a ray, relative to the median depth of the Gaussians in the image."""
+SIMILAR = 0.25
+"""Minimum squared error of another camera at a point, relative to that of the tested cell. Backgrounds differ between
+cameras, so errors differ as well."""
+WITNESSES = 2
+"""Minimum number of other cameras that see a point."""
+AGREE = 0.75
+"""Minimum share of these cameras that have an error there."""
+PART = 0.2
+"""Minimum confirmed share of the squared error in a connected region that confirms the whole region."""
+
+Array = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+
+def credited_decibels(
+    names: Collection[str],
+    views: Sequence[TrainingView],
+    factory: ViewFactory,
+    renderer: Renderer,
+    state: Gaussians,
+) -> dict[str, float]:
+    """Returns by how much the PSNR of each named camera would rise without the errors that other cameras confirm.
+
+    Args:
+        names: names of the cameras to test.
+        views: training views of the frame, including those of the named cameras.
+        factory: factory that created the views.
+        renderer: renderer for the state.
+        state: state to compare the images with.
+
+    Returns:
+        A value in dB of at least 0 for each named camera that has a view.
+    """
+    errors = {view.name: cell_errors(view, factory, renderer, state) for view in views}
+    credits = {}
+    for name in names:
+        if name in errors:
+            cells = errors[name].squares
+            others = {other: one for other, one in errors.items() if other != name}
+            confirmed = confirmed_cells(name, cells, others, factory.posed, ray_depths(factory.posed[name], state))
+            without = np.where(confirmed, np.minimum(cells, _distinct(others)), cells)
+            credits[name] = psnr_of(float(without.mean()), 1) - psnr_of(float(cells.mean()), 1)
+    return credits
+
+
+class CellErrors(NamedTuple):
+    """Errors of a state in the cells of an image.
+
+    Attributes:
+        squares: [h, w] squared error of each cell, as a mean over pixels and RGB.
+        usual: ``USUAL_PERCENTILE`` of the squared errors of opaque cells, or 0 if there are none.
+    """
+
+    squares: Array
+    usual: float
+
+
+def cell_errors(view: TrainingView, factory: ViewFactory, renderer: Renderer, state: Gaussians) -> CellErrors:
+    """Returns the errors of a state in the cells of a view."""
+    scale = 1.0
+    while max(view.camera.width, view.camera.height) >= 2 * RENDERED:
+        scale /= 2
+        view = factory.coarser(view, scale)
+    gain, offset = view.exposure[:LABEL, 0, None, None], view.exposure[:LABEL, 1, None, None]
+    features, transmittance = renderer.render(state, view.camera)
+    squares = _cells(np.square(view.target[:LABEL] - (gain * features[:LABEL] + offset)).mean(axis=0))
+    opaque = squares[_cells(transmittance) < 0.5]
+    return CellErrors(squares, float(np.percentile(opaque, USUAL_PERCENTILE)) if len(opaque) else 0.0)
+
+
+def _cells(plane: Array) -> Array:
+    """Returns the mean of a plane [H, W] in each cell. Cells at the border are filled with the nearest pixels."""
+    edge = max(SMALLEST, -(-max(plane.shape) // CELLS))
+    padded = np.pad(plane, [(0, -side % edge) for side in plane.shape], mode="edge")
+    height, width = (side // edge for side in padded.shape)
+    cells: Array = padded.reshape(height, edge, width, edge).mean(axis=(1, 3))
+    return cells
+
+
+def ray_depths(camera: Camera, state: Gaussians) -> NDArray[np.float64]:
+    """Returns the ``DEPTHS`` depths at which a camera's rays are tested, in metres; empty if it sees no Gaussian."""
+    _, _, depth, inside = pixels_inside(camera, state.means.astype(np.float64))
+    if not inside.any():
+        return np.empty(0)
+    middle = float(np.median(depth[inside]))
+    return np.geomspace(NEAREST * middle, FARTHEST * middle, DEPTHS)
+
+
+def confirmed_cells(
+    name: str, cells: Array, others: Mapping[str, CellErrors], rig: Rig, depths: NDArray[np.float64]
+) -> Bool:
+    """Returns the [h, w] mask of a camera's erroneous cells that other cameras confirm.
+
+    Args:
+        name: name of the camera.
+        cells: [h, w] squared error of each cell.
+        others: errors of the other cameras, keyed by camera name.
+        rig: rig with all of these cameras.
+        depths: [D] depths at which points along the rays are tested, in metres.
+
+    Returns:
+        The confirmed cells. They include whole regions of connected erroneous cells.
+    """
+    erroneous = cells > _distinct(others)
+    tested = np.argsort(np.where(erroneous, cells, -1), axis=None)[::-1][: min(LARGEST, int(erroneous.sum()))]
+    if not len(tested) or not len(depths):
+        return np.zeros(cells.shape, np.bool_)
+    camera = rig[name]
+    row, column = np.unravel_index(tested, cells.shape)
+    edge = max(camera.width / cells.shape[1], camera.height / cells.shape[0])
+    uv = edge * (np.stack([column, row], axis=1) + 0.5)
+    points = np.concatenate([camera.unproject(uv, np.full(len(uv), depth)) for depth in depths])
+    agree, asked = (np.zeros(len(points), np.int64) for _ in range(2))
+    least = np.tile(SIMILAR * cells[row, column], len(depths))
+    for other, (squares, _) in others.items():
+        across, down, _, inside = pixels_inside(rig[other], points)
+        edge = max(rig[other].width / squares.shape[1], rig[other].height / squares.shape[0])
+        nearby = maximum_filter(squares, 3)  # a point projects between two cells
+        at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)
+        asked += inside
+        agree += inside & (nearby[at] >= least)
+    says = (asked >= WITNESSES) & (agree >= AGREE * asked)
+    confirmed = np.zeros(cells.shape, np.bool_)
+    confirmed[row, column] = says.reshape(len(depths), len(tested)).any(axis=0)
+    regions, count = label(erroneous, np.ones((3, 3)))
+    numbers = np.arange(count + 1)
+    whole, part = (np.bincount(regions.ravel(), (cells * mask).ravel(), count + 1) for mask in (erroneous, confirmed))
+    kept = numbers[(numbers > 0) & (part >= PART * whole)]
+    result: Bool = confirmed | np.isin(regions, kept)
+    return result
+
+
+def _distinct(others: Mapping[str, CellErrors]) -> float:
+    """Returns the squared error above which a cell is erroneous, given the errors of the other cameras."""
+    return DISTINCT * max(ROUNDING, float(np.median([one.usual for one in others.values()]))) if others else inf
