@@ -6,7 +6,7 @@ not count against the camera that sees them best.
 
 For each erroneous cell of an image, points along its ray are projected into the other cameras. If most cameras that see
 a point have errors there, the errors of the cell are confirmed. A connected region of errors is confirmed as a whole if
-a part of it is, because other images often show only part of an object.
+most of its cells that other cameras see are confirmed at one depth, because images often show only part of an object.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter
+from scipy.ndimage import label, maximum_filter, maximum_filter1d
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.engines.renderer import Renderer, psnr_of
@@ -52,8 +52,11 @@ WITNESSES = 2
 """Minimum number of other cameras that see a point."""
 AGREE = 0.75
 """Minimum share of these cameras that have an error there."""
-PART = 0.2
-"""Minimum confirmed share of the squared error in a connected region that confirms the whole region."""
+THICKNESS = 5
+"""Number of neighbouring depths that belong to one object."""
+MOST, PART = 0.5, 0.05
+"""Minimum confirmed shares of the squared error in a connected region that confirm the whole region. The first applies
+to the cells that other cameras see at the depth of the object, and the second to all cells."""
 
 Array = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -166,15 +169,33 @@ def confirmed_cells(
         at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)
         asked += inside
         agree += inside & (nearby[at] >= least)
-    says = (asked >= WITNESSES) & (agree >= AGREE * asked)
+    visible = (asked >= WITNESSES).reshape(len(depths), len(tested))
+    agreed = visible & (agree >= AGREE * asked).reshape(visible.shape)
     confirmed = np.zeros(cells.shape, np.bool_)
-    confirmed[row, column] = says.reshape(len(depths), len(tested)).any(axis=0)
-    regions, count = label(erroneous, np.ones((3, 3)))
-    numbers = np.arange(count + 1)
-    whole, part = (np.bincount(regions.ravel(), (cells * mask).ravel(), count + 1) for mask in (erroneous, confirmed))
-    kept = numbers[(numbers > 0) & (part >= PART * whole)]
-    result: Bool = confirmed | np.isin(regions, kept)
+    confirmed[row, column] = agreed.any(axis=0)
+    regions, _ = label(erroneous, np.ones((3, 3)))
+    here = regions[row, column]
+    whole = [
+        region
+        for region in np.unique(here)
+        if _is_confirmed(cells[row, column][here == region], visible[:, here == region], agreed[:, here == region])
+    ]
+    result: Bool = confirmed | np.isin(regions, whole)
     return result
+
+
+def _is_confirmed(squares: Array, visible: Bool, agreed: Bool) -> bool:
+    """Returns whether a region of errors belongs to one object that other cameras confirm.
+
+    Args:
+        squares: [T] squared errors of the region's cells.
+        visible: [D, T] whether enough other cameras see the point of a cell at a depth.
+        agreed: [D, T] whether these cameras confirm the error of the cell at a depth.
+    """
+    near = maximum_filter1d(agreed.view(np.uint8), THICKNESS, axis=0) @ squares
+    depth = int(near.argmax())
+    seen = float(visible[depth] @ squares)
+    return bool(near[depth] > 0 and near[depth] >= MOST * seen and near[depth] >= PART * squares.sum())
 
 
 def _distinct(others: Mapping[str, CellErrors]) -> float:
