@@ -1,8 +1,9 @@
-"""Part segmentation: clusters Gaussians by motion, using K-means on positions and material rotations over time.
+"""Part segmentation: groups Gaussians by motion.
 
-Implements the section "Visualization of Part Segmentation" of the paper. The feature of Gaussian i is ``[λp·p_i(t),
-λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here, p is in units of the extent of the moving Gaussians, so the same λ
-values suit every scene.
+With a given number of parts, this is K-means on positions and material rotations over time, as in the section
+"Visualization of Part Segmentation" of the paper. The feature of Gaussian i is ``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]``
+over the frames t. Here, p is in units of the extent of the moving Gaussians, so the same λ values suit every scene.
+Otherwise, ``motion_segmentation`` determines the number of parts and the parts.
 
 When parts are computed again after more frames, they keep their labels. The clustering also starts from the previous
 parts, and replaces them only if a fresh clustering is clearly better. New labels are matched to previous ones by their
@@ -20,6 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternion_products, quaternions_to_matrices
+from scas4d_core.query import motion_segmentation
 from scas4d_core.storage.births import NO_PARENT
 from scas4d_core.storage.history import History
 
@@ -27,8 +29,6 @@ Features = NDArray[np.float32]
 
 NO_PART = -1
 """Label of static Gaussians, which belong to no part."""
-SILHOUETTE_SAMPLE = 1000
-"""Number of samples for choosing the number of parts. The silhouette score requires all of their pairwise distances."""
 ROWS_AT_ONCE = 8192
 """Number of Gaussians labelled at a time, to limit the memory for features."""
 
@@ -43,12 +43,10 @@ MAX_FRAMES = 32
 """Maximum number of frames in the features, evenly spaced over the history. The limit bounds memory use."""
 SAMPLE = 20_000
 """Maximum number of Gaussians used for clustering. All moving Gaussians are labelled afterwards."""
-MAX_PARTS = 12
-"""Maximum number of parts to try if no number is given."""
+MERGING_SAMPLE = 6_000
+"""Maximum number of Gaussians from which the number of parts is determined."""
 STAY = 0.05
 """Previous parts are kept unless their inertia exceeds that of a fresh clustering by more than this fraction."""
-STAY_COUNT = 0.02
-"""Bonus added to the mean silhouette score for keeping the previous number of parts."""
 RESTARTS = 10
 """Number of K-means initializations (n_init); the best result is kept."""
 SEED = 0
@@ -67,8 +65,9 @@ def parts(
 
     Args:
         history: history with at least one committed frame. With a single frame, only positions separate parts.
-        count: number of parts, or None to choose up to ``MAX_PARTS`` parts by the mean silhouette score (Rousseeuw
-            1987) of up to 1,000 Gaussians.
+        count: number of parts. If None, parts are separate if their relative motion exceeds the track noise and the
+            deformation within them (``motion_segmentation``). Parts that do not move are labelled −1, unless nothing
+            moves: then all Gaussians form one part. Retired Gaussians are labelled, too.
         previous: [N] labels computed from fewer frames with the same ``count``, or None. Parts that persist then keep
             their labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
 
@@ -105,26 +104,64 @@ def parts(
     if previous is not None and previous.shape != (len(newest),):
         raise InputError(f"previous labels must have shape [{len(newest)}], one per Gaussian; got {previous.shape}")
 
-    rng = np.random.default_rng(SEED)
-    chosen = rows if rows.size <= SAMPLE else np.sort(rng.choice(rows, SAMPLE, replace=False))
-    extent = moving_extent(newest)
-    positions, rotations = motion(history, rows, MAX_FRAMES)
     weights = coverage(newest)
-    inside = np.searchsorted(rows, chosen)
+    if count is None:
+        rows = np.flatnonzero(newest.foreground > 0.5)  # retired Gaussians belong to parts of earlier frames
+        weights[rows] = _last_coverage(history, rows, weights[rows])
+        labels = _separated(history, rows, weights[rows], None if previous is None else previous[rows])
+    else:
+        labels = _clustered(history, rows, weights[rows], count, None if previous is None else previous[rows])
+    found, labels[labels >= 0] = np.unique(labels[labels >= 0], return_inverse=True)
+    size = np.bincount(labels[labels >= 0], weights[rows][labels >= 0], minlength=len(found))
+    rank = np.empty(len(found), dtype=np.int64)
+    rank[np.argsort(-size, kind="stable")] = np.arange(len(found))
+    result = np.full(len(newest), NO_PART, dtype=np.int64)
+    result[rows] = np.where(labels >= 0, rank[labels], NO_PART)
+    return result if previous is None else match_labels(result, previous, weights)
+
+
+def _separated(
+    history: History, rows: NDArray[np.intp], weights: NDArray[Any], previous: NDArray[Any] | None
+) -> NDArray[np.int64]:
+    """Returns the part of each of M rows [M], with as many parts as their motion shows."""
+    frames = motion_segmentation.FRAMES
+    positions, rotations = motion(history, rows, frames)
+    present = _presence(history, rows, _evenly(history, frames))
+    weights = weights * present.mean(axis=0)
+    sample = None
+    if rows.size > MERGING_SAMPLE:
+        sample = np.sort(np.random.default_rng(SEED).choice(rows.size, MERGING_SAMPLE, replace=False))
+    with threadpool_limits(limits=1):  # threads would change the summation order and flip Gaussians between two parts
+        labels = motion_segmentation.segment_motion(positions, rotations, present, weights, previous, sample)
+    return labels if (labels >= 0).any() else np.zeros_like(labels)
+
+
+def _last_coverage(history: History, rows: NDArray[np.intp], newest: NDArray[Any]) -> NDArray[np.float64]:
+    """Returns the coverage of M rows in the newest frame, or while they were present if they are retired, [M]."""
+    result, indices = newest.copy(), _evenly(history, motion_segmentation.FRAMES)
+    for index in indices[::-1]:
+        gone = (result <= 0) & history.present(index)[rows]
+        if gone.any():
+            result[gone] = coverage(history.gaussians(index).rows(rows[gone]))
+    return result
+
+
+def _clustered(
+    history: History, rows: NDArray[np.intp], weights: NDArray[Any], count: int, previous: NDArray[Any] | None
+) -> NDArray[np.int64]:
+    """Returns the K-means cluster of each of M rows [M]."""
+    rng = np.random.default_rng(SEED)
+    inside = np.arange(rows.size) if rows.size <= SAMPLE else np.sort(rng.choice(rows.size, SAMPLE, replace=False))
+    extent = moving_extent(history.newest)
+    positions, rotations = motion(history, rows, MAX_FRAMES)
     features = part_features(positions[:, inside], rotations[:, inside], extent)
-    before = None if previous is None else previous[chosen]
     labels = np.empty(rows.size, dtype=np.int64)
     with threadpool_limits(limits=1):  # threads would change the summation order and flip Gaussians between two parts
-        model = _cluster(features, weights[chosen], count, rng, before)
+        model = _cluster(features, weights[inside], count, None if previous is None else previous[inside])
         for start in range(0, rows.size, ROWS_AT_ONCE):
             block = slice(start, start + ROWS_AT_ONCE)
             labels[block] = model.predict(part_features(positions[:, block], rotations[:, block], extent))
-    size = np.bincount(labels, weights[rows], minlength=model.n_clusters)
-    rank = np.empty(model.n_clusters, dtype=np.int64)
-    rank[np.argsort(-size, kind="stable")] = np.arange(model.n_clusters)
-    result = np.full(len(newest), NO_PART, dtype=np.int64)
-    result[rows] = rank[labels]
-    return result if previous is None else match_labels(result, previous, weights)
+    return labels
 
 
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
@@ -167,9 +204,7 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
     At most ``frames`` evenly spaced frames are used. Before its birth, a Gaussian is assumed to move with its
     parent, or to be static if it has no parent.
     """
-    indices = np.array(history.indices)
-    even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
-    chosen = [int(index) for index in indices[even]]
+    chosen = _evenly(history, frames)
     positions, rotations = history.stacked("means", chosen, rows), history.stacked("rotations", chosen, rows)
     unborn = np.isnan(positions[..., 0]) & (history.born_at[rows] > np.array(chosen)[:, None])
     late = np.flatnonzero(unborn.any(axis=0))
@@ -178,6 +213,25 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
         for array, earlier in zip((positions, rotations), before_birth, strict=True):
             array[:, late] = np.where(unborn[:, late, None], earlier, array[:, late])
     return positions, rotations
+
+
+def _evenly(history: History, frames: int) -> list[int]:
+    """Returns the indices of at most ``frames`` evenly spaced frames."""
+    indices = np.array(history.indices)
+    even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
+    return [int(index) for index in indices[even]]
+
+
+def _presence(history: History, rows: NDArray[np.intp], indices: list[int]) -> NDArray[np.bool_]:
+    """Returns whether each of M Gaussians, or before its birth an ancestor, is present in T frames, [T, M]."""
+    parents = history.parents
+    present = np.zeros((len(indices), rows.size), bool)
+    for row, index in enumerate(indices):
+        ancestors = rows.copy()
+        while (up := (history.born_at[ancestors] > index) & (parents[ancestors] != NO_PARENT)).any():
+            ancestors = np.where(up, parents[ancestors], ancestors)
+        present[row] = history.present(index)[ancestors]
+    return present
 
 
 def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -230,37 +284,14 @@ def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
     return gaussians.opacities * axes[:, 0] * axes[:, 1]
 
 
-def _cluster(
-    features: Features,
-    weights: NDArray[Any],
-    count: int | None,
-    rng: np.random.Generator,
-    previous: NDArray[Any] | None,
-) -> Any:
+def _cluster(features: Features, weights: NDArray[Any], count: int, previous: NDArray[Any] | None) -> Any:
     known = np.empty(0, np.int64) if previous is None else np.unique(previous[previous >= 0])
-    if count is None:
-        # Sampling by weight makes the silhouette score weight Gaussians by their image area.
-        drawn = rng.choice(len(features), size=SILHOUETTE_SAMPLE, p=weights / weights.sum())
-        count = _best_count(features[np.unique(drawn)], len(known))
     fresh = _kmeans(count).fit(features, sample_weight=weights)
     if previous is None or len(known) != count:
         return fresh
     centres = np.stack([np.average(features[previous == k], axis=0, weights=weights[previous == k]) for k in known])
     kept = _kmeans(count, init=centres, n_init=1).fit(features, sample_weight=weights)
     return kept if kept.inertia_ <= (1 + STAY) * fresh.inertia_ else fresh
-
-
-def _best_count(features: Features, known: int) -> int:
-    """Returns the number of parts with the best mean silhouette score, which includes a bonus for ``known`` parts."""
-    from sklearn.metrics import silhouette_score
-
-    best, best_score = 1, 0.0
-    for count in range(2, min(MAX_PARTS, len(features) - 1) + 1):
-        labels = _kmeans(count).fit_predict(features)
-        score = float(silhouette_score(features, labels)) + STAY_COUNT * (count == known)
-        if score > best_score:
-            best, best_score = count, score
-    return best
 
 
 def _kmeans(count: int, **given: Any) -> Any:

@@ -61,17 +61,9 @@ def test_standing_gaussians_belong_to_no_part():
     assert np.array_equal(labels[: len(which)], which)
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Fewer starts of K-means, and fewer counts tried."""
-    monkeypatch.setattr(module, "RESTARTS", 3)
-    monkeypatch.setattr(module, "MAX_PARTS", 6)
-
-
-@pytest.mark.usefixtures("quick")
 def test_count_is_found_and_a_sample_labels_everyone(monkeypatch):
     history, which = bodies()
-    monkeypatch.setattr(module, "SAMPLE", 200)
+    monkeypatch.setattr(module, "MERGING_SAMPLE", 700)
     labels = parts(history)
     assert len(labels) == len(which)
     assert labels.max() + 1 == 3
@@ -135,18 +127,42 @@ def test_without_the_parts_before_labels_would_not_be_stable():
     assert np.mean(match_labels(swapped, labels, np.ones(998)) == labels) > 0.97
 
 
-@pytest.mark.usefixtures("quick")
-def test_another_count_is_taken_only_where_it_is_clearly_better(monkeypatch):
+def test_a_scene_without_motion_is_one_part_and_static_things_are_none_beside_others():
+    history, which = bodies(frames=1)
+    assert set(parts(history)) == {0}
     history, which = bodies()
-    four = np.where((which == 0) & (np.arange(len(which)) % 2 == 0), 3, which)
-    assert np.array_equal(parts(history, previous=four) == 1, which == 1)
-    assert len(np.unique(parts(history, previous=four))) == 3
-    # Two parts are hardly worse than three here: they stay where they were found before.
-    two = np.where(which == 2, 1, which)
-    assert len(np.unique(parts(history, previous=two))) == 2
-    monkeypatch.setattr(module, "STAY_COUNT", 0)
-    fresh = parts(history, previous=two)
-    assert len(np.unique(fresh)) == 3
+    still = History()
+    for t in history.indices:  # the last rod rests
+        state, rows = history.gaussians(t), which == 2
+        still.append(t, t / 30, state.replace(**{
+            name: np.where(rows.reshape(-1, *[1] * (getattr(state, name).ndim - 1)), getattr(history.first, name),
+                           getattr(state, name))
+            for name in ("means", "rotations")
+        }))  # fmt: skip
+    labels = parts(still)
+    assert (labels[which == 2] == NO_PART).mean() > 0.98
+    assert adjusted_rand_score(which, labels) > 0.98
+
+
+def test_what_has_left_keeps_a_part_if_the_number_is_found():
+    whole, which = bodies()
+    history = History()
+    for t in whole.indices:
+        history.append(
+            t, t / 30, whole.gaussians(t).retire(np.flatnonzero(which == 2)) if t >= 8 else whole.gaussians(t)
+        )
+    labels = parts(history)
+    assert adjusted_rand_score(which, labels) > 0.98
+    assert (labels >= 0).all()
+    assert (parts(history, 2)[which == 2] == NO_PART).all()
+
+
+def test_parts_are_numbered_as_before_when_more_frames_come():
+    history, which = bodies()
+    early = parts(first_frames(history, 8))
+    order = np.array([2, 0, 1])
+    assert adjusted_rand_score(which, early) > 0.98
+    assert np.mean(parts(history, previous=order[early]) == order[which]) > 0.98
 
 
 def test_labels_are_matched_by_weight_as_a_whole():
