@@ -34,7 +34,15 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
-from scas4d_core.storage.npz import read_npz, write_npz
+from scas4d_core.storage.npz import (
+    LARGE,
+    PACKED,
+    PACKED_INDEX,
+    pack_arrays,
+    read_npz,
+    unpack_arrays,
+    write_npz,
+)
 from scas4d_core.update.parts import Arrays
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
@@ -161,9 +169,10 @@ class Checkpoints:
             arrays |= {f"effect.{name}.{key}": array for key, array in given.items()}
         for view in carry_over.seen:
             arrays[f"seen.{view.name}"] = view.pixels if view.file is None else np.frombuffer(view.file, np.uint8)
+        small = {name: array for name, array in arrays.items() if np.asarray(array).nbytes < LARGE}
+        large = {name: array for name, array in arrays.items() if name not in small}
         # The list of names distinguishes arrays that were lost from arrays that were never written.
-        arrays["names"] = np.array(sorted(arrays))
-        write_npz(self._file(index), arrays)
+        write_npz(self._file(index), {**large, **pack_arrays({**small, "names": np.array(sorted(arrays))})})
 
     def load(self, index: int, factory: ViewFactory) -> CarryOver:
         """Reads the state that frame ``index`` passed to the next frame.
@@ -178,6 +187,7 @@ class Checkpoints:
         file = self._file(index)
         try:
             arrays = read_npz(file)
+            arrays |= unpack_arrays({name: arrays.pop(name) for name in (PACKED, PACKED_INDEX)})
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:

@@ -495,7 +495,10 @@ class _PictureFile:
         with _errors_of(self._name):
             if self._is_simple_jpeg:
                 with suppress(ValueError):  # a warning about a segment, which Pillow ignores
-                    return decode_jpeg(self._data, "RGB", fastdct=False, fastupsample=False, strict=False)
+                    pixels: NDArray[np.uint8] = decode_jpeg(
+                        self._data, "RGB", fastdct=False, fastupsample=False, strict=False
+                    )
+                    return pixels
             picture = self._picture if self.header.bits <= 8 else _eight_bits(self._data, bit_depth)
             if picture.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
                 raise ImageError(f"colour mode {picture.mode} is not supported", "use RGB or greyscale", picture.mode)
