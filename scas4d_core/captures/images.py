@@ -1,4 +1,4 @@
-"""Decides which files are images and masks, and decodes and resizes them. Requires only NumPy and Pillow.
+"""Decides which files are images and masks, and decodes and resizes them. Requires only NumPy, Pillow and simplejpeg.
 
 The service, the worker and the importers all use these rules:
 
