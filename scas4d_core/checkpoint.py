@@ -34,15 +34,7 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
-from scas4d_core.storage.npz import (
-    LARGE,
-    PACKED,
-    PACKED_INDEX,
-    pack_arrays,
-    read_npz,
-    unpack_arrays,
-    write_npz,
-)
+from scas4d_core.storage.npz import LARGE, PACKED, PACKED_INDEX, pack_arrays, read_npz, unpack_arrays, write_npz
 from scas4d_core.update.parts import Arrays
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
@@ -187,6 +179,8 @@ class Checkpoints:
         file = self._file(index)
         try:
             arrays = read_npz(file)
+            if not {PACKED, PACKED_INDEX} <= arrays.keys():
+                raise ValueError(f"{file.name}: missing arrays: {PACKED}, {PACKED_INDEX}")
             arrays |= unpack_arrays({name: arrays.pop(name) for name in (PACKED, PACKED_INDEX)})
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
