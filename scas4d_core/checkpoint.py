@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.captures.images import decode_image
 from scas4d_core.effects.switches import Switches, decode_switches, encode_switches
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import message_of
@@ -33,7 +34,7 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
-from scas4d_core.storage.npz import read_npz, write_npz
+from scas4d_core.storage.npz import LARGE, PACKED, PACKED_INDEX, pack_arrays, read_npz, unpack_arrays, write_npz
 from scas4d_core.update.parts import Arrays
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
@@ -141,8 +142,8 @@ class Checkpoints:
     def save(self, index: int, carry_over: CarryOver) -> None:
         """Writes the state that frame ``index`` passes to the next frame.
 
-        This method must be called before the frame is committed. The file includes the images of
-        ``carry_over.seen``, which take 3 bytes per pixel.
+        This method must be called before the frame is committed. The checkpoint includes the images of
+        ``carry_over.seen``, as image files where these are known, and otherwise as pixels.
         """
         arrays: dict[str, Any] = {"structure": np.int64(carry_over.structure)}
         if carry_over.motion is not None:
@@ -159,10 +160,11 @@ class Checkpoints:
         for name, given in carry_over.effects.items():
             arrays |= {f"effect.{name}.{key}": array for key, array in given.items()}
         for view in carry_over.seen:
-            arrays[f"seen.{view.name}"] = view.pixels
+            arrays[f"seen.{view.name}"] = view.pixels if view.file is None else np.frombuffer(view.file, np.uint8)
+        small = {name: array for name, array in arrays.items() if np.asarray(array).nbytes < LARGE}
+        large = {name: array for name, array in arrays.items() if name not in small}
         # The list of names distinguishes arrays that were lost from arrays that were never written.
-        arrays["names"] = np.array(sorted(arrays))
-        write_npz(self._file(index), arrays)
+        write_npz(self._file(index), {**large, **pack_arrays({**small, "names": np.array(sorted(arrays))})})
 
     def load(self, index: int, factory: ViewFactory) -> CarryOver:
         """Reads the state that frame ``index`` passed to the next frame.
@@ -177,11 +179,14 @@ class Checkpoints:
         file = self._file(index)
         try:
             arrays = read_npz(file)
+            if not {PACKED, PACKED_INDEX} <= arrays.keys():
+                raise ValueError(f"{file.name}: missing arrays: {PACKED}, {PACKED_INDEX}")
+            arrays |= unpack_arrays({name: arrays.pop(name) for name in (PACKED, PACKED_INDEX)})
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
                 raise ValueError(f"{file.name}: missing or unexpected arrays: {', '.join(sorted(missing))}")
-            pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
+            pictures = {name[5:]: _image(array) for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
@@ -214,6 +219,11 @@ class Checkpoints:
 
     def _file(self, index: int) -> Path:
         return self.directory / checkpoint_file(index)
+
+
+def _image(array: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Returns the image [H, W, 3] that a checkpoint contains as an image file [B] or as pixels [H, W, 3]."""
+    return decode_image(array.data) if array.ndim == 1 else array
 
 
 def _packed(motion: Motion) -> dict[str, Any]:

@@ -171,7 +171,8 @@ class ServerSettings(BaseSettings):
     queue_frames: int = Field(
         default=4,
         ge=1,
-        description="Maximum number of acknowledged but unfinished frames per scene; further frames are refused (429).",
+        description="Maximum number of acknowledged but unfinished frames per scene; further frames are refused (429). "
+        "At least 8 in scenes that skip frames.",
     )
     max_body_mb: float = Field(
         default=256,

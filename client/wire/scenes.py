@@ -81,7 +81,10 @@ class IngestSettings(Model):
         default=None,
         ge=1,
         le=10_000,
-        description="Maximum number of acknowledged but unfinished frames; null for the service's default.",
+        description=(
+            "Maximum number of acknowledged but unfinished frames; null for the service's default, and at least 8 with "
+            "`when_full` skip."
+        ),
     )
     when_full: Literal["refuse", "skip"] = Field(
         default="refuse",

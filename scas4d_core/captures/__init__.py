@@ -1,4 +1,4 @@
-"""Reads captures (cameras, images, masks and ground truth) from disk. Requires only NumPy and Pillow."""
+"""Reads captures (cameras, images, masks and ground truth) from disk. Requires only NumPy, Pillow and simplejpeg."""
 
 from __future__ import annotations
 

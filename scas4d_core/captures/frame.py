@@ -6,7 +6,7 @@ This module requires only NumPy.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ class Frame:
             Images may be decoded lazily, on access.
         masks: maps each camera name to its mask, [H, W] uint8, 1 on the foreground. Empty if the
             frame has no masks.
+        files: maps camera names to the image files from which ``decode_image`` decoded ``images`` without
+            arguments that change the pixels; may be empty. Checkpoints contain these files instead of
+            larger pixels.
 
     >>> picture = np.zeros((48, 64, 3), np.uint8)
     >>> frame = Frame(index=3, time=0.1, images={"front": picture, "left": picture}, masks={})
@@ -35,6 +38,7 @@ class Frame:
     time: float
     images: Mapping[str, NDArray[np.uint8]]
     masks: Mapping[str, NDArray[np.uint8]]
+    files: Mapping[str, bytes | memoryview] = field(default_factory=dict)
 
 
 @dataclass(eq=False)

@@ -18,6 +18,8 @@ from scas4d_core.errors import InputError
 
 ACCEPTED = "JPEG, PNG, WebP, BMP, PPM or PGM"
 """Formats of images, for messages."""
+ICC_SEGMENT = 0xE2
+"""Marker of the JPEG segments that contain a colour profile."""
 RESEND = "the file is damaged; send the original again"
 
 _RAW_HEAD = re.compile(rb"P([56])[ \t\r\n]+(\d{1,6})[ \t\r\n]+(\d{1,6})[ \t\r\n]+(\d{1,6})[ \t\r\n]")
@@ -46,6 +48,7 @@ class PictureHeader:
         bits: bits per channel, of a palette per index.
         significant_bits: bits per channel of the original values according to the sBIT chunk of a PNG, or None.
         decodable: whether the structure alone guarantees that the pixels can be decoded.
+        metadata: markers of the application segments of a JPEG, without JFIF.
     """
 
     format: str
@@ -53,6 +56,7 @@ class PictureHeader:
     bits: int = 8
     significant_bits: int | None = None
     decodable: bool = False
+    metadata: frozenset[int] = frozenset()
 
 
 def picture_header(data: bytes | memoryview) -> PictureHeader:
@@ -123,7 +127,8 @@ def _jpeg(data: memoryview) -> PictureHeader:
             at = _end_of_scan(data, at)
     if size is None:
         raise ImageError("the JPEG file has no frame header", RESEND)
-    return PictureHeader("JPEG", size, decodable=always_decodes(segments))
+    metadata = frozenset(marker for marker, _ in segments if 0xE1 <= marker <= 0xEF)
+    return PictureHeader("JPEG", size, decodable=always_decodes(segments), metadata=metadata)
 
 
 def _end_of_scan(data: memoryview, at: int) -> int:

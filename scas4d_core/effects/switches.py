@@ -7,7 +7,7 @@ scene continues with the switches of its checkpoint, so a replay makes the same 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -102,7 +102,7 @@ def first_switches(
 
 def encode_switches(switches: Switches) -> dict[str, dict[str, Any]]:
     """Returns the switches as JSON data, for reports and checkpoints."""
-    return {name: asdict(switch) for name, switch in switches.items()}
+    return {name: dict(vars(switch)) for name, switch in switches.items()}
 
 
 def decode_switches(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:

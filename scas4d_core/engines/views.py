@@ -58,6 +58,7 @@ class TrainingView:
         exposure: [C, 2] gain and offset of each channel, which are 1 and 0 for the mask.
         source: [H, W, 3] uint8 image and [H, W] uint8 mask (or None) from which ``target`` was converted, if any.
         finer: target [C, h, w] of a larger view that ``target`` was area-averaged from, if any.
+        file: image file that the image in ``source`` was decoded from, if known.
     """
 
     name: str
@@ -66,6 +67,7 @@ class TrainingView:
     exposure: Array
     source: tuple[NDArray[np.uint8], NDArray[np.uint8] | None] | None = None
     finer: Array | None = None
+    file: bytes | memoryview | None = None
 
     @property
     def pixels(self) -> NDArray[np.uint8]:

@@ -64,12 +64,16 @@ EVERY = 4
 
 def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
     """Returns the CRC-32 of every fourth pixel of every fourth row of each camera's image [H, W, 3]."""
-    return {name: crc32(picture[::EVERY, ::EVERY].tobytes()) for name, picture in pictures.items()}
+    return {name: crc32(_sample(picture).data) for name, picture in pictures.items()}
 
 
 def brightness_of(picture: NDArray[np.uint8]) -> float:
     """Returns the mean of every fourth pixel of every fourth row of an image [H, W, 3], [0, 1]."""
-    return float(picture[::4, ::4].mean()) / 255
+    return float(_sample(picture).mean()) / 255
+
+
+def _sample(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(picture[::EVERY, ::EVERY])
 
 
 def brightness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:

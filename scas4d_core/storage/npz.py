@@ -16,6 +16,7 @@ import zlib
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any, BinaryIO
@@ -37,6 +38,8 @@ DIGEST = 16
 """Size of a checksum in bytes."""
 LARGE = 1 << 15
 """Size of an array in bytes from which its checksum is computed by another thread."""
+PACKED, PACKED_INDEX = "packed", "packed.index"
+"""Names of the arrays of ``pack_arrays``."""
 PIECE = 1 << 20
 """Number of bytes that ``iter_verified`` reads at a time."""
 
@@ -86,6 +89,34 @@ def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
         archive.comment = _comment(
             {name: digests[name].result() if name in digests else _digest(array) for name, array in values_of.items()}
         )
+
+
+def pack_arrays(arrays: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Returns two arrays with the contents of many small ones, which take longer to write.
+
+    >>> unpack_arrays(pack_arrays({"a": np.arange(3), "b": np.array("text")}))
+    {'a': array([0, 1, 2]), 'b': array('text', dtype='<U4')}
+    """
+    values = {name: np.asarray(array) for name, array in arrays.items()}
+    index = json.dumps([(name, array.dtype.str, array.shape) for name, array in values.items()])
+    packed = b"".join(array.tobytes() for array in values.values())
+    return {PACKED_INDEX: np.array(index), PACKED: np.frombuffer(packed, np.uint8)}
+
+
+def unpack_arrays(packed: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Returns the arrays that ``pack_arrays`` packed.
+
+    Raises:
+        KeyError, TypeError, ValueError: if the packed arrays are missing or do not match.
+    """
+    arrays, at = {}, 0
+    for name, dtype, shape in json.loads(str(packed[PACKED_INDEX])):
+        count = prod(shape)
+        arrays[name] = np.empty(shape, dtype)
+        if count:  # ``frombuffer`` refuses empty arrays
+            arrays[name][...] = np.frombuffer(packed[PACKED], dtype, count, at).reshape(shape)
+        at += arrays[name].nbytes
+    return arrays
 
 
 def _comment(checksums: Mapping[str, str]) -> bytes:

@@ -21,7 +21,7 @@ from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.parts import NOTHING, Arrays, Attempt, PlanBuilder
-from scas4d_core.update.rates import Rates
+from scas4d_core.update.rates import Rates, step_factors
 from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, Gate, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
 from scas4d_core.update.warm_start import Motion, predicted
@@ -124,7 +124,7 @@ class FrameUpdate:
         trace.whole = best.whole
         watch.lap("end")
         state = self._finish(attempt)
-        after = Motion.of(engine.tables(), self.hierarchy, best.seconds)
+        after = Motion.of(engine.tables(), self.hierarchy, best.seconds, own=settings.momentum > 0)
         trace.guards = engine.log().guards
         watch.lap("commit")
         trace.seconds = watch.seconds
@@ -181,14 +181,12 @@ class FrameUpdate:
         rigidity = self.plan.rigidity
         if self.plan.rigidity_fades:  # at the end of an update, positions are more reliable than rotations
             rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / planned_before)))
+        factors = step_factors(rates, iteration, planned)
         return StepScalars(
-            frozen=rates.frozen_layers(iteration, planned),
-            layers=tuple(
-                rates.factor(iteration, planned, rates.layer_start(layer), rates.layer_end(layer))
-                for layer in range(len(rates.layers))
-            ),
-            own=rates.factor(iteration, planned, rates.start, 1.0),
-            colour=rates.factor(iteration, planned),
+            frozen=factors.frozen,
+            layers=factors.layers,
+            own=factors.own,
+            colour=factors.colour,
             gloss=1 - (1 - GLOSS_END) * iteration / planned,
             smooth_gloss=(iteration + 1) % SMOOTH_GLOSS_EVERY == 0,
             rigidity=rigidity,

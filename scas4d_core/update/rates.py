@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import cos, pi
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from scas4d_core.engines.freedom import Freedom
 from scas4d_core.engines.plan import ColourPlan
@@ -56,7 +56,6 @@ def first_iteration(start: float, iterations: int) -> int:
     return round(start * iterations)
 
 
-@lru_cache(maxsize=256)  # each iteration of an update asks for the same spans
 def learning_span(start: float, rest: float, iterations: int) -> range:
     """Returns the indices of the iterations in which a parameter learns; at least one iteration.
 
@@ -237,6 +236,33 @@ class Rates:
             layer_ends=_layer_ends(LAYER_ENDS, layer_starts),
             start=settings.deltas_start,
         )
+
+
+class StepFactors(NamedTuple):
+    """Factors on the learning rates in one iteration, which are 0 for parameters that are not learnt.
+
+    Attributes:
+        frozen: number of frozen layers, coarsest first.
+        layers: factor of each layer, coarse to fine.
+        own: factor of the Gaussians' own Δp, ΔR and Δs.
+        colour: factor of the colours.
+    """
+
+    frozen: int
+    layers: tuple[float, ...]
+    own: float
+    colour: float
+
+
+@lru_cache(maxsize=2048)  # most updates have the same rates and number of iterations
+def step_factors(rates: Rates, iteration: int, iterations: int) -> StepFactors:
+    """Returns the factors on the rates in an iteration, counted from 0."""
+    layers = (
+        rates.factor(iteration, iterations, rates.layer_start(layer), rates.layer_end(layer))
+        for layer in range(len(rates.layers))
+    )
+    own, colour = rates.factor(iteration, iterations, rates.start), rates.factor(iteration, iterations)
+    return StepFactors(rates.frozen_layers(iteration, iterations), tuple(layers), own, colour)
 
 
 def _layer_ends(layer_ends: tuple[float, ...], layer_starts: tuple[float, ...]) -> tuple[float, ...]:

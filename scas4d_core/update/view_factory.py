@@ -72,7 +72,7 @@ class ViewFactory:
                 target[3] = mask
             exposure = np.tile(np.array([1, 0], np.float32), (channels, 1))
             exposure[:3] = exposures.get(name, exposure[:3])
-            views.append(TrainingView(name, camera, target, exposure, (image, mask)))
+            views.append(TrainingView(name, camera, target, exposure, (image, mask), file=frame.files.get(name)))
         if not views:
             raise ValueError(
                 f"frame {frame.index} has no image of any of the rig's cameras ({', '.join(self.rig.names)})"

@@ -51,8 +51,9 @@ class Motion:
         turns: [K, 3] rotations of the clusters in each layer: axis · tan(angle/2), in the rotated axes of the cluster.
         shifts: [K, 3] translations of the clusters in each layer relative to the layer above, in metres in the rotated
             axes of the cluster.
-        own_shifts: [M, 3] displacements Δp minus the part that belongs to the finest clusters, in metres.
-        own_turns: [M, 3] rotations ΔR of the Gaussians; see ``Tables.deltas``.
+        own_shifts: [M, 3] displacements Δp minus the part that belongs to the finest clusters, in metres. Empty if
+            no update starts from the Gaussians' own motion.
+        own_turns: [M, 3] rotations ΔR of the Gaussians, or empty; see ``Tables.deltas``.
         seconds: duration of the motion, in seconds.
     """
 
@@ -78,8 +79,11 @@ class Motion:
         )
 
     @classmethod
-    def of(cls, tables: Tables, hierarchy: Hierarchy, seconds: float) -> Motion:
-        """Returns the motion of a deformation. The mean Δp of a cluster in the finest layer is added to its shift."""
+    def of(cls, tables: Tables, hierarchy: Hierarchy, seconds: float, *, own: bool = True) -> Motion:
+        """Returns the motion of a deformation. The mean Δp of a cluster in the finest layer is added to its shift.
+
+        If ``own`` is false, the motion of individual Gaussians is left out.
+        """
         turns = [values[:, :3].astype(np.float64) for values in tables.clusters]
         shifts = [values[:, 3:6].astype(np.float64) for values in tables.clusters]
         rest = tables.deltas[:, :3].astype(np.float64)
@@ -88,16 +92,20 @@ class Motion:
             common = np.add.reduceat(rest, starts[:-1]) / np.diff(starts)[:, None]
             shifts[-1] += common
             rest -= common[hierarchy.labels[-1]]
+        own_turns = tables.deltas[:, 3:6].astype(np.float64)
+        if not own:
+            rest, own_turns = np.empty((0, 3)), np.empty((0, 3))
         # Rotate into the clusters' rotated axes, from the finest layer up: each layer rotates those below it.
         for k in reversed(range(len(turns))):
             labels = hierarchy.labels[k]
-            rest = rotate_by(turns[k], labels, rest)
+            if own:
+                rest = rotate_by(turns[k], labels, rest)
             for below in range(k + 1, len(turns)):
                 parents = labels[hierarchy.starts[below][:-1]]
                 turns[below] = rotate_by(turns[k], parents, turns[below])
                 shifts[below] = rotate_by(turns[k], parents, shifts[below])
             shifts[k] = rotate(turns[k], shifts[k])
-        return cls(turns, shifts, rest, tables.deltas[:, 3:6].astype(np.float64), seconds)
+        return cls(turns, shifts, rest, own_turns, seconds)
 
 
 def motion_between(
@@ -186,6 +194,7 @@ def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, mome
     for values, turns, shifts in zip(tables.clusters, motion.turns, motion.shifts, strict=True):
         values[:, :3] = share * turns
         values[:, 3:6] = share * shifts
-    tables.deltas[:, :3] = share * momentum * motion.own_shifts
-    tables.deltas[:, 3:6] = share * momentum * motion.own_turns
+    if momentum > 0:
+        tables.deltas[:, :3] = share * momentum * motion.own_shifts
+        tables.deltas[:, 3:6] = share * momentum * motion.own_turns
     return tables

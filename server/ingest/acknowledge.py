@@ -14,6 +14,7 @@ from scas4d_core.cameras import Rig, minimum_cameras
 from scas4d_core.frame_times import ROWS, time_warnings
 from server import counters
 from server.hub import Publisher
+from server.keep_up import queue_limit
 from server.problems import Problem, count_noun
 from server.settings import ServerSettings
 from server.storage.events import ClosedBy, FramesSkipped, Hashes
@@ -75,7 +76,7 @@ class IngestRules:
         return cls(
             rig,
             request.frames_per_second,
-            queue_frames=ingest.queue_frames or settings.queue_frames,
+            queue_frames=queue_limit(ingest, settings.queue_frames),
             when_full=ingest.when_full,
             minimum_cameras=minimum_cameras(len(rig), ingest.minimum_cameras),
             open_frame_seconds=ingest.open_frame_seconds,

@@ -77,7 +77,8 @@ class FrameDecoder:
             images[camera.name], mask = pictures
             if mask is not None:
                 masks[camera.name] = mask
-        return Frame(message.index, message.time, images, masks), dropped
+        files = {name: encoded.images[name] for name in images}
+        return Frame(message.index, message.time, images, masks, files), dropped
 
 
 def _key(message: FrameReady) -> tuple[int, tuple[str, ...], str]:

@@ -14,6 +14,7 @@ from datetime import datetime
 from typing import Any
 
 from client.wire import SceneStatus
+from server.keep_up import queue_limit
 from server.problems import Problem, count_noun
 from server.scene.scene import Scene
 from server.scene.status_cache import read_status_cache
@@ -92,7 +93,7 @@ def status_if_still_asleep(folder: SceneFolder, settings: ServerSettings) -> Sce
         return None
     if (status := read_status_cache(folder)) is None:
         return None
-    return status.model_copy(update={"queue_limit": status.ingest.queue_frames or settings.queue_frames})
+    return status.model_copy(update={"queue_limit": queue_limit(status.ingest, settings.queue_frames)})
 
 
 def _idle_limit(scene: Scene, seconds: float) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 
 from scas4d_core.rig_checks import rig_warnings
 from scas4d_core.storage.npz import sync_folder
+from server.keep_up import queue_limit
 from server.scene.status import SceneFacts
 from server.storage.definition import Definition, DefinitionError, read_definition, write_definition
 from server.storage.disk import no_room
@@ -51,10 +52,10 @@ class StoredScene:
         waits = ledger.unfinished > 0 and not ledger.paused and ledger.fatal is None
         return waits or bool(self.content.events or self.content.recompute or ledger.open)
 
-    def facts(self, queue_limit: int) -> SceneFacts:
+    def facts(self, default_queue: int) -> SceneFacts:
         """Returns the data used to compute the sleeping scene's status.
 
-        `queue_limit` is the service's default maximum number of queued frames.
+        `default_queue` is the service's default maximum number of queued frames.
         """
         ledger = self.content.ledger
         return SceneFacts(
@@ -62,7 +63,7 @@ class StoredScene:
             ledger=ledger,
             pictures=FrameLogIndex(self.content.folder.frames, self.content.sizes),
             has_points=self.points_sha256 is not None,
-            queue_limit=self.definition.request.ingest.queue_frames or queue_limit,
+            queue_limit=queue_limit(self.definition.request.ingest, default_queue),
             first=self.first,
             damage=list(self.content.damage),
             warnings=self.warnings,

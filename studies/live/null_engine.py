@@ -7,6 +7,7 @@ durability and messages are the real ones, as is the fit of frame 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,13 @@ PSNR_DB, LOSS = 30.0, 0.03
 
 
 class NullRenderer(CpuRenderer):
-    """Renderer that finds every image equal to its rendering."""
+    """Renderer that finds every image equal to its rendering.
+
+    Attributes:
+        images: [3, H, W] image of the current frame for each camera, keyed by pose and lens.
+    """
+
+    images: ClassVar[dict[bytes, Array]] = {}
 
     def render(
         self,
@@ -39,12 +46,11 @@ class NullRenderer(CpuRenderer):
         depth_channel: int = -1,
         background: Array | None = None,
     ) -> Picture:
-        """Returns black."""
+        """Returns the camera's image, opaque and with label 1, or black if there is none."""
         channels = CHANNELS if features is None else features.shape[1]
-        return Picture(
-            np.zeros((channels, camera.height, camera.width), np.float32),
-            np.zeros((camera.height, camera.width), np.float32),
-        )
+        planes = np.ones((channels, camera.height, camera.width), np.float32)
+        planes[:3] = self.images.get(_key(camera), 0.0)
+        return Picture(planes, np.zeros((camera.height, camera.width), np.float32))
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """Returns the same figures for every view."""
@@ -81,6 +87,11 @@ class NullEngine(CpuEngine):
         super().bind(plan, structure)
         self.renderer = NullRenderer(plan.background, plan.image, plan.mask, limits=plan.limits)
 
+    def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
+        """See ``UpdateEngine.load_views``. The renderer then shows the images of the views."""
+        super().load_views(views, probes)
+        NullRenderer.images = {_key(view.camera): view.target[:3] for view in views}
+
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
         """Logs a loss, and for each view a PSNR and its image as the rendering."""
         self._log.losses.append(LOSS)
@@ -95,6 +106,10 @@ class NullEngine(CpuEngine):
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """Returns the same loss for every probe view."""
         return [LOSS for _ in which]
+
+
+def _key(camera: CameraArrays) -> bytes:
+    return camera.pose.tobytes() + camera.lens.tobytes()
 
 
 def install() -> None:

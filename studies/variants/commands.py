@@ -74,7 +74,7 @@ def gaps(
     captures: Captures,
     options: CaptureOptions,
     step: Annotated[int, typer.Option(min=2, help="Update only every this many frames.")] = 3,
-    queue: Annotated[int, typer.Option(min=1, help="Maximum number of unfinished frames.")] = 4,
+    queue: Annotated[int, typer.Option(min=1, help="Maximum number of unfinished frames.")] = 8,
     frames: Annotated[int | None, typer.Option(min=4, help="Maximum number of frames of each capture.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of frame 0 and the updates.")] = 0,
     page: Page = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -10,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from box_scene import SHIFT, make_box, make_rig, moved, take_frame
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.captures.images import decode_image
 from scas4d_core.checkpoint import CheckpointError, Checkpoints
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction, ResumeError
@@ -39,6 +42,16 @@ def settings(**scene: object) -> Settings:
     )
 
 
+def as_jpeg(frame: Frame) -> Frame:
+    """The frame without masks, as it is after its images were sent as JPEG files."""
+    files = {}
+    for name, image in frame.images.items():
+        file = io.BytesIO()
+        Image.fromarray(image).save(file, "JPEG", quality=95)
+        files[name] = memoryview(file.getvalue())
+    return Frame(frame.index, frame.time, {name: decode_image(files[name]) for name in files}, {}, files)
+
+
 KINDS: dict[str, tuple[Settings, Callable[[Frame], Frame], StaticResult | None]] = {
     "masks, floor, image scale and exposures": (
         settings(image_scale=0.5, floor=(0.0, 1.0, 0.0, -0.3)),
@@ -48,6 +61,11 @@ KINDS: dict[str, tuple[Settings, Callable[[Frame], Frame], StaticResult | None]]
     "without masks": (
         settings(),
         lambda frame: replace(frame, masks={}),
+        StaticResult(BOX.replace(foreground=np.ones(len(BOX), np.float32)), EXPOSURES, [0.5], [20.0]),
+    ),
+    "image files without masks": (
+        settings(),
+        as_jpeg,
         StaticResult(BOX.replace(foreground=np.ones(len(BOX), np.float32)), EXPOSURES, [0.5], [20.0]),
     ),
     "without masks, cameras missing": (

@@ -58,6 +58,10 @@ def test_a_raw_picture_comes_as_it_is():
     np.testing.assert_array_equal(grey, rgb()[..., :1].repeat(3, axis=2))
 
 
+UPRIGHT = Image.Exif()
+UPRIGHT[0x0112] = 1
+
+
 def test_an_orientation_is_refused_and_upright_is_not():
     for orientation in range(2, 9):
         exif = Image.Exif()
@@ -170,6 +174,26 @@ def test_an_icc_profile_is_converted_to_srgb_and_srgb_itself_left_alone():
     np.testing.assert_allclose(shown, 255 * 0.5018, atol=1.01)
     with pytest.raises(ImageError, match="ICC profile cannot be read"):
         decode_image(encoded(Image.fromarray(rgb()), icc_profile=b"nonsense"))
+
+
+@pytest.mark.parametrize("options", [{}, {"exif": UPRIGHT}, {"progressive": True}])
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+@pytest.mark.parametrize("sampling", ["4:4:4", "4:2:2", "4:2:0"])
+def test_a_jpeg_has_the_pixels_that_pillow_decodes(mode, sampling, options):
+    smooth = Image.fromarray(rgb(height=5, width=7)).resize((61, 43), Image.Resampling.BICUBIC).convert(mode)
+    data = encoded(smooth, "JPEG", subsampling=sampling, **options)
+    np.testing.assert_array_equal(decode_image(data), Image.open(io.BytesIO(data)).convert("RGB"))
+    check_image(data, size=(61, 43))
+    for call in (check_image, decode_image):
+        with pytest.raises(ImageError, match="61x43 pixels, but its camera requires 43x61"):
+            call(data, size=(43, 61))
+
+
+def test_a_jpeg_with_damaged_pixels_is_decoded_as_far_as_possible():
+    data = bytearray(encoded(Image.fromarray(rgb(height=40, width=60)), "JPEG", quality=95))
+    middle = (data.index(b"\xff\xda") + len(data)) // 2
+    data[middle : middle + 40] = bytes(40)
+    np.testing.assert_array_equal(decode_image(bytes(data)), Image.open(io.BytesIO(data)).convert("RGB"))
 
 
 def test_the_size_of_the_camera_is_checked_before_decoding():

@@ -405,7 +405,8 @@ def test_samples_cover_every_moving_gaussian_once(monkeypatch: pytest.MonkeyPatc
 
 def test_a_shift_of_everything_is_found_by_clusters() -> None:
     truth = moved(BEFORE, turn=TURN**0, shift=SHIFT)
-    updater, views = prepare(CALM.model_copy(update={"clusters": (1, 12, 48)}), truth, masks=False)
+    settings = CALM.model_copy(update={"clusters": (1, 12, 48), "momentum": 1.0})  # otherwise own shifts are not kept
+    updater, views = prepare(settings, truth, masks=False)
     state = updater.run(BEFORE, views, None, 1.0, seed=1)
     assert np.median(errors(state.gaussians, truth)) < 1e-3
     assert state.motion is not None

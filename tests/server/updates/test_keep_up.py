@@ -75,6 +75,7 @@ def test_a_scene_that_skips_shortens_updates_while_frames_wait(served):
     refuses, skips, has_a_budget = create(http), create(http, when_full="skip"), create(http, when_full="skip")
     sdk.set_budget(has_a_budget, iterations=7)
     iterations = {}
+    assert [sdk.scene(id).queue_limit for id in (refuses, skips)] == [6, 8]
     for id in (refuses, skips, has_a_budget):
         go_on.unlink(missing_ok=True)
         send_while_one_waits(http, id, go_on)
