@@ -54,7 +54,7 @@ class Scene:
         self.opacities, self.labels = leaf(previous.opacities), leaf(previous.foreground)
         self.colours = leaf(previous.colours)
         self._clusters = [torch.as_tensor(labels.astype(np.int64))[self.sound] for labels in hierarchy.labels]
-        self.first_lengths = leaf(structure.first_lengths)
+        self.first_lengths = leaf(structure.first_lengths[moving])
         if structure.neighbours is not None:
             graph = structure.neighbours
             self.neighbours = torch.as_tensor(graph.index.astype(np.int64))
