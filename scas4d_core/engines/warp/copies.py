@@ -50,7 +50,7 @@ class DeviceCopies:
 
     Rows that a stored array begins with are copied on the device: if Gaussians are added, only their rows are uploaded.
     A host array becomes read-only when a copy of it is stored, because the copy would not reflect later changes.
-    Writable views of parts of other arrays are not stored. Callers must not modify the copies.
+    Writable views of parts of other arrays are compared with what they were. Callers must not modify the copies.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -106,8 +106,7 @@ class DeviceCopies:
 
     def store(self, copy: wp.array, *sources: NDArray[Any]) -> None:
         """Stores a device array as the copy of an array, or of the array derived from several sources."""
-        if not all(_can_freeze(source) for source in sources):
-            return
+        sources = tuple(source if _can_freeze(source) else source.copy() for source in sources)
         for source in sources:
             source.flags.writeable = False
             if isinstance(source.base, np.ndarray):
