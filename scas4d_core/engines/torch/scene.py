@@ -48,7 +48,7 @@ class Scene:
         moving = hierarchy.rows
         held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         self.sound = torch.as_tensor(np.isfinite(held).all(axis=1))
-        self.rows = torch.as_tensor(moving)
+        self.rows = torch.tensor(moving)  # a copy, because the array may be read-only
         self.static = torch.as_tensor(np.setdiff1d(np.arange(len(previous)), moving))
         self.means, self.factors = leaf(previous.means), leaf(previous.factors)
         self.opacities, self.labels = leaf(previous.opacities), leaf(previous.foreground)

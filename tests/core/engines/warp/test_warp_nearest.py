@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 from warp_cases import DEVICE, wp
 
 from scas4d_core.engines.warp.nearest import nearest
+from scas4d_core.engines.warp.neighbour_terms import weigh_pairs
+from scas4d_core.structure.neighbours import Neighbours
 
 RNG = np.random.default_rng(0)
 RANDOM = RNG.normal(size=(700, 3))
@@ -52,3 +54,14 @@ def test_the_neighbours_are_those_of_the_host(kind: str, own: bool) -> None:
         np.testing.assert_allclose(np.sqrt(squares[:, :used]), true, rtol=1e-12)
         assert (index[:, used:] == 0).all()
         assert np.isinf(squares[:, used:]).all()
+
+
+@pytest.mark.parametrize("kind", ["random", "duplicated", "fewer than wanted"])
+def test_distances_and_weights_are_those_of_the_host(kind: str) -> None:
+    points = POINTS[kind].astype(np.float32)
+    graph = Neighbours(points, 20, 3.0)
+    _, squares = nearest(wp.array(points, dtype=wp.vec3, device=DEVICE), graph.count)
+    pairs = [wp.zeros(squares.shape, dtype=wp.float32, device=DEVICE) for _ in range(2)]
+    wp.launch(weigh_pairs, squares.shape, [squares, graph.falloff, *pairs], device=DEVICE)
+    for mine, true in zip(pairs, (graph.distances, graph.weights), strict=True):
+        np.testing.assert_allclose(mine.numpy(), true, rtol=1e-6)
