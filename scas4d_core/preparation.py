@@ -47,7 +47,7 @@ from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.storage.births import NO_PARENT, extend_roots
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.neighbours import Neighbours, build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import Arrays, PlanBuilder
 from scas4d_core.update.result import UpdateResult, UpdateTrace
@@ -194,7 +194,7 @@ class Preparation:
     def _neighbour_graph(self, roots: Gaussians, hierarchy: Hierarchy) -> Neighbours:
         """Returns the neighbour graph of the current hierarchy, and builds it if necessary."""
         if self._neighbours is None:
-            self._neighbours = build_neighbours(roots.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
+            self._neighbours = Neighbours(roots.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
         return self._neighbours
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
@@ -383,7 +383,7 @@ def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:
     """Returns the CRC-32 of the clusters and the neighbour graph."""
     arrays: list[NDArray[np.generic]] = [hierarchy.rows, *hierarchy.labels, *hierarchy.starts]
     if neighbours is not None:
-        arrays += [neighbours.index, neighbours.weights, neighbours.distances]
+        arrays += [neighbours.means, np.array([neighbours.count, neighbours.falloff])]
     value = 0
     for array in arrays:
         value = crc32(np.ascontiguousarray(array).view(np.uint8).data, value)

@@ -63,7 +63,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.storage.history": ("History",),
     "scas4d_core.storage.npz": ("read_npz", "write_npz"),
     "scas4d_core.structure.hierarchy": ("build_hierarchy",),
-    "scas4d_core.structure.neighbours": ("build_neighbours",),
+    "scas4d_core.structure.neighbours": ("Neighbours",),
     "scas4d_core.engines.torch.deformation": (
         "cascade", "cluster_map", "cluster_pivots", "deform", "material_rotations", "polar_rotation",
         "quaternion_matrices", "quaternion_product", "rotation_quaternions", "scaling_factor",

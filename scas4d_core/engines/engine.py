@@ -15,7 +15,7 @@ frame makes these calls, in order::
     engine.state(learnt=True)               # Θ_t
 
 Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` synchronize the host with the device. This
-happens about ten times per frame, and never during an iteration.
+happens at most 12 times per update, and never during an iteration.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class Structure:
         hierarchy: cluster hierarchy of the M moving Gaussians.
         neighbours: neighbour graph, or None if no loss term needs it.
         roots: [N, 3] positions of all Gaussians in frame 0, in metres.
-        first_lengths: [M, 3] axis lengths of the moving Gaussians in frame 0, in metres.
+        first_lengths: [N, 3] axis lengths of all Gaussians in frame 0, in metres.
     """
 
     hierarchy: Hierarchy
@@ -118,6 +118,6 @@ class Structure:
 
     @property
     def length_bounds(self) -> Array:
-        """Axis lengths [M, 3] above which the scale loss applies, in metres."""
-        bounds: Array = np.maximum(self.first_lengths, np.float32(MAX_SCALE))
+        """Axis lengths [M, 3] of the moving Gaussians above which the scale loss applies, in metres."""
+        bounds: Array = np.maximum(self.first_lengths[self.hierarchy.rows], np.float32(MAX_SCALE))
         return bounds

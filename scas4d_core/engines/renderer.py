@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import log10
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
@@ -25,6 +27,8 @@ PRIOR_PIXELS = 1.0
 """Constant, in pixels, that ``Renderer.step_colours`` adds to each Gaussian's total blending weight. It keeps the
 colours of barely visible Gaussians almost unchanged."""
 
+TURNED_TOGETHER = 32
+"""Number of neighbouring Gaussians whose positions determine the rotation of a normal."""
 PAIR_CAMERAS, PAIR_STEP = 2, 4
 """Maximum number of cameras, and step between the rows and columns, that ``pair_counts`` examines."""
 
@@ -99,6 +103,28 @@ class Gradients(NamedTuple):
     screen: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Neighbourhoods:
+    """Neighbourhoods of Gaussians, which the host only searches if a renderer reads ``rows``.
+
+    Args:
+        means: [M, 3] positions in metres, of the first M Gaussians.
+    """
+
+    means: Array
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in each neighbourhood."""
+        return min(TURNED_TOGETHER, len(self.means))
+
+    @cached_property
+    def rows(self) -> NDArray[np.int64]:
+        """[M, count] rows of the nearest Gaussians, starting with the Gaussian itself."""
+        nearest: NDArray[np.int64] = np.asarray(cKDTree(self.means).query(self.means, self.count)[1])
+        return nearest.reshape(len(self.means), -1)
+
+
 class Renderer(Protocol):
     """Interface of a renderer for the states of one scene, with the scene's background and limits.
 
@@ -164,7 +190,7 @@ class Renderer(Protocol):
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """Returns a state moved further along its motion; see ``extrapolated``."""
 
-    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
         """Returns a state whose normals rotated with their neighbourhoods; see ``with_turned_normals``."""
 
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
@@ -284,14 +310,14 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
     return turns
 
 
-def with_turned_normals(before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+def with_turned_normals(before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
     """Returns a state whose normals rotated with their neighbourhoods since an earlier state; only the gloss changes.
 
     Args:
         before: state Θ_{t−1}.
         after: state Θ_t with gloss.
-        near: [M, k] neighbourhood of each Gaussian with gloss; see ``neighbourhood_turns``.
+        near: neighbourhoods of the Gaussians with gloss.
     """
     assert after.gloss is not None
-    turns = neighbourhood_turns(before.means, after.means, near)
+    turns = neighbourhood_turns(before.means, after.means, near.rows)
     return after.replace(gloss=np.einsum("nij,nj->ni", turns, after.gloss).astype(np.float32))

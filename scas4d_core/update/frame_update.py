@@ -203,12 +203,12 @@ class FrameUpdate:
 
 
 def structure_of(hierarchy: Hierarchy, neighbours: Neighbours | None, first: Gaussians) -> Structure:
-    """Returns the structure that an update deforms, with the axis lengths of frame 0.
+    """Returns the structure that an update deforms, with the positions and axis lengths of frame 0.
 
     Args:
         hierarchy: hierarchy of the moving Gaussians.
         neighbours: neighbours of the moving Gaussians, or None.
         first: root Gaussians: Θ_0 plus all Gaussians added since.
     """
-    lengths: Array = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
+    lengths: Array = np.sqrt(np.square(first.factors).sum(axis=1))
     return Structure(hierarchy, neighbours, first.means, lengths)

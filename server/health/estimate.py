@@ -117,7 +117,7 @@ def refuse_if_too_large(rig: RigModel, settings: Settings, server: ServerSetting
         return
     fault = f"the scene needs an estimated {needed.memory_mb:.0f} MB of memory; the limit is {needed.limit_mb:.0f} MB"
     remedy = "raise SCAS4D_MAX_SCENE_MEMORY_MB"
-    raise _too_large(rig, settings, server, fault, remedy, lambda smaller: smaller.memory_mb <= needed.limit_mb)
+    raise _too_large(rig, settings, server, needed, fault, remedy, lambda it: it.memory_mb <= needed.limit_mb)
 
 
 def fit_gpu(rig: RigModel, settings: Settings, server: ServerSettings, free_mb: float | None) -> Settings:
@@ -132,26 +132,27 @@ def fit_gpu(rig: RigModel, settings: Settings, server: ServerSettings, free_mb: 
     Raises:
         Problem: 422 if the scene requires a GPU whose free memory is too small.
     """
-    needed = estimate(rig, settings, server).gpu_mb
-    if free_mb is None or needed <= free_mb:
+    needed = estimate(rig, settings, server)
+    if free_mb is None or needed.gpu_mb <= free_mb:
         return settings
-    fault = f"the scene needs an estimated {needed:.0f} MB of GPU memory; {free_mb:.0f} MB are free"
+    fault = f"the scene needs an estimated {needed.gpu_mb:.0f} MB of GPU memory; {free_mb:.0f} MB are free"
     if settings.device == "auto":
         log.warning("device 'auto' selects the CPU: %s", fault)
         return settings.model_copy(update={"device": "cpu"})
-    raise _too_large(rig, settings, server, fault, "set settings.device to 'cpu'", lambda it: it.gpu_mb <= free_mb)
+    remedy = "set settings.device to 'cpu'"
+    raise _too_large(rig, settings, server, needed, fault, remedy, lambda it: it.gpu_mb <= free_mb)
 
 
 def _too_large(
     rig: RigModel,
     settings: Settings,
     server: ServerSettings,
+    needed: SceneEstimate,
     fault: str,
     remedy: str,
     fits: Callable[[SceneEstimate], bool],
 ) -> Problem:
     """Returns the refusal of a scene; the remedy suggests an image scale for which `fits` is true, if there is one."""
-    needed = estimate(rig, settings, server)
     remedy = f"use fewer or smaller images, lower settings.static.max_gaussians, or {remedy}"
     smaller = [scale for scale in SCALES if scale < settings.scene.image_scale]
     scale = next((scale for scale in smaller if fits(estimate(rig, settings, server, scale))), None)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.structure.neighbours import Neighbours, build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from studies.hard_cases.case import (
     CPU,
     REFERENCE,
@@ -82,7 +82,7 @@ class Deforming:
             return None
         where = np.where(sound[:, None], self.means, 0)
         spread = float(np.square(where[sound] - where[sound].mean(axis=0)).sum(axis=1).mean())
-        return build_neighbours(where, 4, 1 / max(spread, 1e-30))
+        return Neighbours(where, 4, 1 / max(spread, 1e-30))
 
     def run(self, backend: str) -> BackendResult | None:
         """Runs the forward and backward pass on a backend."""

@@ -15,7 +15,7 @@ from scas4d_core.kernels import activation, image_loss
 from scas4d_core.kernels.adam import COUNTED_GUARDS, EVERY_ROW, adam
 from scas4d_core.query.ply import split_factors
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from studies.apart import in_a_process
 from studies.hard_cases.case import (
     CPU,
@@ -318,7 +318,7 @@ def _graph(points: NDArray[Any]) -> HardStep:
     """Checks that neighbours have finite weights and distances, and that no Gaussian is its own neighbour."""
 
     def on_cpu() -> BackendResult:
-        graph = build_neighbours(points, 20, 2000.0)
+        graph = Neighbours(points, 20, 2000.0)
         return BackendResult({"weights": graph.weights, "distances": graph.distances, "index": graph.index})
 
     def apart_from_itself(outcomes: Mapping[str, BackendResult]) -> list[str]:

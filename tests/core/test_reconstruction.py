@@ -321,7 +321,7 @@ def test_without_weights_no_graph_is_built_and_no_neighbour_term_computed(monkey
         raise AssertionError("computed")
 
     monkeypatch.setattr(neighbour_terms, "neighbour_terms", refuse)
-    monkeypatch.setattr("scas4d_core.preparation.build_neighbours", refuse)
+    monkeypatch.setattr("scas4d_core.preparation.Neighbours", refuse)
     scene = start(shortened(weights=Weights(rigidity=0, isometry=0, rotation=0)))
     assert len(scene.step(FRAMES[1]).loss) == 6
 

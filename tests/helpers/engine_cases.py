@@ -20,7 +20,7 @@ from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, ROWS
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.frame_update import structure_of
 
 WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
@@ -141,7 +141,7 @@ def case(previous: Gaussians | None = None, clusters: tuple[int, ...] = CLUSTERS
     made = replace(standard, **plan)  # type: ignore[arg-type]
     sound = previous.replace(means=np.nan_to_num(previous.means))
     hierarchy = build_hierarchy(sound.means, previous.moving, clusters, 4)
-    neighbours = build_neighbours(sound.means[hierarchy.rows], 6, 20.0) if made.neighbour_terms else None
+    neighbours = Neighbours(sound.means[hierarchy.rows], 6, 20.0) if made.neighbour_terms else None
     structure = structure_of(hierarchy, neighbours, sound)
     renderer, after = CpuRenderer(made.background, limits=made.limits), moved(sound)
     rng, views, probes = np.random.default_rng(1), [], []

@@ -115,25 +115,25 @@ class Uploads:
             copy(target, source, dest_offset, src_offset, count)
 
         def constructed(array: wp.array, data: object = None, *given: object, **named: object) -> None:
-            self._watch(data, lambda: construct(array, data, *given, **named))
+            self._watch(array, data, lambda: construct(array, data, *given, **named))
 
         def assigned(array: wp.array, values: object) -> None:
-            self._watch(np.asarray(values), lambda: assign(array, values))
+            self._watch(array, np.asarray(values), lambda: assign(array, values))
 
         monkeypatch.setattr(wp, "zeros", made)
         monkeypatch.setattr(wp, "copy", copied)
         monkeypatch.setattr(wp.array, "__init__", constructed)
         monkeypatch.setattr(wp.array, "assign", assigned)
 
-    def _watch(self, data: object, act: Callable[[], None]) -> None:
-        """Counts the data of the outermost call."""
+    def _watch(self, array: wp.array, data: object, act: Callable[[], None]) -> None:
+        """Counts the data of the outermost call, in the type that it has on the device."""
         if self._inside:
             return act()
-        if isinstance(data, np.ndarray):
-            self._add(data.dtype, data.nbytes)
         self._inside = True
         act()
         self._inside = False
+        if isinstance(data, np.ndarray):
+            self._add(array.dtype, array.size * wp.types.type_size_in_bytes(array.dtype))
 
     def _add(self, kind: object, size: int) -> None:
         name = "uint8" if kind is wp.uint8 else str(kind)

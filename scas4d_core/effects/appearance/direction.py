@@ -12,29 +12,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
+from scas4d_core.engines.renderer import Neighbourhoods
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.parts import Array, Attempt, PlanBuilder, UpdatePart
+from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FrameObservation
 
-TURNED_TOGETHER = 32
-"""Number of neighbouring Gaussians whose positions determine the rotation of a normal."""
 FEW = 4
 """Number of views from which the evidence is computed."""
-
-
-def neighbourhoods(means: Array) -> NDArray[np.int64]:
-    """Returns the [N, k] rows of the k nearest neighbours of each Gaussian, starting with the Gaussian itself."""
-    count = len(means)
-    nearest: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
-    return nearest.reshape(count, -1)
 
 
 class DirectionPart(UpdatePart):
@@ -42,14 +32,14 @@ class DirectionPart(UpdatePart):
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._roots = builder.first.means
-        self._near: NDArray[np.int64] | None = None
+        self._near: Neighbourhoods | None = None
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Rotates the gloss of each Gaussian in Θ_t with its neighbourhood, if the state moved."""
         if state.gloss is None or state.environment is None or attempt.kept is Candidate.PREVIOUS:
             return state
         if self._near is None:
-            self._near = neighbourhoods(self._roots[: len(state.gloss)])
+            self._near = Neighbourhoods(self._roots[: len(state.gloss)])
         return attempt.renderer.turn_normals(attempt.previous, state, self._near)
 
 

@@ -16,6 +16,7 @@ from scas4d_core.engines.renderer import (
     CHANNELS,
     Comparison,
     Gradients,
+    Neighbourhoods,
     Picture,
     colour_step,
     extrapolated,
@@ -140,7 +141,7 @@ class CpuRenderer:
         """See ``Renderer.extrapolate``."""
         return extrapolated(before, after, share)
 
-    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
         """See ``Renderer.turn_normals``."""
         return with_turned_normals(before, after, near)
 

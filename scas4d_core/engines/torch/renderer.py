@@ -13,6 +13,7 @@ from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import (
     BLOCK,
     Comparison,
+    Neighbourhoods,
     Picture,
     colour_step,
     extrapolated,
@@ -103,7 +104,7 @@ class TorchRenderer:
         """See ``Renderer.extrapolate``."""
         return extrapolated(before, after, share)
 
-    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
         """See ``Renderer.turn_normals``."""
         return with_turned_normals(before, after, near)
 

@@ -48,13 +48,13 @@ class Scene:
         moving = hierarchy.rows
         held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         self.sound = torch.as_tensor(np.isfinite(held).all(axis=1))
-        self.rows = torch.as_tensor(moving)
+        self.rows = torch.tensor(moving)  # a copy, because the array may be read-only
         self.static = torch.as_tensor(np.setdiff1d(np.arange(len(previous)), moving))
         self.means, self.factors = leaf(previous.means), leaf(previous.factors)
         self.opacities, self.labels = leaf(previous.opacities), leaf(previous.foreground)
         self.colours = leaf(previous.colours)
         self._clusters = [torch.as_tensor(labels.astype(np.int64))[self.sound] for labels in hierarchy.labels]
-        self.first_lengths = leaf(structure.first_lengths)
+        self.first_lengths = leaf(structure.first_lengths[moving])
         if structure.neighbours is not None:
             graph = structure.neighbours
             self.neighbours = torch.as_tensor(graph.index.astype(np.int64))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from scas4d_core.engines.engine import AttemptStart
 from scas4d_core.engines.plan import UpdatePlan
@@ -17,7 +15,8 @@ wp.set_module_options({"enable_backward": False})
 def step_colours(
     adam: Adam,
     weight: wp.float32,
-    learned: wp.array[wp.int32],
+    entries: wp.array[wp.int32],
+    everywhere: wp.int32,
     before: wp.array2d[wp.float32],
     g_features: wp.array2d[wp.float32],
     features: wp.array2d[wp.float32],
@@ -30,7 +29,8 @@ def step_colours(
     Args:
         adam: optimizer for the colours.
         weight: weight of each element's absolute change.
-        learned: [N] flags, 1 for Gaussians whose colours are learned, otherwise 0.
+        entries: [N] index of each Gaussian among the moving ones, or −1 for static Gaussians.
+        everywhere: 1 if the colours of static Gaussians are learned too, otherwise 0.
         before: [N, 4] features of Θ_{t−1}.
         g_features: [N, 4] gradients of the rendering losses.
         features: [N, 4] features. The first three columns are updated.
@@ -40,7 +40,7 @@ def step_colours(
     """
     i, k = wp.tid()
     g = wp.float32(0.0)
-    if learned[i] == 1:
+    if everywhere == 1 or entries[i] >= 0:
         change = features[i, k] - before[i, k]
         g = g_features[i, k]
         if change != 0.0:
@@ -51,9 +51,12 @@ def step_colours(
 
 
 @wp.kernel
-def set_rows(rows: wp.array[wp.int32], value: wp.float32, values: wp.array[wp.float32]) -> None:
-    """Sets the elements of an array at the given rows, with one thread per row."""
-    values[rows[wp.tid()]] = value
+def set_rates(
+    entries: wp.array[wp.int32], moving: wp.float32, others: wp.float32, rates: wp.array[wp.float32]
+) -> None:  # fmt: skip
+    """Sets the learning rates of moving and static Gaussians, with one thread per Gaussian."""
+    i = wp.tid()
+    rates[i] = wp.where(entries[i] >= 0, moving, others)
 
 
 class WarpColours:
@@ -61,8 +64,7 @@ class WarpColours:
 
     Args:
         plan: plan of the scene's updates, with a colour plan.
-        count: number of Gaussians, N.
-        rows: [M] rows of the moving Gaussians.
+        entries: [N] index of each Gaussian among the moving ones, or −1 for static Gaussians.
         scalars: [3] device array with the optimizer's scalars.
 
     Attributes:
@@ -70,27 +72,25 @@ class WarpColours:
         optimizer: optimizer for the colours.
     """
 
-    def __init__(self, plan: UpdatePlan, count: int, rows: NDArray[np.int64], scalars: wp.array) -> None:
+    def __init__(self, plan: UpdatePlan, entries: wp.array, scalars: wp.array) -> None:
         assert plan.colours is not None
+        count = len(entries)
         self._static, self._count, self._device = plan.colours.static, count, scalars.device
         self._weight = plan.soft_colour / max(3 * count, 1)
-        learned = np.full(count, self._static, np.int32)
-        learned[rows] = 1
-        self._rows = wp.array(rows, dtype=wp.int32, device=self._device)
-        self._learned = wp.array(learned, dtype=wp.int32, device=self._device)
+        self._entries = entries
         self.gradients = wp.zeros((count, 3), dtype=wp.float32, device=self._device)
         self.optimizer = Optimizer((count, 3), scalars, varies_by_row=True)
 
     def begin(self, start: AttemptStart) -> None:
         """Starts an attempt, with zero moments."""
-        by_row = self.optimizer.adam.by_row
-        by_row.fill_(start.static_colour if self._static else 0.0)
-        wp.launch(set_rows, len(self._rows), [self._rows, start.colour, by_row], device=self._device)
+        rates = start.colour, start.static_colour if self._static else 0.0
+        inputs = [self._entries, *rates, self.optimizer.adam.by_row]
+        wp.launch(set_rates, self._count, inputs, device=self._device)
         self.optimizer.begin([1.0] * 3, (start.beta1, start.beta2))
 
     def step(
         self, before: wp.array, g_features: wp.array, features: wp.array, iteration: wp.array, losses: wp.array
     ) -> None:
         """Performs one optimization step; see ``step_colours``."""
-        given = [self.optimizer.adam, self._weight, self._learned, before, g_features, features]
+        given = [self.optimizer.adam, self._weight, self._entries, int(self._static), before, g_features, features]
         wp.launch(step_colours, (self._count, 3), [*given, self.gradients, iteration, losses], device=self._device)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.warp import cluster_map, gaussian_deltas
 from scas4d_core.engines.warp.adam import Optimizer
-from scas4d_core.engines.warp.copies import DeviceCopies
+from scas4d_core.engines.warp.copies import DeviceCopies, structures_on, upload
 from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.lanes import lanes_of
-from scas4d_core.engines.warp.neighbour_terms import neighbour_terms
+from scas4d_core.engines.warp.nearest import nearest
+from scas4d_core.engines.warp.neighbour_terms import neighbour_terms, weigh_pairs
 from scas4d_core.engines.warp.step_records import StepRecords
-
-Array = NDArray[np.float32]
 
 TABLES = 4
 """Number of host tables whose device copies are kept: the candidates of an attempt."""
@@ -41,6 +39,7 @@ class WarpDeformation:
         means: [N] vec3 means of all Gaussians.
         factors: [N] mat33 covariance factors of all Gaussians.
         turns: [M] vec4 rotations since Θ_{t−1}, as quaternions (w, x, y, z).
+        entries: [N] index of each Gaussian among the moving ones, or −1 for static Gaussians.
         unsound: [1] number of moving Gaussians with non-finite values, which stay unchanged.
     """
 
@@ -49,8 +48,13 @@ class WarpDeformation:
         count = len(hierarchy.rows)
         self._device, self._plan, self._lanes = device, plan, lanes_of(device)
         self._records, self._count = records, count
-        self._rows = self._upload(hierarchy.rows, wp.int32)
-        self._starts = [self._upload(starts, wp.int32) for starts in hierarchy.starts]
+        copies = structures_on(device)
+        self._rows = copies.of(hierarchy.rows, wp.int32)
+        self._starts = [copies.of(starts, wp.int32) for starts in hierarchy.starts]
+        self._lengths = copies.of(structure.first_lengths, wp.vec3)
+        self.entries, points = wp.full(total, -1, dtype=wp.int32, device=device), self._zeros(count, wp.vec3)
+        inputs = [self._rows, copies.of(structure.roots, wp.vec3), self.entries, points]
+        wp.launch(gaussian_deltas.find_entries, count, inputs, device=device)
         self.clusters = [self._zeros((size, cluster_map.COLUMNS)) for size in hierarchy.sizes]
         self.deltas = self._zeros((count, 9))
         tables = [*self.clusters, self.deltas]
@@ -68,12 +72,12 @@ class WarpDeformation:
         self.means, self._previous_means = self._zeros(total, wp.vec3), self._zeros(total, wp.vec3)
         self.factors, self._previous_factors = self._zeros(total, wp.mat33), self._zeros(total, wp.mat33)
         self.turns = self._zeros(count, wp.vec4)
-        self._bounds = self._upload(structure.length_bounds, wp.vec3)
         self._graph = graph
         if graph is not None:
-            self._neighbours = self._upload(graph.index, wp.int32, 2)
-            self._distances = self._upload(graph.distances, wp.float32, 2)
-            self._pair_weights = self._upload(graph.weights, wp.float32, 2)
+            self._neighbours, squares = nearest(points, graph.count)
+            self._distances, self._pair_weights = (self._zeros(squares.shape) for _ in range(2))
+            inputs = [squares, graph.falloff, self._distances, self._pair_weights]
+            wp.launch(weigh_pairs, squares.shape, inputs, device=device)
         self._copies = DeviceCopies(device, TABLES * len(tables))
         self._samples, self._sample_sizes = self._zeros((0, 0), wp.int32), list[int]()
         self._published = int(plan.cluster_map == "published")
@@ -86,9 +90,6 @@ class WarpDeformation:
 
     def _zeros(self, shape: int | tuple[int, ...], dtype: object = wp.float32) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)
-
-    def _upload(self, values: NDArray[np.generic], dtype: object, dimensions: int = 1) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, ndim=dimensions, device=self._device)
 
     def load_state(self, means: wp.array, factors: wp.array) -> None:
         """Loads the means ([N] vec3) and factors ([N] mat33) of Θ_{t−1}."""
@@ -138,7 +139,7 @@ class WarpDeformation:
         replaced = bool(samples.shape != self._samples.shape)
         if replaced:
             self._samples = self._zeros(samples.shape, wp.int32)
-        self._samples.assign(samples)
+        wp.copy(self._samples, upload(samples, wp.int32, self._device))
         return replaced
 
     def restart(self, start: AttemptStart) -> None:
@@ -153,7 +154,7 @@ class WarpDeformation:
         """Returns an iteration's scalars for ``StepRecords.write``: the weights, then each optimizer's scalars."""
         plan, pairs = self._plan, 1
         if self._graph is not None:
-            pairs = max(1, self._sample_sizes[step.sample] * self._graph.index.shape[1])
+            pairs = max(1, self._sample_sizes[step.sample] * self._graph.count)
         scalars = [step.rigidity / pairs, plan.isometry / pairs, plan.rotation / pairs]
         for place, (optimizer, factor) in enumerate(zip(self.optimizers, [*step.layers, step.own], strict=True)):
             scalars += optimizer.next_scalars(0.0 if place < step.frozen else factor)
@@ -195,7 +196,7 @@ class WarpDeformation:
             inputs += [self._tied_means, self._tied_turns, iteration, losses]
             wp.launch(neighbour_terms, self._samples.shape[1], inputs, device=device)
         inputs = [self._terms, self._rows, self._sound, self._jacobians[-1], self._turned[-1], self._previous_factors]
-        inputs += [self.deltas, self._bounds, self.means, self.factors, g_means, g_factors]
+        inputs += [self.deltas, self._lengths, self.means, self.factors, g_means, g_factors]
         inputs += [self._tied_means, self._tied_turns, self._g_points, self._g_jacobians, self._g_turned]
         inputs += [self.gradients[-1], self.optimizers[-1].adam, iteration, losses]
         wp.launch(gaussian_deltas.apply_deltas_backward, self._count, inputs, device=device)

@@ -31,7 +31,7 @@ from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.engines.warp.adam import COUNTED_GUARDS as ADAM_GUARDS
 from scas4d_core.engines.warp.adam import IDLE
 from scas4d_core.engines.warp.colours import WarpColours
-from scas4d_core.engines.warp.copies import as_numbers, copies_on, features_on
+from scas4d_core.engines.warp.copies import as_numbers, copies_on, features_on, structures_on
 from scas4d_core.engines.warp.deformation import WarpDeformation
 from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.gains import WarpGains
@@ -107,7 +107,7 @@ class WarpEngine:
         _, colours, *self._gloss_scalars = (self._records.optimizer(layers + k) for k in range(4))
         self._deformation = WarpDeformation(device, plan, structure, self._records)
         self._pictures = PicturePass(device, plan, count)
-        self._colours = None if plan.colours is None else WarpColours(plan, count, self._rows, colours)
+        self._colours = None if plan.colours is None else WarpColours(plan, self._deformation.entries, colours)
         self._gains = WarpGains(device, len(plan.cameras)) if plan.camera_gains else None
         self._gloss: WarpGloss | None = None
         self._opacities = wp.zeros(count, dtype=wp.float32, device=device)
@@ -147,7 +147,8 @@ class WarpEngine:
         if previous.gloss is None or previous.environment is None:
             self._gloss = None
         elif before is None or before.glossy != len(previous.gloss):
-            self._gloss = WarpGloss(previous, self._rows, self._structure.roots, *self._gloss_scalars)
+            roots = structures_on(self._device).of(self._structure.roots, wp.vec3)[: len(previous.gloss)]
+            self._gloss = WarpGloss(self._deformation.entries, roots, *self._gloss_scalars)
         if self._gloss is not before:
             self._graphs.forget()
         if self._gloss is not None:

@@ -136,7 +136,8 @@ class WarpFitEngine:
         if shading is not None:
             self._seen = wp.zeros(most, dtype=wp.vec4, device=self._device)
             scalars = self._scalars[SCALARS : 2 * SCALARS], self._scalars[2 * SCALARS :]
-            self._gloss = GlossTables(self._count, len(shading.gloss), np.zeros(0, np.int64), scalars)
+            entries = wp.full(self._count, -1, dtype=wp.int32, device=self._device)
+            self._gloss = GlossTables(entries, len(shading.gloss), scalars)
             self._gloss.begin(shading.rates)
             values = zip((shading.gloss, shading.environment), shading.moments, strict=True)
             for table, optimizer, (given, moments) in zip(

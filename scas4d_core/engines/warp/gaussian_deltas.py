@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from scas4d_core.engines.plan import MAX_SCALE
 from scas4d_core.engines.warp.adam import Adam, step_element
 from scas4d_core.engines.warp.cluster_map import LARGEST
 from scas4d_core.engines.warp.quaternions import (
@@ -16,6 +17,8 @@ from scas4d_core.engines.warp.quaternions import (
 )
 
 wp.set_module_options({"enable_backward": False})
+
+SMALLEST_BOUND = wp.constant(wp.float32(MAX_SCALE))
 
 
 @wp.struct
@@ -51,6 +54,23 @@ def stretch(ds: wp.vec3) -> wp.mat33:
             wp.exp(wp.clamp(ds[2], -LARGEST, LARGEST)),
         )
     )
+
+
+@wp.kernel
+def find_entries(
+    rows: wp.array[wp.int32], roots: wp.array[wp.vec3], entries: wp.array[wp.int32], own: wp.array[wp.vec3]
+) -> None:
+    """Inverts ``rows`` and gathers the roots of the moving Gaussians, with one thread per moving Gaussian.
+
+    Args:
+        rows: [M] rows of the moving Gaussians.
+        roots: [N] positions in frame 0.
+        entries: [N] output, index of each moving Gaussian in ``rows``.
+        own: [M] output, positions of the moving Gaussians in frame 0.
+    """
+    entry = wp.tid()
+    entries[rows[entry]] = entry
+    own[entry] = roots[rows[entry]]
 
 
 @wp.kernel
@@ -136,7 +156,7 @@ def apply_deltas_backward(
     turned: wp.array[wp.vec4],
     previous_factors: wp.array[wp.mat33],
     deltas: wp.array2d[wp.float32],
-    length_bounds: wp.array[wp.vec3],
+    first_lengths: wp.array[wp.vec3],
     means: wp.array[wp.vec3],
     factors: wp.array[wp.mat33],
     g_means: wp.array[wp.vec3],
@@ -157,7 +177,7 @@ def apply_deltas_backward(
 
     Args:
         terms, rows, sound, jacobians, turned, previous_factors, deltas: see ``apply_deltas``.
-        length_bounds: [M] axis lengths above which the scale loss (equation (8)) applies, in metres.
+        first_lengths: [N] axis lengths in frame 0 in metres, above which the scale loss (equation (8)) applies.
         means, factors: [N] deformed means and factors.
         g_means, g_factors: [N] gradients of the rendering losses.
         tied_means, tied_turns: [M] gradients of the neighbour terms.
@@ -185,7 +205,7 @@ def apply_deltas_backward(
         for axis in range(3):
             column = wp.vec3(factor[0, axis], factor[1, axis], factor[2, axis])
             length = wp.length(column)
-            excess = length - length_bounds[entry][axis]
+            excess = length - wp.max(first_lengths[row][axis], SMALLEST_BOUND)
             if excess > 0.0:
                 here += terms.axis_length * excess
                 for k in range(3):

@@ -5,10 +5,7 @@ The formula is in ``kernels.appearance.direction``. Reference: ``engines.torch.g
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from scas4d_core.engines.cpu.gloss import (
     NEIGHBOURS,
@@ -23,13 +20,12 @@ from scas4d_core.engines.cpu.gloss import (
 from scas4d_core.engines.warp.adam import Optimizer, step_table
 from scas4d_core.engines.warp.copies import DeviceCopies, features_on
 from scas4d_core.engines.warp.layout import Camera
+from scas4d_core.engines.warp.nearest import nearest
 from scas4d_core.engines.warp.quaternions import change_of, conjugate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance import direction
 
 wp.set_module_options({"enable_backward": False})
-
-Array = NDArray[np.float32]
 
 SIDE = wp.constant(direction.SIDE)
 CELLS = wp.constant(direction.CELLS)
@@ -352,9 +348,8 @@ class GlossTables:
     """Gloss and environment parameters with their optimizers.
 
     Args:
-        count: number of Gaussians, N.
+        entries: [N] index of each Gaussian among those that rotate, or −1 for all others.
         glossy: number of glossy Gaussians, which precede all others.
-        rows: [M] rows of the Gaussians that rotate.
         scalars: two [3] device arrays with the scalars of the optimizers for the gloss and environment.
 
     Attributes:
@@ -366,12 +361,10 @@ class GlossTables:
         optimizers: optimizers for the gloss and environment.
     """
 
-    def __init__(self, count: int, glossy: int, rows: NDArray[np.int64], scalars: tuple[wp.array, wp.array]) -> None:
+    def __init__(self, entries: wp.array, glossy: int, scalars: tuple[wp.array, wp.array]) -> None:
         device = self._device = scalars[0].device
-        self._count, self.glossy = count, glossy
-        entries = np.full(count, -1, np.int32)
-        entries[rows] = np.arange(len(rows))
-        self._entries = wp.array(entries, dtype=wp.int32, device=device)
+        self._count = count = len(entries)
+        self._entries, self.glossy = entries, glossy
         self.seen, self.g_seen = (wp.zeros(count, dtype=wp.vec4, device=device) for _ in range(2))
         shapes = (glossy, 3), (direction.ROWS, 3)
         self.tables, self.gradients = (
@@ -433,9 +426,8 @@ class WarpGloss(GlossTables):
     """Gloss and environment parameters of an attempt.
 
     Args:
-        previous: state whose gloss is not None.
-        rows: [M] rows of the moving Gaussians.
-        roots: [N, 3] positions in frame 0, in metres, used to find neighbours.
+        entries: [N] index of each Gaussian among the moving ones, or −1 for static Gaussians.
+        roots: [glossy] positions of the glossy Gaussians in frame 0, in metres, used to find neighbours.
         scalars, environment_scalars: [3] device arrays with the scalars of the optimizers for gloss and environment.
 
     Attributes:
@@ -443,21 +435,13 @@ class WarpGloss(GlossTables):
     """
 
     def __init__(
-        self,
-        previous: Gaussians,
-        rows: NDArray[np.int64],
-        roots: Array,
-        scalars: wp.array,
-        environment_scalars: wp.array,
-    ) -> None:
-        assert previous.gloss is not None
-        super().__init__(len(previous), len(previous.gloss), rows, (scalars, environment_scalars))
+        self, entries: wp.array, roots: wp.array, scalars: wp.array, environment_scalars: wp.array
+    ) -> None:  # fmt: skip
+        super().__init__(entries, len(roots), (scalars, environment_scalars))
         self.before = [wp.zeros_like(table) for table in self.tables]
         self._smooth = wp.zeros_like(self.tables[0])
-        points = roots[: self.glossy]
-        index = cKDTree(points).query(points, min(NEIGHBOURS, self.glossy))[1].reshape(self.glossy, -1)
-        self._neighbours = wp.array(index, dtype=wp.int32, ndim=2, device=self._device)
-        self._weights = wp.zeros(index.shape, dtype=wp.float32, device=self._device)
+        self._neighbours, _ = nearest(roots, min(NEIGHBOURS, self.glossy), own=True)
+        self._weights = wp.zeros(self._neighbours.shape, dtype=wp.float32, device=self._device)
 
     def load(self, previous: Gaussians, copies: DeviceCopies) -> None:
         """Loads the gloss and environment of Θ_{t−1}."""

@@ -13,6 +13,27 @@ FLOOR = wp.constant(wp.float32(ROOT_FLOOR))
 
 
 @wp.kernel
+def weigh_pairs(
+    squares: wp.array2d[wp.float64],
+    falloff: wp.float64,
+    distances: wp.array2d[wp.float32],
+    weights: wp.array2d[wp.float32],
+) -> None:
+    """Computes the distances and weights of neighbours as ``structure.neighbours``, with one thread per pair.
+
+    Args:
+        squares: [M, k] squared distances in m², which are infinite for unused pairs.
+        falloff: decay of the weights in 1/m².
+        distances, weights: [M, k] outputs, which are 0 for unused pairs.
+    """
+    i, k = wp.tid()
+    square = squares[i, k]
+    if wp.isfinite(square):
+        distances[i, k] = wp.float32(wp.sqrt(square))
+        weights[i, k] = wp.float32(wp.exp(-falloff * square))
+
+
+@wp.kernel
 def neighbour_terms(
     weights: wp.array[wp.float32],
     samples: wp.array2d[wp.int32],

@@ -14,16 +14,18 @@ from scas4d_core.engines.renderer import (
     CHANNELS,
     PRIOR_PIXELS,
     Comparison,
+    Neighbourhoods,
     Picture,
     extrapolated,
     psnr_of,
 )
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
-from scas4d_core.engines.warp.copies import as_numbers, copies_on, features_on
+from scas4d_core.engines.warp.copies import as_numbers, copies_on, features_on, structures_on
 from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.gloss import features_seen
 from scas4d_core.engines.warp.lanes import load
 from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, PAIRS, SHIFT, SQUARES, Camera, camera_of
+from scas4d_core.engines.warp.nearest import nearest
 from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.projection import RECORD
 from scas4d_core.engines.warp.rasterizer import Rasterizer
@@ -226,7 +228,7 @@ class WarpRenderer:
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
         self._log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
-        self._near: tuple[NDArray[np.int64], wp.array] | tuple[None, None] = None, None
+        self._near: tuple[Neighbourhoods, wp.array] | tuple[None, None] = None, None
 
     def render(
         self,
@@ -325,11 +327,12 @@ class WarpRenderer:
             self._copies.store(moved, getattr(state, name))
         return state
 
-    def turn_normals(self, before: Gaussians, after: Gaussians, near: NDArray[np.int64]) -> Gaussians:
+    def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
         """See ``Renderer.turn_normals``."""
         assert after.gloss is not None
         if near is not self._near[0]:
-            self._near = near, wp.array(near, dtype=wp.int32, device=self.device)
+            roots = structures_on(self.device).of(near.means, wp.vec3)
+            self._near = near, nearest(roots, near.count, own=True)[0]
         means = (self._copies.of(state.means, wp.vec3) for state in (before, after))
         gloss = self._copies.of(after.gloss, wp.float32)
         turned = wp.empty_like(gloss)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import Camera
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
-from scas4d_core.engines.renderer import Renderer, levels, pair_counts
+from scas4d_core.engines.renderer import Neighbourhoods, Renderer, levels, pair_counts
 from scas4d_core.engines.torch.renderer import TorchRenderer
 from scas4d_core.engines.views import LABEL, CameraArrays
 from scas4d_core.gaussians import Gaussians
@@ -164,10 +164,10 @@ def test_normals_turn_with_their_neighbourhoods(tested: Renderer) -> None:
     turn = Rotation.from_rotvec([0.1, 0.5, 0.2]).as_matrix()
     means = (before.means @ turn.T + rng.normal(0, 0.02, before.means.shape)).astype(np.float32)
     means[3] = np.nan
-    near = rng.integers(len(before), size=(len(before.gloss), 8))
+    near = Neighbourhoods(before.means[: len(before.gloss)])
     mine, true = (renderer.turn_normals(before, before.replace(means=means), near) for renderer in (tested, TRUE))
     assert apart(mine.gloss, true.gloss) < CLOSE
     assert apart(true.gloss, before.gloss) > 0.1
-    lost = (near == 3).any(axis=1)  # in neighbourhoods of a lost Gaussian
+    lost = (near.rows == 3).any(axis=1)  # in neighbourhoods of a lost Gaussian
     assert lost.any()
     np.testing.assert_allclose(mine.gloss[lost], before.gloss[lost], atol=1e-6)

@@ -20,7 +20,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import PlanBuilder
@@ -35,7 +35,7 @@ BOX = MADE.replace(means=MADE.means + JITTER)
 AFTER = moved(BOX)
 SETTINGS = UpdateSettings(iterations=6, clusters=(2, 12, 48))
 HIERARCHY = build_hierarchy(BOX.means, BOX.moving, SETTINGS.clusters, SMALLEST_CLUSTER)
-NEIGHBOURS = build_neighbours(BOX.means[HIERARCHY.rows], 6, 200.0)
+NEIGHBOURS = Neighbours(BOX.means[HIERARCHY.rows], 6, 200.0)
 FRAME = take_frame(1, 1.0, AFTER, RIG)
 SEQUENCE = ["0a", "2b", "1b", "3a", "0b", "1a"]
 

@@ -31,7 +31,7 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import PlanBuilder
@@ -47,7 +47,7 @@ RIG = make_rig()
 FACTORY = ViewFactory(RIG)
 SETTINGS = UpdateSettings(clusters=(2, 12, 48), momentum=1.0)
 HIERARCHY = build_hierarchy(BOX.means, BOX.moving, SETTINGS.clusters, SMALLEST_CLUSTER)
-NEIGHBOURS = build_neighbours(BOX.means[HIERARCHY.rows], 6, 200.0)
+NEIGHBOURS = Neighbours(BOX.means[HIERARCHY.rows], 6, 200.0)
 FRAME = take_frame(1, 1.0, moved(BOX), RIG)
 DOCUMENT = Path(__file__).parents[3] / "docs" / "stability.md"
 

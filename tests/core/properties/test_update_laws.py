@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import permutations, product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,6 @@ from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.structure.neighbours import Neighbours
 
 MOVING, STANDING, NEAREST = 24, 6, 4
 CLOSE = 1e-9
@@ -83,8 +83,8 @@ def some_case(seed: int) -> Case:
     lengths = np.take_along_axis(distances, nearest, axis=1)
     labels = np.arange(MOVING) // 12, np.arange(MOVING) // 4
     hierarchy = Hierarchy(np.arange(MOVING), labels, (np.arange(0, 25, 12), np.arange(0, 25, 4)))  # type: ignore[arg-type]
-    neighbours = Neighbours(nearest, np.exp(-20 * lengths**2), 1.1 * lengths)  # type: ignore[arg-type]
-    structure = Structure(hierarchy, neighbours, means, np.full((MOVING, 3), 0.03))  # type: ignore[arg-type]
+    neighbours = SimpleNamespace(index=nearest, weights=np.exp(-20 * lengths**2), distances=1.1 * lengths)
+    structure = Structure(hierarchy, neighbours, means, np.full((len(means), 3), 0.03))  # type: ignore[arg-type]
     views = []
     for index in range(3):
         pose = np.concatenate([some_rotation(seed + index), [[0], [0], [1.5]]], axis=1)

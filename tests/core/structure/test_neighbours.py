@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 
 
 @pytest.mark.parametrize("count", [50, 200])
 def test_the_nearest_are_those_of_brute_force(count: int) -> None:
     means = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
-    graph = build_neighbours(means, 7, 3.0)
+    graph = Neighbours(means, 7, 3.0)
     distances = np.linalg.norm(means[:, None].astype(np.float64) - means, axis=-1)
     np.fill_diagonal(distances, np.inf)
     np.testing.assert_array_equal(graph.index, np.argsort(distances, axis=1)[:, :7])
@@ -24,7 +24,7 @@ def test_the_nearest_are_those_of_brute_force(count: int) -> None:
 def test_coincident_gaussians_are_neighbours_but_none_is_its_own() -> None:
     means = np.zeros((30, 3), np.float32)
     means[20:] = np.random.default_rng(0).normal(size=(10, 3))
-    graph = build_neighbours(means, 5, 2000.0)
+    graph = Neighbours(means, 5, 2000.0)
     assert (graph.index != np.arange(30)[:, None]).all()
     assert all(len(set(row)) == 5 for row in graph.index)
     assert (graph.index[:20] < 20).all()
@@ -35,7 +35,7 @@ def test_coincident_gaussians_are_neighbours_but_none_is_its_own() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2, 4])
 def test_fewer_gaussians_than_neighbours_leave_weights_zero(count: int) -> None:
     means = np.arange(3 * count, dtype=np.float32).reshape(count, 3) * 0.01
-    graph = build_neighbours(means, 20, 1.0)
+    graph = Neighbours(means, 20, 1.0)
     assert graph.index.shape == graph.weights.shape == graph.distances.shape == (count, 20)
     found = max(count - 1, 0)
     assert (graph.weights[:, :found] > 0).all()

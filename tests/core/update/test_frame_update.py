@@ -28,7 +28,7 @@ from scas4d_core.kernels import neighbour_terms
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.neighbours import Neighbours, build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update import rates, schedule
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.result import AttemptOptions, Stopwatch, UpdateResult
@@ -47,7 +47,7 @@ CALM = SETTINGS.model_copy(update={"final_rate": 0.1})
 
 def tied(settings: UpdateSettings, gaussians: Gaussians, count: int = NEIGHBOURS) -> tuple[Hierarchy, Neighbours]:
     hierarchy = build_hierarchy(gaussians.means, gaussians.moving, settings.clusters, SMALLEST_CLUSTER)
-    return hierarchy, build_neighbours(gaussians.means[hierarchy.rows], count, FALLOFF)
+    return hierarchy, Neighbours(gaussians.means[hierarchy.rows], count, FALLOFF)
 
 
 def prepare(

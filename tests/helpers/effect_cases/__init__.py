@@ -12,7 +12,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, Settings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.view_factory import ViewFactory
@@ -40,7 +40,7 @@ def of_whole_pictures(
 def updater_of(built: PlanBuilder, engine: UpdateEngine | None = None) -> FrameUpdate:
     """The updater of what the effects have filled in, on an engine; None: that of the CPU."""
     rows = built.hierarchy.rows
-    neighbours = build_neighbours(built.first.means[rows], 20, 200.0) if built.plan.neighbour_terms else None
+    neighbours = Neighbours(built.first.means[rows], 20, 200.0) if built.plan.neighbour_terms else None
     return FrameUpdate(engine or CpuEngine(), built, neighbours)
 
 

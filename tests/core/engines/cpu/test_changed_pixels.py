@@ -23,7 +23,7 @@ from scas4d_core.kernels import image_loss
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.structure.neighbours import build_neighbours
+from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import AttemptOptions, UpdateResult
@@ -53,7 +53,7 @@ def updater(state: Gaussians, most: float, monkeypatch: pytest.MonkeyPatch) -> t
     monkeypatch.setattr(cpu_engine, "MOST", most)
     factory = ViewFactory(RIG)
     hierarchy = build_hierarchy(state.means, state.moving, SETTINGS.clusters, SMALLEST_CLUSTER)
-    neighbours = build_neighbours(state.means[hierarchy.rows], 6, 200.0)
+    neighbours = Neighbours(state.means[hierarchy.rows], 6, 200.0)
     built = register_effects(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
     return FrameUpdate(CpuEngine(), built, neighbours), factory
 

@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
 
 import warp as wp
-from warp_cases import DEVICE
+from warp_cases import DEVICE, Uploads
 
-from scas4d_core.engines.warp.copies import MOST, DeviceCopies, features_on
+from scas4d_core.engines.warp.copies import MISSING, MOST, DeviceCopies, features_on, upload
 from scas4d_core.gaussians import Gaussians
 
 
@@ -32,9 +32,12 @@ def test_an_array_is_uploaded_once_and_becomes_read_only(copies: DeviceCopies) -
         array[0] = 2
 
 
-def test_a_view_that_may_change_is_uploaded_each_time(copies: DeviceCopies) -> None:
+def test_a_view_that_may_change_is_uploaded_when_it_does(copies: DeviceCopies, monkeypatch: pytest.MonkeyPatch) -> None:
     array = points()
     copies.of(array[1:], wp.vec3)
+    uploads = Uploads(monkeypatch)
+    assert (copies.of(array[1:], wp.vec3).numpy() == 1).all()
+    assert not uploads.bytes
     array[1:] = 2
     assert (copies.of(array[1:], wp.vec3).numpy() == 2).all()
 
@@ -66,3 +69,21 @@ def test_an_array_computed_on_the_device_is_a_copy(copies: DeviceCopies) -> None
     host, device = points(), wp.array(points(), dtype=wp.vec3, device=DEVICE)
     copies.store(device, host)
     assert copies.of(host, wp.vec3) is device
+
+
+def test_only_rows_that_were_added_are_uploaded(copies: DeviceCopies, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, born = np.arange(30, dtype=np.float32).reshape(10, 3), points()
+    after, changed = np.concatenate([before, born]), before + (np.arange(10) == 0)[:, None].astype(np.float32)
+    copies.of(before, wp.vec3)
+    uploads = Uploads(monkeypatch)
+    for array, size in ((after, born.nbytes), (before[:7].copy(), 0), (after.copy(), 0), (changed, changed.nbytes)):
+        uploads.bytes.clear()
+        assert np.array_equal(copies.of(array, wp.vec3).numpy(), array)
+        assert sum(uploads.bytes.values()) == size
+
+
+@pytest.mark.parametrize(("largest", "size"), [(MISSING - 1, 2), (MISSING, 4), (10**6, 4)])
+def test_indices_that_fit_are_uploaded_in_two_bytes(largest: int, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    indices, uploads = np.array([[0, -1, 5], [largest, 7, -1]]), Uploads(monkeypatch)
+    assert np.array_equal(upload(indices, wp.int32, DEVICE).numpy(), indices)
+    assert sum(uploads.bytes.values()) == size * indices.size
