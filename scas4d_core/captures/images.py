@@ -24,10 +24,11 @@ A mask is 1 where the stored value of any channel is nonzero. Masks with alpha o
 from __future__ import annotations
 
 import io
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,7 @@ def check_image(source: Source, *, size: Size | None = None, name: str | None = 
     """Raises the error that `decode_image` would raise for a file.
 
     The pixels of common JPEG files and of raw pixels are not decoded, because their structure shows that they can be.
+    Of those without metadata, only the structure is checked.
 
     Args:
         source: image file, as bytes or as a path.
@@ -420,6 +422,9 @@ class _PictureFile:
         size: required (width, height), or None.
         mask: whether the file is a mask or a label image.
 
+    Attributes:
+        is_plain: whether the image is 8-bit RGB or grey without transparency, whose conversion to sRGB cannot fail.
+
     Raises:
         ImageError: if the file breaks a rule, or cannot be decoded.
     """
@@ -439,22 +444,30 @@ class _PictureFile:
             # reported below.
             if size is not None and sorted(size) != sorted(self.header.size):
                 raise _wrong_size(self.header, size)
-            self._picture = _open(io.BytesIO(self._data), (self.header.format,))
-            if self._picture.size != self.header.size:
-                raise ImageError("the file contains different image sizes", RESEND)
-            profile = self._picture.info.get("icc_profile")
-            self._to_srgb = _to_srgb(profile) if profile and not mask else None
-            if not self.header.decodable:
-                self._picture.load()
-            _check_orientation(self._picture)
+            # Pillow, which takes longer than all other checks, would find nothing in a file that is decodable and has
+            # no metadata, except that an image is huge.
+            is_huge = math.prod(self.header.size) > (Image.MAX_IMAGE_PIXELS or 0)
+            self.is_plain = self.header.decodable and not self.header.has_metadata and not is_huge
+            self._to_srgb: Any = None
+            if not self.is_plain:
+                self._check_with_pillow(mask)
             if size not in (None, self.header.size):
                 raise _wrong_size(self.header, size)
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether the image is 8-bit RGB or grey without transparency, whose conversion to sRGB cannot fail."""
+    @cached_property
+    def _picture(self) -> Image.Image:
+        return _open(io.BytesIO(self._data), (self.header.format,))
+
+    def _check_with_pillow(self, mask: bool) -> None:
+        if self._picture.size != self.header.size:
+            raise ImageError("the file contains different image sizes", RESEND)
+        profile = self._picture.info.get("icc_profile")
+        self._to_srgb = _to_srgb(profile) if profile and not mask else None
+        if not self.header.decodable:
+            self._picture.load()
+        _check_orientation(self._picture)
         plain = self._picture.mode in ("L", "RGB") and "transparency" not in self._picture.info
-        return plain and self.header.bits <= 8
+        self.is_plain = plain and self.header.bits <= 8
 
     def stored(self) -> NDArray[Any]:
         """Returns the values of a mask as stored, [H, W] or [H, W, C]; of a palette image, the indices."""
