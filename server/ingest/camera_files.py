@@ -189,10 +189,7 @@ def _only_camera(head: FrameHead, camera: str | None) -> str:
 
 def _seconds(value: str) -> float:
     try:
-        try:
-            seconds = float(value)
-        except ValueError:
-            raise time_error(value) from None
-        return check_time(seconds)
-    except InputError as error:
+        return check_time(float(value))
+    except ValueError as fault:
+        error = fault if isinstance(fault, InputError) else time_error(value)
         raise Problem(422, error.fault, field="time", value=value, remedy=error.remedy) from None
