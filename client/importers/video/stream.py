@@ -80,7 +80,7 @@ class VideoStream:
 
         The conversion is set up once per stream. PyAV's `to_ndarray` would do so for each frame.
         """
-        return np.ascontiguousarray(self._reformatter.reformat(frame, format="rgb24", threads=1).to_ndarray())
+        return np.ascontiguousarray(self._reformatter.reformat(frame, format="rgb24").to_ndarray())
 
     def close(self) -> None:
         """Closes the file."""
