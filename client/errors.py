@@ -167,13 +167,16 @@ def error_of(response: httpx.Response) -> ServiceError:
     """Returns the exception for an error response."""
     try:
         problem = ProblemDetails.model_validate_json(response.content)
-    except ValueError:  # not from our service, e.g. from a proxy in front of it
-        text = response.text[:TEXT_LENGTH]
-        detail = (
-            f"unexpected response, which is not from the service but perhaps from a proxy or another server: {text}"
-        )
-        problem = ProblemDetails(title="unexpected response", status=response.status_code, detail=detail)
+    except ValueError:
+        return unexpected_response(response)
     return error_of_problem(problem)
+
+
+def unexpected_response(response: httpx.Response) -> ServiceError:
+    """Returns the exception for a response that is not from the service, of any status."""
+    text = response.text[:TEXT_LENGTH]
+    detail = f"unexpected response, which is not from the service but perhaps from a proxy or another server: {text}"
+    return error_of_problem(ProblemDetails(title="unexpected response", status=response.status_code, detail=detail))
 
 
 def error_of_problem(problem: ProblemDetails) -> ServiceError:

@@ -19,7 +19,7 @@ from client import calls
 from client.batches import SendingBatch
 from client.calls import Call, NewFrame
 from client.calls.frames import Numbering
-from client.errors import ServiceError
+from client.errors import ServiceError, unexpected_response
 from client.retries import BUSY_S, OUTAGE_S, OnRetry, Retries
 from client.wire import FINISHED, FrameReportModel, IngestAnswer, SceneState, SceneStatus
 
@@ -74,6 +74,17 @@ class _ClientBase:
     def _http_arguments(self) -> dict[str, Any]:
         headers = {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
         return {"base_url": self.url, "timeout": httpx.Timeout(TIMEOUT_S, connect=10.0), "headers": headers}
+
+    def _parse(self, call: Call[T], response: httpx.Response) -> T:
+        """Returns the parsed response.
+
+        Raises:
+            ServiceError: another server responded.
+        """
+        try:
+            return call.parse(response)
+        except (ValueError, OSError) as error:  # pydantic, NumPy and Pillow
+            raise unexpected_response(response) from error
 
     def _retries(self, call: Call[Any]) -> Retries:
         return Retries(call, self.url, busy=self.busy_timeout, outage=self.outage, on_retry=self.on_retry)
@@ -149,7 +160,7 @@ class Client(_ClientBase):
             else:
                 wait = retries.after_response(response)
                 if wait is None:
-                    return call.parse(response)
+                    return self._parse(call, response)
             time.sleep(wait)
 
     live = _sends(calls.live)
@@ -306,7 +317,7 @@ class AsyncClient(_ClientBase):
             else:
                 wait = retries.after_response(response)
                 if wait is None:
-                    return call.parse(response)
+                    return self._parse(call, response)
             await asyncio.sleep(wait)
 
     live = _sends_async(calls.live)

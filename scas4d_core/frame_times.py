@@ -17,13 +17,16 @@ from scas4d_core.errors import InputError
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 86_400.0
 """Minimum and maximum time between two frames in seconds. A longer step is a clock that was set, not a pause."""
 LATEST_FIRST = 1e10
-"""Maximum time of the first frame in seconds, the year 2286 as Unix time. Differences of later times are inexact."""
+"""Maximum magnitude of the first frame's time in seconds, the year 2286 as Unix time. Beyond it, differences of times
+are inexact."""
 MAX_TIME = 1e19
-"""Maximum sent time. Unix time in nanoseconds is 1.8e18."""
+"""Maximum magnitude of a sent time. Unix time in nanoseconds is 1.8e18."""
 ROWS = 8
 """Number of frames from which the unit of the times is judged."""
 SUSPICIOUS = 100.0
 """Minimum step between frames, in multiples of the interval at the frame rate, at which the unit is suspected."""
+PAUSE_FACTOR = 2.0
+"""Maximum factor between the first step and a unit for which that step alone shows the unit and is not a pause."""
 UNITS = {"seconds": 1.0, "milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 """Number of each unit in a second. A time from 1e9 to 1e10 s is probably a Unix time, from 2001 to 2286."""
 
@@ -38,17 +41,22 @@ class FrameTime:
 
 
 def check_time(seconds: float) -> float:
-    """Returns the sent time of a frame unchanged.
+    """Returns the sent time of a frame unchanged. Times before the clock's origin, such as a trigger, are negative.
 
     Raises:
-        InputError: if the time is not a number from 0 to ``MAX_TIME``.
+        InputError: if the time is not a number within ±``MAX_TIME``.
     """
-    if not 0 <= seconds <= MAX_TIME:
-        raise InputError(
-            f"the time of a frame must be a number of seconds from 0 to {MAX_TIME!r}, not {seconds!r}",
-            "send the seconds since a fixed moment, such as 1.25, or omit time",
-        )
+    if not abs(seconds) <= MAX_TIME:
+        raise time_error(seconds)
     return seconds
+
+
+def time_error(value: object) -> InputError:
+    """Returns the error for a value that is not the time of a frame."""
+    return InputError(
+        f"the time of a frame must be a number of seconds from {-MAX_TIME!r} to {MAX_TIME!r}, not {value!r}",
+        "send the seconds since a fixed moment, such as 1.25, or omit time",
+    )
 
 
 def time_after(previous: FrameTime | None, index: int, sent: float, fps: float) -> float:
@@ -73,7 +81,7 @@ def time_after(previous: FrameTime | None, index: int, sent: float, fps: float) 
     0.325
     """
     if previous is None:
-        return sent if sent <= LATEST_FIRST else index / fps
+        return sent if abs(sent) <= LATEST_FIRST else index / fps
     if SHORTEST_STEP <= sent - previous.time <= LONGEST_STEP:
         return sent
     step = sent - previous.sent
@@ -85,8 +93,9 @@ def time_after(previous: FrameTime | None, index: int, sent: float, fps: float) 
 def time_warnings(frames: Sequence[FrameTime], fps: float) -> list[str]:
     """Returns sentences on times that are probably not seconds, and on a sent time that was not used.
 
-    The unit is that in which the step between frames is closest to the interval at the frame rate. A single frame is
-    judged by its size.
+    The unit is that in which the step between frames is closest to the interval at the frame rate, for most steps and
+    for the newest one: a pause is no unit, and a sender that has corrected its unit is not warned again. A single
+    frame is judged by its size.
 
     Args:
         frames: up to ``ROWS`` frames in order; the last one is the newest.
@@ -102,6 +111,9 @@ def time_warnings(frames: Sequence[FrameTime], fps: float) -> list[str]:
     steps = [(later.sent - earlier.sent) / (later.index - earlier.index) for earlier, later in pairwise(frames)]
     step = median_low([step for step in steps if step > 0] or [0.0])
     unit = _unit(step * fps)
+    # Most steps may precede a correction of the unit, and a single step may be a pause.
+    if (steps and _unit(steps[-1] * fps) != unit) or (len(steps) == 1 and not _is_near(step * fps, UNITS[unit])):
+        unit = "seconds"
     unix = next((name for name, scale in UNITS.items() if 1e9 <= newest.sent / scale < 1e10), "")
     if step == 0 and unix:
         unit = unix
@@ -115,7 +127,7 @@ def time_warnings(frames: Sequence[FrameTime], fps: float) -> list[str]:
             f"the times are probably {what}: frame {newest.index} has the time {newest.sent!r}{apart}; {remedy}"
         )
     if newest.time != newest.sent:
-        fault = f"above {LATEST_FIRST:.0f} s"
+        fault = f"not within ±{LATEST_FIRST:.0f} s"
         if len(frames) > 1:
             fault = f"not 1 µs to 1 day after frame {frames[-2].index} at {frames[-2].time!r} s"
         warnings.append(
@@ -130,3 +142,7 @@ def _unit(ratio: float) -> str:
     if ratio < SUSPICIOUS:
         return "seconds"
     return next((unit for unit, scale in UNITS.items() if scale > 1 and ratio < scale * 10**1.5), "nanoseconds")
+
+
+def _is_near(ratio: float, scale: float) -> bool:
+    return scale / PAUSE_FACTOR <= ratio <= scale * PAUSE_FACTOR

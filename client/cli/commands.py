@@ -17,7 +17,7 @@ from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_lab
 from client.importers.open_source import CaptureOptions
 from client.progress import Bars, console
 from client.sdk import DEFAULT_URL, Client
-from client.wire import FINISHED, FrameReportModel, IngestSettings, SceneState, SceneStatus
+from client.wire import FINISHED, FrameReportModel, IngestSettings
 from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
@@ -125,7 +125,7 @@ def push(
             on_message=note,
         )
         status = client.scene(delivery.scene)
-        only_left_out = delivery.left_out.images > 0 and _lacks_only_cameras(client, status)
+        only_left_out = delivery.left_out.images > 0 and status.lost_cameras
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
     for sentence in status.warnings:
         if sentence not in source.remarks:  # already printed when the capture was opened
@@ -135,19 +135,6 @@ def push(
     if status.error and not only_left_out:
         raise SystemExit(f"scas4d: {status.error}")
     finish(delivery.left_out)
-
-
-def _lacks_only_cameras(client: Client, status: SceneStatus) -> bool:
-    """Returns whether the last frame is as it should be, except that it lacks cameras."""
-    if status.state == SceneState.FAILED or status.last_committed is None:
-        return False
-    report = client.frame(status.id, status.last_committed)
-    return (
-        bool(report.dropped_cameras)
-        and not report.degraded
-        and status.error is not None
-        and status.error.startswith(f"frame {report.index} ")
-    )
 
 
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:

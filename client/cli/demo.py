@@ -47,7 +47,7 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
         url = f"http://127.0.0.1:{port}"
         total = 1
         with Bars() as bars:
-            while (left := _compile_progress(url, log)) is not None:
+            while (left := _compile_progress(url, log, process.pid)) is not None:
                 if process.poll() is not None:
                     raise RuntimeError(f"the service exited: {_last_log_line(log)}; see the log at {log}")
                 done, total = left
@@ -74,13 +74,16 @@ def _free(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
+def _compile_progress(url: str, log: Path, process: int) -> tuple[int, int] | None:
     """Returns the numbers of compiled and total kernels, or None once the service is ready.
 
-    Returns (0, 1) while the numbers are unknown.
+    Returns (0, 1) while the numbers are unknown, or if another process responds: it took the port in the meantime, and
+    the service is about to exit.
     """
     try:
         with Client(url, token=_token(), outage=0) as client:
+            if client.live().process != process:
+                return 0, 1
             client.ready()
     except ServiceUnreachable:
         return 0, 1

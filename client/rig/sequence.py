@@ -1,4 +1,4 @@
-"""Frames of a capture as encoded frames of a scene. The next frame is read ahead of time."""
+"""Frames of a capture as encoded frames of a scene. The next frames are read ahead of time."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from client.left_out import LeftOut
 from scas4d_core.captures import Capture, CaptureError, ImageError
 
 FOREVER = 10**9
+AHEAD = 2
+"""Number of frames to read ahead. With one, reading would pause while the service syncs a frame to disk."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Sequence:
         self.loop = loop
         self._last = source.frame_count - 1 - start
         self._pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1), thread_name_prefix="frames")
-        self._ahead: tuple[int, Future[EncodedFrame]] | None = None
+        self._ahead: dict[int, Future[EncodedFrame]] = {}
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead")
 
     def __len__(self) -> int:
@@ -76,17 +78,22 @@ class Sequence:
         return self.time(self._last) + (index - self._last) / self.source.fps
 
     def files(self, index: int) -> EncodedFrame:
-        """Returns the files of a frame, and starts to read the next frame in the background."""
+        """Returns the files of a frame, and starts to read the next frames in the background."""
         files = self.read_ahead(index)
-        if index + 1 < len(self):
-            self._ahead = index + 1, self._reader.submit(self._files, index + 1)
+        following = range(index + 1, min(index + 1 + AHEAD, len(self)))
+        self._ahead = {
+            other: self._ahead[other] if other in self._ahead else self._reader.submit(self._files, other)
+            for other in following
+        }
         return files
 
     def read_ahead(self, index: int) -> EncodedFrame:
         """Reads a frame and keeps it for the next call of `files`."""
-        if self._ahead is None or self._ahead[0] != index:
-            self._ahead = index, self._reader.submit(self._files, index)
-        return self._ahead[1].result()
+        if index not in self._ahead:
+            for other in self._ahead.values():
+                other.cancel()
+            self._ahead = {index: self._reader.submit(self._files, index)}
+        return self._ahead[index].result()
 
     def first_usable(self, left_out: LeftOut) -> int:
         """Returns the index of the first frame with enough usable images, and keeps this frame for `files`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +20,9 @@ from client.sdk import Client
 from client.wire import IngestSettings, SceneStatus
 from client.wire.base import MAX_NAME, escaped
 from scas4d_core.captures import Capture
+
+PROGRESS_S = 0.2
+"""Minimum interval in seconds between two requests for the progress while frames are sent."""
 
 OnProgress = Callable[[str, int, int], None]
 """Progress callback, called with (stage, done, total)."""
@@ -124,13 +128,15 @@ def push(
         stack.callback(sender.close)
         stack.enter_context(_record_retries(client, delivery.lateness, on_message))
         is_first = status.next_frame == 0
+        asked = -math.inf
         try:
             for index in sender.send_all(status.next_frame, count):
                 if is_first and index not in delivery.lost:
                     is_first = False
                     _follow(client, status.id, index, count, on_progress)
                     sender.start_clock()
-                else:
+                elif time.monotonic() >= asked + PROGRESS_S:
+                    asked = time.monotonic()
                     on_progress("frames", _finished(client.scene(status.id)), count)
             delivery.lateness.ended = time.monotonic()
             # Lost frames count as finished immediately, so wait for the last frame that was sent.

@@ -304,6 +304,9 @@ class SceneStatus(Model):
             "the reason. Independent of `state`."
         ),
     )
+    lost_cameras: bool = Field(
+        default=False, description="Whether `degraded` is only due to cameras that the last frame lost."
+    )
     open_frames: list[int] = Field(description="Frames whose cameras are still sending.")
     failed: int = Field(description="Number of frames that could not be reconstructed.")
     missing: int = Field(description="Number of frames declared missing.")

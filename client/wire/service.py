@@ -15,6 +15,7 @@ class Health(Model):
     status: Literal["live", "ready"]
     version: str
     scenes: int
+    process: int | None = Field(default=None, description="Process id of the service on its machine; only in /live.")
     ready_after: float | None = Field(
         default=None, description="Seconds from the start of the service until its kernels were compiled."
     )

@@ -38,7 +38,7 @@ from PIL import Image, ImageCms, UnidentifiedImageError
 from simplejpeg import decode_jpeg
 
 from scas4d_core.captures.bit_depth import find_bit_depth, is_sixteen_bit, sixteen_bit_values, to_eight_bits
-from scas4d_core.captures.picture_file import ACCEPTED, ICC_SEGMENT, RESEND, ImageError, PictureHeader, picture_header
+from scas4d_core.captures.picture_file import ACCEPTED, RESEND, ImageError, PictureHeader, picture_header
 from scas4d_core.frame_outcome import grey_warnings
 
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "PPM")
@@ -103,6 +103,7 @@ def check_image(source: Source, *, size: Size | None = None, name: str | None = 
     """Raises the error that `decode_image` would raise for a file.
 
     The pixels of common JPEG files and of raw pixels are not decoded, because their structure shows that they can be.
+    Of those without metadata, only the structure is checked.
 
     Args:
         source: image file, as bytes or as a path.
@@ -422,6 +423,9 @@ class _PictureFile:
         size: required (width, height), or None.
         mask: whether the file is a mask or a label image.
 
+    Attributes:
+        is_plain: whether the image is 8-bit RGB or grey without transparency, whose conversion to sRGB cannot fail.
+
     Raises:
         ImageError: if the file breaks a rule, or cannot be decoded.
     """
@@ -441,20 +445,13 @@ class _PictureFile:
             # reported below.
             if size is not None and sorted(size) != sorted(self.header.size):
                 raise _wrong_size(self.header, size)
-            self._to_srgb = None
-            self._is_bare = self._is_simple_jpeg and not self.header.metadata
-            if self._is_bare:
-                if size not in (None, self.header.size):
-                    raise _wrong_size(self.header, size)
-                return
-            if self._picture.size != self.header.size:
-                raise ImageError("the file contains different image sizes", RESEND)
-            profile = self._picture.info.get("icc_profile")
-            if profile and not mask:
-                self._to_srgb = _to_srgb(profile)
-            if not self.header.decodable:
-                self._picture.load()
-            _check_orientation(self._picture)
+            # Pillow, which takes longer than all other checks, would find nothing in a file that is decodable and has
+            # no metadata, except that an image is huge.
+            self._is_huge = math.prod(self.header.size) > (Image.MAX_IMAGE_PIXELS or math.inf)
+            self.is_plain = self.header.decodable and not self.header.has_metadata and not self._is_huge
+            self._to_srgb: Any = None
+            if not self.is_plain:
+                self._check_with_pillow(mask)
             if size not in (None, self.header.size):
                 raise _wrong_size(self.header, size)
 
@@ -466,20 +463,20 @@ class _PictureFile:
     def _is_simple_jpeg(self) -> bool:
         """Whether the image is a JPEG that simplejpeg decodes like Pillow, in less than half of its time.
 
-        Such a JPEG can be decoded for certain, has no colour profile, and is not so large that Pillow would warn.
+        Such a JPEG can be decoded for certain, needs no colour conversion, and is not so large that Pillow would warn.
         """
-        width, height = self.header.size
-        bounded = width * height <= (Image.MAX_IMAGE_PIXELS or math.inf)
-        plain = self.header.format == "JPEG" and ICC_SEGMENT not in self.header.metadata
-        return plain and self.header.decodable and bounded
+        return self.header.format == "JPEG" and self.header.decodable and not self._is_huge and self._to_srgb is None
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether the image is 8-bit RGB or grey without transparency, whose conversion to sRGB cannot fail."""
-        if self._is_bare:
-            return True
+    def _check_with_pillow(self, mask: bool) -> None:
+        if self._picture.size != self.header.size:
+            raise ImageError("the file contains different image sizes", RESEND)
+        profile = self._picture.info.get("icc_profile")
+        self._to_srgb = _to_srgb(profile) if profile and not mask else None
+        if not self.header.decodable:
+            self._picture.load()
+        _check_orientation(self._picture)
         plain = self._picture.mode in ("L", "RGB") and "transparency" not in self._picture.info
-        return plain and self.header.bits <= 8
+        self.is_plain = plain and self.header.bits <= 8
 
     def stored(self) -> NDArray[Any]:
         """Returns the values of a mask as stored, [H, W] or [H, W, C]; of a palette image, the indices."""

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scas4d_core.captures.jpeg import SOS, always_decodes
+from scas4d_core.captures.jpeg import COM, SOS, always_decodes
 from scas4d_core.errors import InputError
 
 ACCEPTED = "JPEG, PNG, WebP, BMP, PPM or PGM"
 """Formats of images, for messages."""
-ICC_SEGMENT = 0xE2
-"""Marker of the JPEG segments that contain a colour profile."""
 RESEND = "the file is damaged; send the original again"
+JFIF_SIZE = 14
+"""Size of a JFIF segment without a thumbnail, in bytes. It contains the resolution in print, which is not used."""
 
 _RAW_HEAD = re.compile(rb"P([56])[ \t\r\n]+(\d{1,6})[ \t\r\n]+(\d{1,6})[ \t\r\n]+(\d{1,6})[ \t\r\n]")
 """Header of a binary PGM or PPM file, up to the first byte of its pixels: format, width, height and maximum value."""
@@ -48,7 +48,7 @@ class PictureHeader:
         bits: bits per channel, of a palette per index.
         significant_bits: bits per channel of the original values according to the sBIT chunk of a PNG, or None.
         decodable: whether the structure alone guarantees that the pixels can be decoded.
-        metadata: markers of the application segments of a JPEG, without JFIF.
+        has_metadata: whether there may be metadata that affect the pixels, such as an orientation or a profile.
     """
 
     format: str
@@ -56,7 +56,7 @@ class PictureHeader:
     bits: int = 8
     significant_bits: int | None = None
     decodable: bool = False
-    metadata: frozenset[int] = frozenset()
+    has_metadata: bool = True
 
 
 def picture_header(data: bytes | memoryview) -> PictureHeader:
@@ -127,8 +127,9 @@ def _jpeg(data: memoryview) -> PictureHeader:
             at = _end_of_scan(data, at)
     if size is None:
         raise ImageError("the JPEG file has no frame header", RESEND)
-    metadata = frozenset(marker for marker, _ in segments if 0xE1 <= marker <= 0xEF)
-    return PictureHeader("JPEG", size, decodable=always_decodes(segments), metadata=metadata)
+    others = [(marker, body) for marker, body in segments if 0xE0 <= marker <= 0xEF or marker == COM]
+    has_metadata = any(marker != 0xE0 or len(body) != JFIF_SIZE or body[:5] != b"JFIF\0" for marker, body in others)
+    return PictureHeader("JPEG", size, decodable=always_decodes(segments), has_metadata=has_metadata)
 
 
 def _end_of_scan(data: memoryview, at: int) -> int:
@@ -202,7 +203,7 @@ def _ppm(data: memoryview) -> PictureHeader:
             f"the PPM or PGM file has {len(data)} bytes, but its header declares {size}",
             "send one byte per channel and pixel, and nothing else",
         )
-    return PictureHeader("PPM", (width, height), decodable=min(width, height) > 0)
+    return PictureHeader("PPM", (width, height), decodable=min(width, height) > 0, has_metadata=False)
 
 
 def _webp(data: memoryview) -> PictureHeader:

@@ -107,12 +107,14 @@ def _json_problem(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, t
     at = loc[-1] if loc and isinstance(loc[-1], int) else None
     sent = text if text is not None else str(error.get("input", ""))
     value = sent if at is None else sent[max(0, at - EXCERPT) : at + EXCERPT]
-    reason = error.get("ctx", {}).get("error", error["msg"])
+    reason = str(error.get("ctx", {}).get("error", error["msg"])).removesuffix(
+        " at"
+    )  # "Unterminated string starting at"
     place = "" if at is None else f" at character {at}"
     field = prefix or (str(loc[0]) if loc else "message")
     return Problem(
         422,
-        f"the {field} is not valid JSON: {str(reason)[:1].lower()}{str(reason)[1:]}{place}",
+        f"the {field} is not valid JSON: {reason[:1].lower()}{reason[1:]}{place}",
         field=field,
         value=value or MISSING,
         remedy="send well-formed JSON: names and text in double quotes, no trailing comma, no comments",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import AsyncIterator, Sequence
 
 from fastapi import Request
@@ -11,7 +10,7 @@ from starlette.datastructures import UploadFile
 from client.wire import CameraReceipt, FileKind, FrameFile, FrameHead, FrameReceipt
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.errors import InputError
-from scas4d_core.frame_times import check_time
+from scas4d_core.frame_times import check_time, time_error
 from server.ingest.acknowledge import Ingest
 from server.ingest.open_frames import OpenFrames
 from server.ingest.pictures import MASK, check_files, check_size
@@ -190,10 +189,7 @@ def _only_camera(head: FrameHead, camera: str | None) -> str:
 
 def _seconds(value: str) -> float:
     try:
-        seconds = float(value)
-    except ValueError:
-        seconds = math.nan
-    try:
-        return check_time(seconds)
-    except InputError as error:
+        return check_time(float(value))
+    except ValueError as fault:
+        error = fault if isinstance(fault, InputError) else time_error(value)
         raise Problem(422, error.fault, field="time", value=value, remedy=error.remedy) from None

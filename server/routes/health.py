@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 
 from fastapi import APIRouter, Request
@@ -26,7 +27,7 @@ A typical frame takes a few MB, and so does its state. Frames are still accepted
 @router.get("/live")
 async def live(scenes: AllScenes) -> Health:
     """Returns 200 while the process is running."""
-    return Health(status="live", version=__version__, scenes=len(scenes))
+    return Health(status="live", version=__version__, scenes=len(scenes), process=os.getpid())
 
 
 @router.get("/ready")

@@ -34,7 +34,7 @@ from server.storage.journal import Journal
 from server.storage.ledger import SceneLog
 from server.storage.snapshot import events_of
 from server.updates.reports import FrameReports
-from server.updates.trouble import Trouble, last_trouble
+from server.updates.trouble import Reason, Trouble, last_trouble
 from server.updates.updates import Updates
 from server.updates.worker_process import WorkerProcess
 
@@ -180,7 +180,7 @@ class Scene:
 
     @property
     def _facts(self) -> SceneFacts:
-        updates = self.updates
+        updates, repair = self.updates, self.repair_queue.current_repair
         return SceneFacts(
             definition=self._definition,
             ledger=self.ledger,
@@ -190,7 +190,7 @@ class Scene:
             first=updates.first,
             damage=self._damage.sentences,
             warnings=self.warnings,
-            trouble=self._trouble.sentence or self.repair_queue.current_repair,
+            trouble=self._trouble.reason or (Reason(repair) if repair else None),
             at_work=updates.at_work,
             behind_seconds=updates.behind_seconds,
             progress=updates.progress,

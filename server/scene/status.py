@@ -27,6 +27,7 @@ from server.scene.new_reconstruction import restart_remedy
 from server.storage.definition import Definition
 from server.storage.frame_store import FrameLogIndex
 from server.storage.ledger import Ledger
+from server.updates.trouble import Reason
 
 
 def state_of(ledger: Ledger, *, at_work: bool, degraded: bool) -> SceneState:
@@ -74,7 +75,7 @@ class SceneFacts:
     first: Mapping[str, Any]
     damage: list[str]
     warnings: list[str]
-    trouble: str | None
+    trouble: Reason | None
     at_work: bool = False
     behind_seconds: float = 0.0
     progress: ProgressModel | None = None
@@ -85,7 +86,9 @@ class SceneFacts:
     def error(self) -> str | None:
         """Reason why the scene has failed or is degraded, or None."""
         fatal = self.ledger.fatal
-        return self.trouble if fatal is None else f"{fatal}; {restart_remedy(self.ledger)}"
+        if fatal is None:
+            return None if self.trouble is None else self.trouble.sentence
+        return f"{fatal}; {restart_remedy(self.ledger)}"
 
     @property
     def state(self) -> SceneState:
@@ -119,7 +122,8 @@ class SceneFacts:
             paused=ledger.paused,
             asleep=self.asleep,
             archived=bool(ledger.edited.archived),
-            degraded=self.error is not None and ledger.fatal is None,
+            degraded=self.trouble is not None and ledger.fatal is None,
+            lost_cameras=self.trouble is not None and self.trouble.lost_cameras and ledger.fatal is None,
             open_frames=sorted(ledger.open),
             failed=counts[FrameState.FAILED],
             missing=counts[FrameState.MISSING],

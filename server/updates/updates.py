@@ -41,7 +41,7 @@ from server.storage.events import FrameFailed, PicturesDeleted, StatesDeleted, W
 from server.storage.ledger import SceneLog
 from server.updates.latency import Latencies
 from server.updates.reports import FrameReports, first_frame_facts
-from server.updates.trouble import Trouble, last_trouble, trouble_in_report
+from server.updates.trouble import Reason, Trouble, last_trouble, trouble_in_report
 from server.updates.work_clock import WorkClock
 from server.updates.worker_process import WorkerProcess, give_up_event
 
@@ -287,7 +287,7 @@ class Updates:
                 self._publisher.publish_frame(ledger.frames[ready.indices[-1]].report)
         if life is None or life is not self.worker.life:  # the worker died in the meantime
             return
-        self._trouble.sentence = last_trouble(self._ledger)
+        self._trouble.reason = last_trouble(self._ledger)
         self.worker.ready = True
         self._repair_queue.resume(ready.damaged)
         self.begin()
@@ -315,7 +315,7 @@ class Updates:
         self.latencies.commit(message.index)
         self._record(message.index, message.report)
         report = self.with_latency(self._ledger.frames[message.index].report)
-        self._trouble.sentence = trouble_in_report(report)
+        self._trouble.reason = trouble_in_report(report)
         self._readers.refresh((message.index,))
         self._publisher.publish_frame(report)
         self.begin()
@@ -351,12 +351,12 @@ class Updates:
         self._ledger.apply(event)
         self.clock.end(committed=False)
         self._index, self.progress = None, None
-        self._trouble.sentence = trouble_in_report(self._ledger.frames[event.index].report)
+        self._trouble.reason = reason = trouble_in_report(self._ledger.frames[event.index].report)
         if event.fatal:
             async with self._log.lock:  # waits for a frame that is being acknowledged
                 pass
             await self._fail_waiting()
-        log.warning("scene %s: %s", self._ledger.scene, self._trouble.sentence)
+        log.warning("scene %s: %s", self._ledger.scene, reason and reason.sentence)
         self._publisher.publish_frame(self._ledger.frames[event.index].report)
         self.begin()
         await self._make_room()
@@ -416,8 +416,8 @@ class Updates:
             return
         counters.RESTARTS.labels("worker").inc()
         own, delay = self.worker.deaths.note_death(reason)
-        self._trouble.sentence = f"the worker exited unexpectedly ({reason}); restarting it in {delay:g} s"
-        log.error("scene %s: %s", self._ledger.scene, self._trouble.sentence)
+        self._trouble.reason = Reason(f"the worker exited unexpectedly ({reason}); restarting it in {delay:g} s")
+        log.error("scene %s: %s", self._ledger.scene, self._trouble.reason.sentence)
         self._background.run(self._retry_or_fail(reason, own, delay))
 
     async def _retry_or_fail(self, reason: ProcessExit, own: bool, delay: float) -> None:

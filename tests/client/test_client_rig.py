@@ -59,6 +59,19 @@ def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
         Sequence(capture, start=4)
 
 
+def test_the_next_frames_are_read_ahead_and_those_of_another_place_are_not_used(capture):
+    sequence, read = Sequence(capture), []
+    files = sequence._files
+    sequence._files = lambda index: read.append(index) or files(index)
+    first = sequence.files(0)
+    sequence._reader.submit(int).result()  # after what was asked for
+    assert read == [0, 1, 2]
+    assert sequence.files(0).images == first.images
+    assert sequence.files(3).time == capture.time(3)
+    sequence.close()
+    assert read[-1] == 3
+
+
 def test_the_summary_says_how_far_behind():
     lateness = Lateness(late=[-0.1, -0.1, 0.4], busy=1.5, busy_count=2, outage=3, outage_count=4, began=0, ended=2)
     said = lateness.summary(5)

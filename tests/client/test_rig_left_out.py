@@ -18,7 +18,7 @@ from client.left_out import LeftOut
 from client.rig import push
 from client.sdk import Client
 from client.wire import IngestSettings, ProblemDetails
-from scas4d_core.captures import Capture, CaptureError
+from scas4d_core.captures import Capture, CaptureError, decode_image
 
 
 @pytest.fixture
@@ -48,6 +48,54 @@ def test_a_frame_goes_on_without_a_camera(client, folder, way, frame):
     assert (delivery.left_out.images, delivery.left_out.frames, delivery.lost) == (1, [], [])
     (sentence,) = said
     assert re.match(rf"frame {frame}, without camera 1: .*ims/1/00000{frame}.png: the PNG file is truncated", sentence)
+
+
+def turn(path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(path) as picture:
+        picture.save(path, "PNG", exif=exif)
+
+
+def as_jpeg(path):
+    with Image.open(path) as picture:
+        picture.save(path, "JPEG")
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("file", "spoiled", "reason"),
+    [
+        ("ims/1/000002.png", turn, "EXIF orientation is 6"),
+        ("seg/1/000002.png", as_jpeg, "masks must be PNG or BMP, not JPEG"),
+    ],
+)
+def test_turned_images_and_lossy_masks_are_left_out_and_named(client, folder, way, file, spoiled, reason):
+    spoiled(folder / file)
+    said = []
+    delivery = push(open_source(folder), client, on_message=said.append, **way)
+    reports = [client.frame(delivery.scene, index) for index in range(4)]
+    assert [(report.state, report.used_cameras) for report in reports] == [
+        ("committed", ["0"] if index == 2 else ["0", "1"]) for index in range(4)
+    ]
+    (sentence,) = said
+    assert sentence.startswith("frame 2, without camera 1: ")
+    assert reason in sentence
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_16_bit_images_are_sent_and_decoded_as_they_are_read(client, folder, way):
+    values = np.random.default_rng(0).integers(0, 4096, (4, HEIGHT, WIDTH), np.uint16)
+    values[:, 0, 0] = 4095
+    for frame, picture in enumerate(values):
+        Image.fromarray(picture).save(folder / f"ims/1/{frame:06d}.png")
+    source = open_source(folder)
+    delivery = push(source, client, **way)
+    for frame, picture in enumerate(values):
+        assert client.frame(delivery.scene, frame).used_cameras == ["0", "1"]
+        stored = decode_image(client.picture(delivery.scene, frame, "1"))  # 8 bits, as the worker decodes it
+        assert np.array_equal(stored, source.frame(frame).images["1"])
+        assert np.abs(stored[..., 0] - picture * (255 / 4095)).max() <= 0.5 + 1e-9
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from client.cli import main
-from client.errors import NotFound, ServiceUnreachable, unreachable
+from client.errors import NotFound, ServiceError, ServiceUnreachable, unreachable
 from client.ingest import IngestSocket
 from client.sdk import Client
 
@@ -124,6 +124,16 @@ def test_a_response_of_another_server_is_not_taken_for_the_service():
     with Client("http://nowhere", transport=transport) as client, pytest.raises(NotFound) as caught:
         client.scene("s")
     assert "404: unexpected response, which is not from the service but perhaps from a proxy" in str(caught.value)
+
+
+@pytest.mark.parametrize("read", [lambda client: client.scene("s"), lambda client: client.render("s", "c0")])
+@pytest.mark.parametrize("text", ["<html>nginx</html>", "{}"])
+def test_a_success_of_another_server_is_not_taken_for_the_service(read, text):
+    transport = httpx.MockTransport(lambda request: httpx.Response(200, text=text))
+    with Client("http://nowhere", transport=transport) as client, pytest.raises(ServiceError) as caught:
+        read(client)
+    assert str(caught.value).startswith("200: unexpected response, which is not from the service but perhaps")
+    assert str(caught.value).endswith(text)
 
 
 def test_the_command_advises_to_start_a_service_only_if_nothing_listens(closed_port, plain_server, monkeypatch):

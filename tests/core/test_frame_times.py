@@ -40,7 +40,7 @@ def steps(scene: list[float]) -> list[float]:
     return [after - before for before, after in pairwise(scene)]
 
 
-SENT = st.floats(0, MAX_TIME) | st.floats(0, 100) | st.sampled_from([0.0, 5e-324, 1e10, 1e18, MAX_TIME])
+SENT = st.floats(-MAX_TIME, MAX_TIME) | st.floats(-100, 100) | st.sampled_from([0.0, 5e-324, 1e10, 1e18, MAX_TIME])
 
 
 @given(st.lists(st.tuples(st.integers(1, 10**6), SENT), max_size=20), st.floats(1e-4, 1e4))
@@ -118,6 +118,29 @@ def test_unix_times_are_named_and_used() -> None:
         )
 
 
+def test_times_before_a_trigger_are_used() -> None:
+    sent = [check_time(time) for time in regular(40, -1.0)]
+    assert times(sent) == sent
+    assert not warnings(sent)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e6, 1e9])
+@pytest.mark.parametrize("before", [1, 2, 5, 20])
+def test_a_corrected_unit_is_not_named_again(scale: float, before: int) -> None:
+    sent = [*(time * scale for time in regular(before)), *regular(20)[before:]]
+    assert before == 1 or "probably" in warnings(sent[:before])[0]
+    for count in range(before + 1, 20):
+        assert not [text for text in warnings(sent[:count]) if "probably" in text]
+
+
+@pytest.mark.parametrize("seconds", [500.0, 5e3])
+@pytest.mark.parametrize("before", [1, 2, 5])
+def test_one_jump_is_no_unit(seconds: float, before: int) -> None:
+    sent = [*regular(before), *(seconds + time for time in regular(12)[before:])]
+    for count in range(1, 12):
+        assert not [text for text in warnings(sent[:count]) if "probably" in text]
+
+
 @pytest.mark.parametrize("seconds", [2.0, 33.0])
 def test_a_pause_is_no_unit(seconds: float) -> None:
     sent = [*regular(4), *regular(4, seconds)]
@@ -125,7 +148,7 @@ def test_a_pause_is_no_unit(seconds: float) -> None:
         assert not warnings(sent[:count])
 
 
-@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -float("inf"), -1.0, -5e-324, 1e300, 2 * MAX_TIME])
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -float("inf"), 1e300, 2 * MAX_TIME, -2 * MAX_TIME])
 def test_other_times_are_refused_by_value(seconds: float) -> None:
     with pytest.raises(InputError) as error:
         check_time(seconds)

@@ -7,6 +7,7 @@ points are relative to the upper left corner of the image. This project uses the
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -60,7 +61,8 @@ class _Image:
 
 def is_model(folder: Path) -> bool:
     """Returns whether the folder contains a COLMAP model."""
-    return any((folder / f"cameras{end}").is_file() for end in (".bin", ".txt"))
+    # Unlike Path.is_file, os.path.isfile returns False in folders that must not be searched, such as `lost+found`.
+    return any(os.path.isfile(folder / f"cameras{end}") for end in (".bin", ".txt"))
 
 
 def find_models(capture: Path) -> list[Path]:

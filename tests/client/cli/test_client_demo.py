@@ -14,10 +14,11 @@ from PIL import Image
 from running import HEIGHT, WIDTH
 from waiting import HANG_S
 
+from client.cli import demo as demo_command
 from client.cli.demo import _compile_progress, running_service
 from client.errors import ServiceError
 from client.sdk import Client
-from client.wire.service import ProblemDetails
+from client.wire.service import Health, ProblemDetails
 from scas4d_core.captures import open_capture
 from server.storage.disk import FolderLock
 
@@ -85,15 +86,26 @@ def test_it_waits_for_what_will_be_ready_without_anybodys_doing(said, tmp_path, 
     def not_ready(client):
         raise ServiceError(ProblemDetails(title="not ready", status=503, detail="not yet", **said))
 
+    monkeypatch.setattr(Client, "live", lambda client: Health(status="live", version="", scenes=0, process=7))
     monkeypatch.setattr(Client, "ready", not_ready)
     if said:
-        assert _compile_progress("http://127.0.0.1:1", tmp_path) == (
+        assert _compile_progress("http://127.0.0.1:1", tmp_path, 7) == (
             said.get("kernels_compiled", 0),
             said.get("kernels", 1),
         )
     else:
         with pytest.raises(RuntimeError, match="failed to become ready: 503: not yet"):
-            _compile_progress("http://127.0.0.1:1", tmp_path)
+            _compile_progress("http://127.0.0.1:1", tmp_path, 7)
+
+
+def test_a_service_that_takes_the_port_in_the_meantime_is_not_used(service, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", fakes.environment()["PYTHONPATH"])
+    monkeypatch.setattr(demo_command, "_free", lambda port: port)  # it was free when the demo looked
+    with (
+        pytest.raises(RuntimeError, match=f"the service exited: port {service.port} of 127.0.0.1 is in use"),
+        running_service(tmp_path / "data", tmp_path / "log", service.port),
+    ):
+        pytest.fail("the demo would delete scenes of another service")
 
 
 def test_another_demo_takes_the_place_of_the_one_before(capture_folder, tmp_path):

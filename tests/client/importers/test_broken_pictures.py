@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,20 @@ def test_a_folder_that_must_not_be_listed_is_not_part_of_the_capture(tmp_path, m
     monkeypatch.setattr(Path, "iterdir", iterdir)
     capture = open_source(tmp_path)
     assert (set(capture.rig.names), capture.frame_count) == (set(NAMES), COUNT)
+
+
+def test_a_folder_that_must_not_be_searched_is_no_model(tmp_path, monkeypatch):
+    (tmp_path / "sparse" / "lost+found").mkdir(parents=True)
+    make(camera_folders, tmp_path)
+    own = os.stat
+
+    def stat(path, *arguments, **options):
+        if "lost+found/" in str(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        return own(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "stat", stat)
+    assert open_source(tmp_path).frame_count == COUNT
 
 
 def test_a_full_disk_is_named_with_the_file(tmp_path, monkeypatch):

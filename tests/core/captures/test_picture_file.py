@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import io
+
 import pytest
 from mutated_pictures import HEIGHT, WIDTH, mutated, whole_files
+from PIL import Image
 
+from scas4d_core.captures import images
 from scas4d_core.captures.images import check_image, check_mask, decode_image, decode_mask
 from scas4d_core.captures.picture_file import ImageError, picture_header
 
@@ -62,3 +66,17 @@ def outcome(function, data):
     except ImageError as error:
         return str(error)
     return None
+
+
+@pytest.mark.parametrize("name", ["JPEG", "JPEG with a comment", "PPM"])
+def test_pillow_opens_only_files_with_metadata(name, monkeypatch):
+    picture = Image.new("RGB", (16, 8), (10, 200, 30))
+    file = io.BytesIO()
+    picture.save(file, name.split()[0], **({"comment": b"metadata"} if "comment" in name else {}))
+    opened, original = [], images._open
+    monkeypatch.setattr(images, "_open", lambda *arguments: opened.append(arguments) or original(*arguments))
+    check_image(file.getvalue(), size=(16, 8))
+    assert len(opened) == ("comment" in name)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 16 * 8 // 4)  # Pillow refuses twice as many
+    with pytest.raises(ImageError, match="DecompressionBomb"):
+        check_image(file.getvalue(), size=(16, 8))

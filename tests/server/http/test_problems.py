@@ -87,3 +87,8 @@ def test_a_fault_of_the_service_names_no_more_than_its_kind(service, monkeypatch
     document = problem(httpx.get(f"{service.url}/v1/scenes/x", timeout=HANG_S), 500)
     assert "KeyError" in document["detail"]
     assert "secret" not in str(document)
+
+
+def test_the_place_of_a_json_error_is_named_once(http):
+    answer = http.post("/v1/scenes", content='{"name": "open', headers={"Content-Type": "application/json"})
+    assert problem(answer, 422)["detail"] == "the body is not valid JSON: unterminated string starting at character 9"

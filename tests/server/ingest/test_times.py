@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 from client.wire import FRAME_MEDIA_TYPE, RigModel
 from client.wire.framing import PREFIX
 
-BAD = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf, "-1": -1.0, "1e300": 1e300}
+BAD = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf, "-2e19": -2e19, "1e300": 1e300}
 """Times as JSON and as a form field writes them."""
 
 
@@ -75,6 +75,12 @@ def test_a_time_out_of_bounds_is_refused_at_every_door_before_the_acknowledgemen
     assert status(http, scene)["next_frame"] == 0
 
 
+def test_a_time_that_is_no_number_is_named_as_it_was_sent(http, make):
+    files = {name: (name, data) for name, data in pictures().items()}
+    answer = http.put(f"/v1/scenes/{make()}/frames/0", files=files, data={"time": "abc"})
+    assert problem(answer, 422)["detail"].endswith(", not 'abc'")
+
+
 @pytest.mark.parametrize("fps", [0, 9e-5, 1e300])
 def test_a_frame_rate_out_of_bounds_is_refused(http, fps):
     rig = RigModel.of(make_rig()).model_dump(mode="json")
@@ -94,6 +100,7 @@ def send_all(http, scene, sent, first=0):
 
 REGULAR = [index / 10 for index in range(4)]
 CLOCKS = {
+    "relative to a trigger": [index / 10 - 0.25 for index in range(5)],
     "set back for good": [*REGULAR, 0.0, 0.1, 0.2],
     "one frame from the near future": [*REGULAR, 500.0, 0.5, 0.6],
     "one frame from the far future": [*REGULAR, 1e18, 0.5, 0.6],
