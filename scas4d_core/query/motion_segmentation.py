@@ -2,7 +2,7 @@
 
 The Gaussians are divided into small patches. Groups of patches are merged in pairs, and each merge is judged by the RMS
 relative motion of the two groups: the distance between their Gaussians and the best common rigid motion, minus what
-their own rigid motions leave. It is compared with the larger of the track noise and the deformation within the groups.
+their own rigid motions leave. It is compared with the track noise plus the deformation of the group that deforms less.
 In a bar that stretches evenly, two halves move apart by √12 times the RMS deviation of each half from a rigid motion.
 Groups whose relative motion clearly exceeds this are separate parts.
 
@@ -13,7 +13,7 @@ that come and go are compared only over their common frames.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,8 @@ NEIGHBOURS = 8
 """Number of neighbours whose residuals are averaged with a Gaussian's own residual before it is assigned to a part."""
 NEAR_PATCHES = 6
 """Number of nearest patches whose motions a Gaussian is compared with."""
-ROWS_AT_ONCE = 4096
+ROWS_AT_ONCE = 1 << 15
+"""Number of Gaussians that are compared with the parts at once, which limits the memory."""
 SEED = 0
 
 
@@ -121,15 +122,34 @@ class Moments:
         moved: Float = np.maximum(self.spread - 2 * np.trace(self.cross, axis1=-2, axis2=-1), 0).sum(-1)
         return moved
 
-    def motions(self) -> tuple[Float, Float]:
-        """Returns the best rotations [K, P, 3, 3] and translations [K, P, 3]."""
+    def motions(self) -> Motions:
+        """Returns the best rigid motion of each group in each pair of frames."""
         weight = np.maximum(self.weight, 1e-12)[..., None]
         cross = self.cross - self.target[..., :, None] * (self.source / weight)[..., None, :]
         size = np.linalg.norm(cross, axis=(-2, -1))[..., None, None]
         left, _, right = np.linalg.svd(cross + (1e-9 * size + 1e-15) * np.eye(3))
         left[..., 2] *= np.linalg.det(left @ right)[..., None]
         turns = left @ right
-        return turns, (self.target - np.einsum("kpij,kpj->kpi", turns, self.source)) / weight
+        shifts = (self.target - np.einsum("kpij,kpj->kpi", turns, self.source)) / weight
+        return Motions(turns, shifts, self.weight > 0)
+
+
+class Motions(NamedTuple):
+    """Rigid motions of G groups in P pairs of frames.
+
+    Attributes:
+        turns: [G, P, 3, 3] rotations.
+        shifts: [G, P, 3] translations.
+        known: [G, P] whether the group is in the scene in both frames.
+    """
+
+    turns: Float
+    shifts: Float
+    known: NDArray[np.bool_]
+
+    def of(self, group: int) -> Motions:
+        """Returns the motions of one group."""
+        return Motions(*(array[[group]] for array in self))
 
 
 def segment_motion(
@@ -143,7 +163,7 @@ def segment_motion(
     """Returns the part of each Gaussian, [M]; ``STATIC`` for parts that do not move.
 
     Args:
-        positions: [T, M, 3] positions over time.
+        positions: [T, M, 3] positions over time; finite, and near the scene where a Gaussian is absent.
         rotations: [T, M, 4] material rotations as unit quaternions (w, x, y, z).
         present: [T, M] whether a Gaussian is in the scene.
         weights: [M] nonnegative weights.
@@ -180,15 +200,19 @@ def segment_motion(
     moments = _robust_moments(chosen, patches)
     merging = _Merging(moments, None if previous is None else _label_weights(previous[rows], patches, chosen))
     groups = merging.run()
-    ids = np.unique(groups)
-    motions = _PartMotions(chosen, patches, moments, merging.moments[ids], np.searchsorted(ids, groups))
+    usable = np.flatnonzero(moments.weight.sum(-1) > 0)  # other patches are in no two frames
+    if not len(usable):
+        return np.zeros(positions.shape[1], np.int64)
+    ids = np.unique(groups[usable])
+    motions = _PartMotions(chosen, patches, usable, moments, merging.moments[ids], np.searchsorted(ids, groups[usable]))
     blocks = range(0, positions.shape[1], ROWS_AT_ONCE)
     evidence = np.concatenate([motions.evidence(tracks(slice(b, b + ROWS_AT_ONCE))) for b in blocks], axis=1)
     evidence = _pooled(evidence, positions[0])
+    unknown = (np.ptp(evidence, axis=0) == 0) & (len(ids) > 1)  # neither a Gaussian nor its neighbours have moved
     shares = np.bincount(evidence.argmin(axis=0), mass, minlength=len(ids)) / mass.sum()
     evidence[(shares < MIN_SHARE) & (shares < shares.max())] = np.inf
     parts = evidence.argmin(axis=0)
-    result: Int = np.where(merging.static(ids)[parts], STATIC, parts).astype(np.int64)
+    result: Int = np.where(merging.static(ids)[parts] | unknown, STATIC, parts).astype(np.int64)
     return result
 
 
@@ -239,25 +263,21 @@ def _robust_moments(tracks: Tracks, patches: Int) -> Moments:
     """Returns the moments of the patches without Gaussians that move differently from the rest of their patch."""
     kept = np.ones(len(patches), bool)
     for _ in range(2):
-        turns, shifts = _moments(tracks, patches, kept).motions()
-        for patch in range(len(turns)):
+        motions = _moments(tracks, patches, kept).motions()
+        for patch in range(len(motions.turns)):
             rows = np.flatnonzero(patches == patch)
-            left = np.sqrt(_residuals(tracks.rows(rows), turns[[patch]], shifts[[patch]])[0])
+            left = np.sqrt(_residuals(tracks.rows(rows), motions.of(patch))[0])
             kept[rows] = left <= OUTLIER * np.median(left) + 1e-9
     return _moments(tracks, patches, kept)
 
 
-def _residuals(tracks: Tracks, turns: Float, shifts: Float) -> Float:
-    """Returns the mean squared distance [G, M] of Gaussians from G motions, infinite without common pairs of frames.
-
-    Args:
-        tracks: tracks of M Gaussians.
-        turns, shifts: [G, P, 3, 3] and [G, P, 3] motions.
-    """
+def _residuals(tracks: Tracks, motions: Motions) -> Float:
+    """Returns the mean squared distance [G, M] of Gaussians from motions, infinite without common pairs of frames."""
+    turns, shifts, known = motions
     count = len(tracks.weights)
-    total, number = np.zeros((len(turns), count)), np.zeros(count)
+    total, number = np.zeros((len(turns), count)), np.zeros((len(turns), count))
     for pair, (first, second) in enumerate(tracks.pairs):
-        both = tracks.present[first] & tracks.present[second]
+        both = tracks.present[first] & tracks.present[second] & known[:, pair, None]
         moved = np.matmul(tracks.positions[first], np.swapaxes(turns[:, pair], -1, -2)) + shifts[:, pair, None]
         between = np.matmul(tracks.turns[second], np.swapaxes(tracks.turns[first], -1, -2)).reshape(count, 9)
         agreement = turns[:, pair].reshape(-1, 9) @ between.T
@@ -298,7 +318,7 @@ class _Merging:
         # The motion relative to the most similar patch: noise in rigid parts, deformation in others.
         nearest = self._apart.min(axis=1, initial=np.inf)
         self._noise = np.where(np.isfinite(nearest), nearest, 0)
-        self._usual_noise = float(np.median(self._noise))
+        self._usual_noise = float(np.median(self._noise[self._alive])) if self._alive.any() else 0.0
 
     def run(self) -> Int:
         """Returns the group of each patch, named after one of its patches."""
@@ -372,27 +392,29 @@ class _PartMotions:
     Args:
         tracks: tracks of the Gaussians in the patches.
         patches: [M] patch of each Gaussian.
+        usable: [U] patches to use.
         moments, parts: moments of the patches and the parts.
-        part_of: part of each patch.
+        part_of: [U] part of each usable patch.
     """
 
-    def __init__(self, tracks: Tracks, patches: Int, moments: Moments, parts: Moments, part_of: Int) -> None:
-        self._parts, self._patches, self._part_of = parts.motions(), moments.motions(), part_of
+    def __init__(
+        self, tracks: Tracks, patches: Int, usable: Int, moments: Moments, parts: Moments, part_of: Int
+    ) -> None:
+        self._parts, self._patches, self._part_of = parts.motions(), moments[usable].motions(), part_of
         starts = tracks.positions[0]
-        self._near = cKDTree([starts[patches == patch].mean(axis=0) for patch in range(len(part_of))])
+        self._near = cKDTree([starts[patches == patch].mean(axis=0) for patch in usable])
 
     def evidence(self, tracks: Tracks) -> Float:
         """Returns the logarithm of the mean squared distance of Gaussians from each part's motion, [parts, M].
 
         It is the smallest over the motion of the part and of its patches near the Gaussian.
         """
-        left = _residuals(tracks, *self._parts)
+        left = _residuals(tracks, self._parts)
         nearest = self._near.query(tracks.positions[0], k=min(NEAR_PATCHES, self._near.n))[1]
         nearest = nearest.reshape(left.shape[1], -1)
-        turns, shifts = self._patches
         for patch in np.unique(nearest):
             rows, part = np.flatnonzero((nearest == patch).any(axis=1)), self._part_of[patch]
-            fitted = _residuals(tracks.rows(rows), turns[[patch]], shifts[[patch]])[0]
+            fitted = _residuals(tracks.rows(rows), self._patches.of(patch))[0]
             left[part, rows] = np.minimum(left[part, rows], fitted)
         left[:, ~np.isfinite(left).any(axis=0)] = 1.0  # without motion, the neighbours decide
         logarithms: Float = np.log(np.minimum(left, 1.0) + NOISE**2)

@@ -4,15 +4,16 @@ A camera that has moved, is dirty or lags contradicts the other cameras, which f
 scene, or an update that lags behind, causes errors as well, but in every camera that sees the place. Such errors must
 not count against the camera that sees them best.
 
-For each erroneous cell of an image, points along its ray are projected into the other cameras. If most cameras that see
-a point have errors there, the errors of the cell are confirmed. A connected region of errors is confirmed as a whole if
-most of its cells that other cameras see are confirmed at one depth, because images often show only part of an object.
+For each erroneous cell of an image, points along its ray are projected into the other cameras. If most of the images
+that contain a point have errors there, the errors of the cell are confirmed. A connected region of errors is confirmed
+as a whole if most of its cells are confirmed at one depth. Cells that no other image contains do not count, because
+images often show only part of an object.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from math import inf
+from math import inf, log10
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label, maximum_filter, maximum_filter1d
 
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.engines.renderer import Renderer, psnr_of
+from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.posed_pictures import pixels_inside
@@ -87,9 +88,10 @@ def credited_decibels(
         if name in errors:
             cells = errors[name].squares
             others = {other: one for other, one in errors.items() if other != name}
-            confirmed = confirmed_cells(name, cells, others, factory.posed, ray_depths(factory.posed[name], state))
+            depths = ray_depths(factory.posed[name], state)
+            confirmed = confirmed_cells(name, errors[name], others, factory.posed, depths)
             without = np.where(confirmed, np.minimum(cells, _distinct(others)), cells)
-            credits[name] = psnr_of(float(without.mean()), 1) - psnr_of(float(cells.mean()), 1)
+            credits[name] = 10 * log10(max(cells.mean(), ROUNDING) / max(without.mean(), ROUNDING))
     return credits
 
 
@@ -99,28 +101,31 @@ class CellErrors(NamedTuple):
     Attributes:
         squares: [h, w] squared error of each cell, as a mean over pixels and RGB.
         usual: ``USUAL_PERCENTILE`` of the squared errors of opaque cells, or 0 if there are none.
+        edge: edge of a cell, in pixels of the camera.
     """
 
     squares: Array
     usual: float
+    edge: float
 
 
 def cell_errors(view: TrainingView, factory: ViewFactory, renderer: Renderer, state: Gaussians) -> CellErrors:
     """Returns the errors of a state in the cells of a view."""
-    scale = 1.0
+    scale, full = 1.0, view.camera.width
     while max(view.camera.width, view.camera.height) >= 2 * RENDERED:
         scale /= 2
         view = factory.coarser(view, scale)
     gain, offset = view.exposure[:LABEL, 0, None, None], view.exposure[:LABEL, 1, None, None]
     features, transmittance = renderer.render(state, view.camera)
-    squares = _cells(np.square(view.target[:LABEL] - (gain * features[:LABEL] + offset)).mean(axis=0))
-    opaque = squares[_cells(transmittance) < 0.5]
-    return CellErrors(squares, float(np.percentile(opaque, USUAL_PERCENTILE)) if len(opaque) else 0.0)
+    edge = max(SMALLEST, -(-max(transmittance.shape) // CELLS))
+    squares = _cells(np.square(view.target[:LABEL] - (gain * features[:LABEL] + offset)).mean(axis=0), edge)
+    opaque = squares[_cells(transmittance, edge) < 0.5]
+    usual = float(np.percentile(opaque, USUAL_PERCENTILE)) if len(opaque) else 0.0
+    return CellErrors(squares, usual, edge * full / view.camera.width)
 
 
-def _cells(plane: Array) -> Array:
+def _cells(plane: Array, edge: int) -> Array:
     """Returns the mean of a plane [H, W] in each cell. Cells at the border are filled with the nearest pixels."""
-    edge = max(SMALLEST, -(-max(plane.shape) // CELLS))
     padded = np.pad(plane, [(0, -side % edge) for side in plane.shape], mode="edge")
     height, width = (side // edge for side in padded.shape)
     cells: Array = padded.reshape(height, edge, width, edge).mean(axis=(1, 3))
@@ -137,13 +142,13 @@ def ray_depths(camera: Camera, state: Gaussians) -> NDArray[np.float64]:
 
 
 def confirmed_cells(
-    name: str, cells: Array, others: Mapping[str, CellErrors], rig: Rig, depths: NDArray[np.float64]
+    name: str, own: CellErrors, others: Mapping[str, CellErrors], rig: Rig, depths: NDArray[np.float64]
 ) -> Bool:
     """Returns the [h, w] mask of a camera's erroneous cells that other cameras confirm.
 
     Args:
         name: name of the camera.
-        cells: [h, w] squared error of each cell.
+        own: errors of this camera.
         others: errors of the other cameras, keyed by camera name.
         rig: rig with all of these cameras.
         depths: [D] depths at which points along the rays are tested, in metres.
@@ -151,20 +156,20 @@ def confirmed_cells(
     Returns:
         The confirmed cells. They include whole regions of connected erroneous cells.
     """
+    cells = own.squares
     erroneous = cells > _distinct(others)
-    tested = np.argsort(np.where(erroneous, cells, -1), axis=None)[::-1][: min(LARGEST, int(erroneous.sum()))]
+    # A stable sort has the same order on every processor.
+    tested = np.argsort(-np.where(erroneous, cells, -1), axis=None, kind="stable")[: min(LARGEST, erroneous.sum())]
     if not len(tested) or not len(depths):
         return np.zeros(cells.shape, np.bool_)
     camera = rig[name]
     row, column = np.unravel_index(tested, cells.shape)
-    edge = max(camera.width / cells.shape[1], camera.height / cells.shape[0])
-    uv = edge * (np.stack([column, row], axis=1) + 0.5)
+    uv = own.edge * (np.stack([column, row], axis=1) + 0.5)
     points = np.concatenate([camera.unproject(uv, np.full(len(uv), depth)) for depth in depths])
     agree, asked = (np.zeros(len(points), np.int64) for _ in range(2))
     least = np.tile(SIMILAR * cells[row, column], len(depths))
-    for other, (squares, _) in others.items():
+    for other, (squares, _, edge) in others.items():
         across, down, _, inside = pixels_inside(rig[other], points)
-        edge = max(rig[other].width / squares.shape[1], rig[other].height / squares.shape[0])
         nearby = maximum_filter(squares, 3)  # a point projects between two cells
         at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)
         asked += inside
@@ -192,10 +197,9 @@ def _is_confirmed(squares: Array, visible: Bool, agreed: Bool) -> bool:
         visible: [D, T] whether enough other cameras see the point of a cell at a depth.
         agreed: [D, T] whether these cameras confirm the error of the cell at a depth.
     """
-    near = maximum_filter1d(agreed.view(np.uint8), THICKNESS, axis=0) @ squares
+    near, seen = (maximum_filter1d(mask.view(np.uint8), THICKNESS, axis=0) @ squares for mask in (agreed, visible))
     depth = int(near.argmax())
-    seen = float(visible[depth] @ squares)
-    return bool(near[depth] > 0 and near[depth] >= MOST * seen and near[depth] >= PART * squares.sum())
+    return bool(near[depth] > 0 and near[depth] >= MOST * seen[depth] and near[depth] >= PART * squares.sum())
 
 
 def _distinct(others: Mapping[str, CellErrors]) -> float:

@@ -23,10 +23,10 @@ state. If the offset is still below this value, the camera is excluded at once. 
 LAST_DB = -5.0
 """Offset when last rendered, without errors that other cameras confirm (``confirmed_errors``), below which a camera is
 excluded starting with the next frame. Cameras that moved by one or two pixels reach -6 to -15."""
-NEAR_DB = -3.0
+NEAR_DB = -3.5
 """Offset below which a camera is suspect. Its usual level is then not updated, so a lasting fault remains visible. Two
 consecutive suspect frames raise an alarm. Without confirmed errors, clean captures reach -3.2."""
-FITS_DB = -3.0
+FITS_DB = -3.5
 """Offset above which an excluded camera is accepted again. Until then, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
 """Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""

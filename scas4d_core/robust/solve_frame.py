@@ -6,7 +6,7 @@ fits the frame (``outliers``), the previous state is kept and the report states 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -37,7 +37,7 @@ from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.best_state import committed_errors, is_slow_motion, label_by_size, mean_is_within
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.rates import latest_start
-from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, UpdateResult, UpdateTrace
+from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, Current, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import MAX_TIMED, PROBE, Stopping
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
@@ -51,6 +51,9 @@ LADDER = (
 SEARCH = AttemptOptions("longer search", cold=True, iteration_factor=5.0)
 """Options of a search from the position that silhouettes suggest, or from the end of the update. If two of three frames
 of `robot` are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB with a factor of 2."""
+
+REFERENCES = 6
+"""Approximate number of cameras whose confirmed errors count as usual."""
 
 LONGEST_GAP = 3
 """Largest factor on the iterations of an update after missing frames; the factor is the gap between the frames."""
@@ -358,13 +361,13 @@ class FrameSolver:
     def _accepted(self, given: UpdateInput, result: UpdateResult) -> Solved:
         trace, psnr = result.trace, result.trace.fits
         with self._time_checks():
-            # In short updates, a camera may have been last rendered long before the end, so it is rendered again.
+            # The last renderings are from different iterations. If a camera fits badly, all are compared in one state.
             off, views = outliers.offsets(given.past, psnr), result.views or given.views
-            doubtful = [view for view in views if view.name in off and outliers.in_doubt(given.past, off[view.name])]
-            doubtful += given.suspects
-            psnr |= self._psnr_by_camera(doubtful, result.gaussians)
-            names = [view.name for view in doubtful]
-            psnr = self._with_credit(given.past, psnr, names, [*views, *given.suspects], result.gaussians)
+            doubtful = [name for name, value in off.items() if outliers.in_doubt(given.past, value)]
+            psnr |= self._psnr_by_camera([*(views if doubtful else ()), *given.suspects], result.gaussians)
+            if doubtful and self._settings.reject_outliers:
+                used = [view for view in views if view.name not in trace.left_out]
+                psnr = self._with_credit(given.past, psnr, doubtful, used, result.gaussians)
         moved = trace.kept is not Candidate.PREVIOUS or given.past.updates > 0
         past = outliers.past_after_update(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
@@ -379,9 +382,7 @@ class FrameSolver:
         with self._time_checks():
             return committed_errors(self._factory.rig, self._renderer, views, state)
 
-    def _find_outliers(
-        self, given: UpdateInput, first: Mapping[str, float], current: Callable[[], Gaussians]
-    ) -> Mapping[str, str]:
+    def _find_outliers(self, given: UpdateInput, first: Mapping[str, float], current: Current) -> Mapping[str, str]:
         """Returns the cameras that contradict the others, with the reasons; see ``AttemptOptions.gate``.
 
         The first renderings are from different iterations. The cameras that fit worst are therefore compared with the
@@ -390,9 +391,8 @@ class FrameSolver:
         doubtful = outliers.misfits(given.past, first, outliers.FIRST_DB)
         if not doubtful:
             return {}
-        state = current()
-        psnr = self._psnr_by_camera(given.views, state)
-        psnr = self._with_credit(given.past, psnr, doubtful, given.views, state)
+        state, views = current()
+        psnr = self._with_credit(given.past, self._psnr_by_camera(views, state), list(doubtful), views, state)
         out = outliers.misfits(given.past, psnr, outliers.FIRST_DB)
         return {name: reason for name, reason in out.items() if name in doubtful}
 
@@ -400,24 +400,31 @@ class FrameSolver:
         self,
         past: Past,
         psnr: Mapping[str, float],
-        doubtful: Collection[str],
+        doubtful: Sequence[str],
         views: Sequence[TrainingView],
         state: Gaussians,
     ) -> dict[str, float]:
         """Returns the PSNR of each camera in dB, for doubtful ones without the errors that other cameras confirm.
 
-        A credited camera fits at most as usual, so it does not change what is usual for the others.
+        Only confirmed errors in excess of those of the other cameras count. A credited camera fits at most as usual.
 
         Args:
             past: usual values of the cameras.
             psnr: PSNR of each camera in dB.
             doubtful: names of the cameras that may be faulty.
-            views: views of the frame.
+            views: views of the cameras that are used.
             state: state to compare the views with.
         """
         low = {name: -off for name, off in outliers.offsets(past, psnr).items() if name in doubtful and off < 0}
-        credits = credited_decibels(low, views, self._factory, self._renderer, state) if low else {}
-        return {**psnr, **{name: psnr[name] + min(credit, low[name]) for name, credit in credits.items()}}
+        if not low:
+            return dict(psnr)
+        views = [view for view in views if not past.is_left_out(view.name)]
+        others = [view.name for view in views if view.name not in doubtful]
+        others = others[:: max(1, len(others) // REFERENCES)]
+        credits = credited_decibels([*low, *others], views, self._factory, self._renderer, state)
+        usual = float(np.median([credits[name] for name in others])) if others else 0.0
+        excess = {name: min(max(credits[name] - usual, 0.0), low[name]) for name in low if name in credits}
+        return {**psnr, **{name: psnr[name] + credit for name, credit in excess.items()}}
 
     def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """Returns the PSNR of a state in each view in dB, keyed by camera name."""

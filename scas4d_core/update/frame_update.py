@@ -133,7 +133,11 @@ class FrameUpdate:
     def _exclude_outliers(self, gate: Gate, attempt: Attempt, order: ViewPlan, trace: UpdateTrace) -> None:
         """Excludes cameras that do not fit from the rest of an attempt, once every camera has been rendered."""
         trace.load_log(self._engine.log(), attempt.views)
-        trace.left_out.update(gate(trace.first, lambda: self._engine.state(learnt=True)))
+
+        def current() -> tuple[Gaussians, Sequence[TrainingView]]:
+            return self._engine.state(learnt=True), self._exposed(attempt.views)
+
+        trace.left_out.update(gate(trace.first, current))
         excluded = [index for index, view in enumerate(attempt.views) if view.name in trace.left_out]
         order.leave_out(excluded)
         self._engine.leave_out(excluded)

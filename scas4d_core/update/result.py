@@ -18,9 +18,10 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
-Gate = Callable[[Mapping[str, float], Callable[[], Gaussians]], Mapping[str, str]]
-"""Function that returns the cameras to exclude, with the reasons. It takes the first PSNR of each camera in dB, and a
-function that returns the current state of the attempt."""
+Current = Callable[[], tuple[Gaussians, Sequence[TrainingView]]]
+"""Function that returns the current state of an attempt, and the views with the current exposures."""
+Gate = Callable[[Mapping[str, float], Current], Mapping[str, str]]
+"""Function that takes the first PSNR of each camera in dB, and returns the cameras to exclude, with the reasons."""
 
 
 class Stopwatch:

@@ -194,7 +194,7 @@ def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, mome
     for values, turns, shifts in zip(tables.clusters, motion.turns, motion.shifts, strict=True):
         values[:, :3] = share * turns
         values[:, 3:6] = share * shifts
-    if momentum > 0:
+    if momentum > 0 and len(motion.own_shifts):
         tables.deltas[:, :3] = share * momentum * motion.own_shifts
         tables.deltas[:, 3:6] = share * momentum * motion.own_turns
     return tables

@@ -185,6 +185,27 @@ def test_positions_of_absent_gaussians_do_not_matter():
     assert adjusted_rand_score(expected, scene.parts()) > 0.97
 
 
+def test_what_stands_after_a_part_has_left_does_not_join_it():
+    """The part has no motion in the frames in which only the other body is there."""
+    scene, half = Scene(), FRAMES // 2
+    scene.add(0, scene.box(0.5, [0, 0, 0]), sliding([0.1, 0, 0]), lambda t: t < half)
+    scene.add(1, scene.box(0.5, [2, 0, 0]), turning([0, 0, 1], 0.1, [2, 0, 0]))
+    scene.add(-1, scene.box(0.5, [0, 1, 0]), resting, lambda t: t >= half)
+    parts, truth = scene.parts(), np.array(scene.truth)
+    assert (parts[truth == -1] == module.STATIC).all()
+    assert adjusted_rand_score(truth, parts) > 0.95
+
+
+def test_an_object_that_has_just_entered_is_no_moving_part():
+    scene = Scene()
+    scene.add(0, scene.box(0.5, [0, 0, 0]), sliding([0.1, 0, 0]))
+    scene.add(1, scene.box(0.5, [2, 0, 0]), turning([0, 0, 1], 0.1, [2, 0, 0]))
+    scene.add(-1, scene.box(0.5, [0, 2, 0]), resting, lambda t: t == FRAMES - 1)
+    parts, truth = scene.parts(), np.array(scene.truth)
+    assert (parts[truth == -1] == module.STATIC).mean() > 0.99
+    assert len(set(parts[truth >= 0].tolist())) == 2
+
+
 def test_number_and_labels_are_stable_as_frames_come():
     scene = arm(20)
     labels, numbers, kept = None, [], []

@@ -13,7 +13,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.confirmed_errors import CellErrors, confirmed_cells, credited_decibels, ray_depths
+from scas4d_core.robust.confirmed_errors import CellErrors, cell_errors, confirmed_cells, credited_decibels, ray_depths
 from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
@@ -100,6 +100,23 @@ def test_a_camera_that_sees_no_gaussian_confirms_nothing() -> None:
     assert ray_depths(turned, BOX).size == 0
     cells = np.zeros((24, 24), np.float32)
     cells[5, 5] = 1
-    quiet = {name: CellErrors(np.full((24, 24), 1e-4, np.float32), 1e-4) for name in RIG.names}
+    quiet = {name: CellErrors(np.full((24, 24), 1e-4, np.float32), 1e-4, 2.0) for name in RIG.names}
     rig = Rig((*RIG.cameras, turned))
-    assert not confirmed_cells("away", cells, quiet, rig, ray_depths(turned, BOX)).any()
+    own = CellErrors(cells, 0.0, 2.0)
+    assert not confirmed_cells("away", own, quiet, rig, ray_depths(turned, BOX)).any()
+
+
+@pytest.mark.parametrize("size", [(48, 48), (53, 37), (300, 193)])
+def test_cells_cover_the_image_at_any_size(size: tuple[int, int]) -> None:
+    """A single erroneous pixel lies in the cell that its position in pixels of the camera belongs to."""
+    width, height = size
+    lens = np.array([[60.0, 0, width / 2], [0, 60, height / 2], [0, 0, 1]])
+    camera = replace(RIG["c0"], intrinsics=lens, width=width, height=height)
+    factory = ViewFactory(Rig((camera,)))
+    image = take_frame(1, 0.1, BOX, Rig((camera,))).images["c0"].copy()
+    column, row = width - 6, height - 7
+    image[row - 2 : row + 3, column - 2 : column + 3] = 255
+    (view,) = factory.views(Frame(1, 0.1, {"c0": image}, {}), {})
+    errors = cell_errors(view, factory, CpuRenderer((0, 0, 0)), BOX)
+    worst = np.unravel_index(errors.squares.argmax(), errors.squares.shape)
+    assert np.abs(np.array(worst) - np.array([row, column]) / errors.edge).max() <= 1.5

@@ -235,7 +235,7 @@ def test_the_past_goes_through_arrays_unchanged() -> None:
         Past.of_arrays(broken)
 
 
-@pytest.mark.parametrize(("off", "follows"), [(-2.9, True), (-3.1, False)])
+@pytest.mark.parametrize(("off", "follows"), [(-3.4, True), (-3.6, False)])
 def test_the_usual_place_of_a_camera_does_not_follow_what_is_in_doubt(off: float, follows: bool) -> None:
     """Else a fault that lasts is usual before two frames in a row have told of it."""
     after = outliers.past_after_update(PAST, {**USUAL, "c4": USUAL["c4"] + off}, BRIGHT, 1.0)

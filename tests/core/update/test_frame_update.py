@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
@@ -31,7 +31,7 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update import rates, schedule
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.result import AttemptOptions, Stopwatch, UpdateResult
+from scas4d_core.update.result import AttemptOptions, Current, Stopwatch, UpdateResult
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples, view_order
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -356,9 +356,11 @@ def test_cameras_are_judged_once_all_were_seen() -> None:
         asked: list[int] = []
         updater, _ = prepare(SETTINGS.model_copy(update={"iterations": 2 * len(views), "views": each}))
 
-        def gate(first: Any, current: Callable[[], Gaussians], asked: list[int] = asked) -> dict[str, str]:
+        def gate(first: Any, current: Current, asked: list[int] = asked) -> dict[str, str]:
             asked.append(len(first))
-            assert np.isfinite(current().means).all()
+            state, now = current()
+            assert np.isfinite(state.means).all()
+            assert [view.name for view in now] == [view.name for view in views]
             return {}
 
         updater.run(BEFORE, views, None, 1.0, 1, AttemptOptions(stopping=Stopping(2 * len(views)), gate=gate))
