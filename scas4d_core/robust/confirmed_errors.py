@@ -6,7 +6,7 @@ not count against the camera that sees them best.
 
 For each erroneous cell of an image, points along its ray are projected into the other cameras. If most of the images
 that contain a point have errors there, the errors of the cell are confirmed. A connected region of errors is confirmed
-as a whole if most of its cells are confirmed at one depth. Cells that no other image contains do not count, because
+as a whole if many of its cells are confirmed at one depth. Cells that no other image contains do not count, because
 images often show only part of an object.
 """
 
@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter, maximum_filter1d
+from scipy.ndimage import label, maximum_filter
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.engines.renderer import Renderer
@@ -53,9 +53,7 @@ WITNESSES = 2
 """Minimum number of other cameras that see a point."""
 AGREE = 0.75
 """Minimum share of these cameras that have an error there."""
-THICKNESS = 5
-"""Number of neighbouring depths that belong to one object."""
-MOST, PART = 0.5, 0.05
+MOST, PART = 0.4, 0.05
 """Minimum confirmed shares of the squared error in a connected region that confirm the whole region. The first applies
 to the cells that other cameras see at the depth of the object, and the second to all cells."""
 
@@ -197,9 +195,9 @@ def _is_confirmed(squares: Array, visible: Bool, agreed: Bool) -> bool:
         visible: [D, T] whether enough other cameras see the point of a cell at a depth.
         agreed: [D, T] whether these cameras confirm the error of the cell at a depth.
     """
-    near, seen = (maximum_filter1d(mask.view(np.uint8), THICKNESS, axis=0) @ squares for mask in (agreed, visible))
-    depth = int(near.argmax())
-    return bool(near[depth] > 0 and near[depth] >= MOST * seen[depth] and near[depth] >= PART * squares.sum())
+    confirmed, seen = agreed @ squares, visible @ squares
+    depth = int(confirmed.argmax())
+    return bool(confirmed[depth] >= max(MOST * seen[depth], PART * squares.sum()))
 
 
 def _distinct(others: Mapping[str, CellErrors]) -> float:
