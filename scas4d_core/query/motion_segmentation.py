@@ -149,7 +149,7 @@ class Motions(NamedTuple):
 
     def of(self, group: int) -> Motions:
         """Returns the motions of one group."""
-        return Motions(*(array[[group]] for array in self))
+        return Motions(self.turns[[group]], self.shifts[[group]], self.known[[group]])
 
 
 def segment_motion(
