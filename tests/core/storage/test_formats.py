@@ -18,7 +18,7 @@ from scas4d_core.storage import frame_files
 from scas4d_core.storage.chunks import chunk_file
 from scas4d_core.storage.faults import HistoryError, OtherFormatError
 from scas4d_core.storage.history import History
-from scas4d_core.storage.npz import read_npz, write_npz
+from scas4d_core.storage.npz import pack_arrays, read_npz, unpack_arrays, write_npz
 from scas4d_core.update.view_factory import ViewFactory
 
 FRAMES = 3
@@ -91,9 +91,9 @@ def test_a_checkpoint_that_lost_an_array_is_damaged(missing: str, tmp_path: Path
     for index in (FRAMES - 2, FRAMES - 1):
         checkpoints.save(index, CarryOver())
     file = folder / frame_files.checkpoint_file(FRAMES - 1)
-    arrays = read_npz(file)
+    arrays = unpack_arrays(read_npz(file))
     del arrays[missing]
-    write_npz(file, arrays)
+    write_npz(file, pack_arrays(arrays))
     with pytest.raises(CheckpointError, match=missing):
         checkpoints.load(FRAMES - 1, factory)
     index, carried, faults = find_commit(history, checkpoints, factory, lambda index: True)
