@@ -216,9 +216,18 @@ def segment_motion(
     return result
 
 
+def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
+    """Returns at most ``most`` evenly spaced indices of ``count`` frames, with the first and the last.
+
+    >>> evenly_spaced(10, 4).tolist()
+    [0, 3, 6, 9]
+    """
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.intp))
+
+
 def _frame_pairs(frames: int) -> Int:
     """Returns pairs of frames [P, 2]: a few evenly spaced references with all other frames."""
-    references = np.unique(np.linspace(0, frames - 1, min(REFERENCES, frames)).round().astype(int))
+    references = evenly_spaced(frames, REFERENCES)
     pairs = {(min(s, t), max(s, t)) for s in references.tolist() for t in range(frames) if s != t}
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
@@ -228,7 +237,7 @@ def _patches(tracks: Tracks) -> Int:
     from sklearn.cluster import KMeans
 
     frames, rows = tracks.present.shape
-    few = np.unique(np.linspace(0, frames - 1, min(6, frames)).round().astype(np.intp))
+    few = evenly_spaced(frames, 6)
     features = np.concatenate(
         [
             tracks.positions[few].transpose(1, 0, 2).reshape(rows, -1),

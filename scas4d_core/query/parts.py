@@ -218,8 +218,7 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
 def _evenly(history: History, frames: int) -> list[int]:
     """Returns the indices of at most ``frames`` evenly spaced frames."""
     indices = np.array(history.indices)
-    even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
-    return [int(index) for index in indices[even]]
+    return [int(index) for index in indices[motion_segmentation.evenly_spaced(len(indices), frames)]]
 
 
 def _presence(history: History, rows: NDArray[np.intp], indices: list[int]) -> NDArray[np.bool_]:

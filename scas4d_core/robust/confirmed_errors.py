@@ -6,8 +6,8 @@ not count against the camera that sees them best.
 
 For each erroneous cell of an image, points along its ray are projected into the other cameras. If most of the images
 that contain a point have errors there, the errors of the cell are confirmed. A connected region of errors is confirmed
-as a whole if many of its cells are confirmed at one depth. Cells that no other image contains do not count, because
-images often show only part of an object.
+as a whole if many of its cells are confirmed at one depth. Cells that too few other images contain do not count,
+because images often show only part of an object.
 """
 
 from __future__ import annotations

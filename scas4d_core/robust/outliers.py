@@ -25,7 +25,8 @@ LAST_DB = -5.0
 excluded starting with the next frame. Cameras that moved by one or two pixels reach -6 to -15."""
 NEAR_DB = -3.5
 """Offset below which a camera is suspect. Its usual level is then not updated, so a lasting fault remains visible. Two
-consecutive suspect frames raise an alarm. Without confirmed errors, clean captures reach -3.2."""
+consecutive suspect frames raise an alarm. Without confirmed errors, clean captures reach -4.0
+in single frames."""
 FITS_DB = -4.5
 """Offset above which an excluded camera is accepted again. Until then, colours follow only the other cameras."""
 NEW_DB = (-4.0, -2.0, -2.0)
