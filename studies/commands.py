@@ -11,7 +11,7 @@ from studies.effort.commands import effort
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
-from studies.hard_cases.commands import stability, timing
+from studies.hard_cases.commands import alarms, stability, timing
 from studies.kernels.commands import gpu_kernels, kernels, moving, startup
 from studies.live.commands import live, soak, viewer
 from studies.paper.commands import paper
@@ -36,7 +36,7 @@ STUDIES = {
     "Quality of the output": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants, gaps),
     "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
-    "Hard cases": (stability, timing),
+    "Hard cases": (stability, timing, alarms),
     "The running service": (
         faults,
         ingest,

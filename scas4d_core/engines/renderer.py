@@ -174,7 +174,7 @@ class Renderer(Protocol):
         """
 
     def step_colours(
-        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
         """Returns a state whose colours are corrected by the mean residual, weighted by blending weights.
 
@@ -182,7 +182,7 @@ class Renderer(Protocol):
 
         Args:
             state: Gaussians to render.
-            views: training views over which the mean is taken.
+            subsets: training views over which the mean of each step is taken, in the order of the steps.
             learnt: [N] mask that is 1 for Gaussians whose colours are corrected, and 0 for all others.
             most: magnitude to which residuals are clipped; RGB values are in [0, 1].
         """
@@ -199,15 +199,17 @@ class Renderer(Protocol):
         The mask covers the image padded to a multiple of 32 pixels.
         """
 
-    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+    def pairs_per_pixel(
+        self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1
+    ) -> list[NDArray[np.int32]]:
         """Returns the number of Gaussians that are blended into each pixel, which determines the rendering time.
 
         Gaussians behind the one that finishes a pixel do not count.
 
         Args:
             state: Gaussians to render.
-            camera: camera in kernel format.
-            every: step between the rows and columns to count. With 1, the result is [H, W].
+            cameras: cameras in kernel format.
+            every: step between the rows and columns to count. With 1, the result is [H, W] for each camera.
         """
 
 
@@ -255,25 +257,27 @@ def pair_counts(renderer: Renderer, state: Gaussians, cameras: Sequence[CameraAr
     PairCounts(mean=2.0, percentile_99=2)
     """
     chosen = cameras[:: -(-len(cameras) // PAIR_CAMERAS)]
-    pairs = np.concatenate([renderer.pairs_per_pixel(state, camera, PAIR_STEP).ravel() for camera in chosen])
+    pairs = np.concatenate([pairs.ravel() for pairs in renderer.pairs_per_pixel(state, chosen, PAIR_STEP)])
     below = np.cumsum(np.bincount(pairs))
     return PairCounts(float(pairs.mean()), int(np.searchsorted(below, 0.99 * len(pairs))))
 
 
-def colour_step(
+def colour_steps(
     renderer: ResidualRenderer,
     state: Gaussians,
-    views: Sequence[TrainingView],
+    subsets: Sequence[Sequence[TrainingView]],
     learnt: NDArray[np.uint8],
     most: float,
 ) -> Gaussians:
     """Implements ``Renderer.step_colours`` for renderers that compute residuals on the host."""
-    sums, weights = np.zeros((len(state), 3)), np.full(len(state), PRIOR_PIXELS)
-    for view in views:
-        more, seen = renderer.residuals(state, view, learnt, most)
-        sums += more
-        weights += seen
-    return state.replace(colours=state.colours + (sums / weights[:, None]).astype(np.float32))
+    for views in subsets:
+        sums, weights = np.zeros((len(state), 3)), np.full(len(state), PRIOR_PIXELS)
+        for view in views:
+            more, seen = renderer.residuals(state, view, learnt, most)
+            sums += more
+            weights += seen
+        state = state.replace(colours=state.colours + (sums / weights[:, None]).astype(np.float32))
+    return state
 
 
 def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians:

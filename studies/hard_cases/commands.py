@@ -1,4 +1,4 @@
-"""The commands `scripts/bench stability` (hard cases, frame cases and the soak test) and `timing`."""
+"""The commands `scripts/bench stability` (hard cases, frame cases and the soak test), `timing` and `alarms`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from client.cli.capture_options import with_capture_options
+from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes, write_part
 
 
@@ -73,6 +75,39 @@ def timing(
     from studies.hard_frames.out_of_step import run
 
     run(captures, out, updates=updates, masks=masks, changes=changes or (), again=again)
+
+
+@with_capture_options
+def alarms(
+    captures: Captures,
+    options: CaptureOptions,
+    out: Annotated[
+        Path, typer.Option(help="Study folder, for rows and frames 0. A second run continues the study.")
+    ] = Path("out/alarms"),
+    variant: Annotated[list[str] | None, typer.Option(help="Measure only this variant; default: all.")] = None,
+    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates. May be repeated.")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="Maximum number of frames per variant.")] = None,
+    faults: Annotated[bool, typer.Option(help="Also plant faults.")] = True,
+    again: Again = False,
+    changes: Changes = None,
+) -> None:
+    """Counts false alarms on clean variants of captures, and planted faults of single cameras that are found.
+
+    Example: scripts/bench alarms captures/robot captures/visit --variant backwards --set scene.image_scale=0.5
+    """
+    from studies.hard_frames.alarms import run
+
+    run(
+        captures,
+        out,
+        variants=variant or (),
+        seeds=seed or (0,),
+        frames=frames,
+        faults=faults,
+        changes=changes or (),
+        again=again,
+        options=options,
+    )
 
 
 def _frame_studies(

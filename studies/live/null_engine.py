@@ -60,9 +60,11 @@ class NullRenderer(CpuRenderer):
         """Returns zeros: no Gaussian is in a changed pixel."""
         return np.zeros((len(state), len(planes)), np.float32)
 
-    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+    def pairs_per_pixel(
+        self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1
+    ) -> list[NDArray[np.int32]]:
         """Returns zeros."""
-        return np.zeros((-(-camera.height // every), -(-camera.width // every)), np.int32)
+        return [np.zeros((-(-each.height // every), -(-each.width // every)), np.int32) for each in cameras]
 
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
@@ -71,7 +73,7 @@ class NullRenderer(CpuRenderer):
         return np.zeros((len(state), 3), np.float32), np.zeros(len(state), np.float32)
 
     def step_colours(
-        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
         """Returns the state unchanged."""
         return state

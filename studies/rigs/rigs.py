@@ -137,7 +137,7 @@ def measured(
     cameras = [CameraArrays.of(camera) for camera in scene.rig.cameras]
     renderer = renderer_of("cpu", (0, 0, 0), rig_limits(settings.scene.near, scene.world, given.rig.cameras))
     pairs, pairs_last = (
-        np.concatenate([renderer.pairs_per_pixel(state, camera).ravel() for camera in cameras])
+        np.concatenate([pairs.ravel() for pairs in renderer.pairs_per_pixel(state, cameras)])
         for state in map(scene.history.gaussians, (0, count - 1))
     )
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]

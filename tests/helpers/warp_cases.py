@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera
 from scas4d_core.engines.limits import Limits
@@ -17,6 +18,7 @@ from scas4d_core.engines.torch.rasterizer import CameraParams, render
 from scas4d_core.engines.views import CameraArrays, TrainingView
 
 wp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
+downloads = pytest.importorskip("scas4d_core.engines.warp.downloads")
 
 DEVICE = os.environ.get("SCAS4D_WARP_DEVICE", "cpu")
 """Of Warp; "cuda:0" runs the same tests on a GPU."""
@@ -87,6 +89,21 @@ def drawn(
 def index(number: int) -> wp.array:
     """A number on the device."""
     return wp.array([number], dtype=wp.int32, device=DEVICE)
+
+
+class Waits:
+    """Counts how often the host waits for results of the device, from now on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.count = 0
+        read = downloads.Downloads.read
+
+        def counted(own: Any, *arrays: wp.array) -> list[NDArray[Any]]:
+            self.count += 1
+            copies: list[NDArray[Any]] = read(own, *arrays)
+            return copies
+
+        monkeypatch.setattr(downloads.Downloads, "read", counted)
 
 
 class Uploads:

@@ -42,9 +42,8 @@ def follow_pictures(
         learnt: [N] mask that is 1 for Gaussians whose colours are updated, and 0 for all others.
     """
     views = from_all_sides(views)
-    for first in range(min(SUBSETS, len(views))):
-        state = renderer.step_colours(state, views[first::SUBSETS], learnt, MOST)
-    return state
+    subsets = [views[first::SUBSETS] for first in range(min(SUBSETS, len(views)))]
+    return renderer.step_colours(state, subsets, learnt, MOST)
 
 
 def from_all_sides(views: Sequence[TrainingView]) -> list[TrainingView]:

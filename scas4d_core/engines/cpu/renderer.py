@@ -18,7 +18,7 @@ from scas4d_core.engines.renderer import (
     Gradients,
     Neighbourhoods,
     Picture,
-    colour_step,
+    colour_steps,
     extrapolated,
     picture_levels,
     psnr_of,
@@ -132,10 +132,10 @@ class CpuRenderer:
         return self._lacking(view, most)
 
     def step_colours(
-        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
         """See ``Renderer.step_colours``."""
-        return colour_step(self, state, views, learnt, most)
+        return colour_steps(self, state, subsets, learnt, most)
 
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """See ``Renderer.extrapolate``."""
@@ -154,10 +154,15 @@ class CpuRenderer:
         )
         return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
 
-    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+    def pairs_per_pixel(
+        self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1
+    ) -> list[NDArray[np.int32]]:
         """See ``Renderer.pairs_per_pixel``."""
-        self.render(state, camera, state.features(state.colours))
-        return self.rasterizer.pairs_per_pixel()[::every, ::every].astype(np.int32)
+        counted = []
+        for camera in cameras:
+            self.render(state, camera, state.features(state.colours))
+            counted.append(self.rasterizer.pairs_per_pixel()[::every, ::every].astype(np.int32))
+        return counted
 
     # Losses of iterations, for arrays that are updated in place.
 

@@ -15,7 +15,7 @@ from scas4d_core.engines.renderer import (
     Comparison,
     Neighbourhoods,
     Picture,
-    colour_step,
+    colour_steps,
     extrapolated,
     picture_levels,
     with_turned_normals,
@@ -95,10 +95,10 @@ class TorchRenderer:
         return sums[:, :LABEL], sums[:, LABEL]
 
     def step_colours(
-        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
         """See ``Renderer.step_colours``."""
-        return colour_step(self, state, views, learnt, most)
+        return colour_steps(self, state, subsets, learnt, most)
 
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """See ``Renderer.extrapolate``."""
@@ -129,11 +129,12 @@ class TorchRenderer:
         blocks: NDArray[np.bool_] = padded.reshape(height, BLOCK, width, BLOCK).any(dim=3).any(dim=1).numpy()
         return blocks
 
-    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
+    def pairs_per_pixel(
+        self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1
+    ) -> list[NDArray[np.int32]]:
         """See ``Renderer.pairs_per_pixel``."""
-        drawn = self._drawn(state, camera, self._seen(state, camera), None)
-        pairs: NDArray[np.int32] = drawn.pairs[::every, ::every].numpy().astype(np.int32)
-        return pairs
+        drawn = [self._drawn(state, camera, self._seen(state, camera), None) for camera in cameras]
+        return [each.pairs[::every, ::every].numpy().astype(np.int32) for each in drawn]
 
     def _seen(self, state: Gaussians, camera: CameraArrays) -> Tensor:
         """Returns the features [N, 4] of a state as seen by a camera: RGB including gloss, and label."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -38,7 +38,7 @@ from scas4d_core.engines.warp.gains import WarpGains
 from scas4d_core.engines.warp.gloss import WarpGloss
 from scas4d_core.engines.warp.graphs import Graphs
 from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, PAIRS, SHIFT, SQUARES
-from scas4d_core.engines.warp.pictures import PicturePass
+from scas4d_core.engines.warp.pictures import PicturePass, thinned
 from scas4d_core.engines.warp.projection import COUNTED_GUARDS as RENDERING_GUARDS
 from scas4d_core.engines.warp.renderer import WarpRenderer
 from scas4d_core.engines.warp.step_records import StepRecords
@@ -288,15 +288,15 @@ class WarpEngine:
         while self._pending and self._read_log() is None:
             pass
 
-    def _read_log(self, probes: int = 0) -> Array | None:
+    def _read_log(self, probes: int = 0, *others: wp.array) -> list[NDArray[Any]] | None:
         """Waits for the device, and reads the log of the pending iterations and the log rows of the probes.
 
         Returns:
-            [probes, 8] log rows of the probes, or None if an image was incomplete because its tile lists were too
-            small. In this case, the lists have been enlarged. If an iteration was affected, all iterations have been
-            enqueued again.
+            [probes, 8] log rows of the probes, and copies of the other arrays; or None if an image was incomplete
+            because its tile lists were too small. In this case, the lists have been enlarged. If an iteration was
+            affected, all iterations have been enqueued again.
         """
-        log, losses = self.downloads.read(self._pictures.log, self._losses)
+        log, losses, *values = self.downloads.read(self._pictures.log, self._losses, *others)
         rows, probed = log[: self._used_rows], log[LOG_ROWS : LOG_ROWS + probes]
         if self._pictures.grow(rows[:, PAIRS].max(initial=0)):
             self._repeat()
@@ -311,7 +311,7 @@ class WarpEngine:
             first += len(views)
         self._pending, self._used_rows = [], 0
         self._losses.zero_()
-        return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else probed
+        return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else [probed, *values]
 
     def _repeat(self) -> None:
         """Enqueues all iterations of the attempt again, after buffers were reallocated."""
@@ -328,9 +328,9 @@ class WarpEngine:
         """See ``UpdateEngine.probe``."""
         while True:
             self._launch_probes(which, moved, learnt)
-            rows = self._read_log(len(which))
-            if rows is not None:
-                return [float(loss) for loss in rows[:, IMAGE_LOSS]]
+            read = self._read_log(len(which))
+            if read is not None:
+                return [float(loss) for loss in read[0][:, IMAGE_LOSS]]
 
     def _launch_probes(self, which: Iterable[int], moved: bool, learnt: bool) -> None:
         """Enqueues renderings of probe views; see ``UpdateEngine.probe``."""
@@ -358,27 +358,28 @@ class WarpEngine:
 
     def log(self) -> IterationLog:
         """See ``UpdateEngine.log``."""
-        self._settle()
-        if self._keeps_unread:
+        read = None
+        while read is None:
+            kept = [self._pictures.kept] if self._keeps_unread else []
+            counted = self._deformation.unsound, self._pictures.guard_counts
+            read = self._read_log(0, *counted, *kept, *self._adam_counts())
+        _, unsound, rendered, *values = read
+        if kept:
             self._keeps_unread = False
-            kept = self._pictures.kept(
-                [(slot, self._views[view]) for view, slot in self._slots.items()], self.downloads
-            )
-            for view, picture in zip(self._slots, kept, strict=True):
-                self._log.keep(view, picture)
-        self._log.guards = self._guards()
+            pictures = values.pop(0)
+            for view, slot in self._slots.items():
+                self._log.keep(view, thinned(pictures[slot], self._views[view]))
+        counts = [guard_counts(RENDERING_GUARDS, rendered), *(guard_counts(ADAM_GUARDS, each) for each in values)]
+        triggered = dict(summed(counts)) | {"held_back": int(unsound[0])}
+        self._log.guards = {name: count for name, count in triggered.items() if count}
         return self._log
 
-    def _guards(self) -> dict[str, int]:
-        """Waits for the device, and returns the number of times each guard was triggered."""
+    def _adam_counts(self) -> list[wp.array]:
+        """Returns the number of times that the guards of each optimizer were triggered."""
         optimizers = [*self._deformation.optimizers]
         optimizers += [] if self._colours is None else [self._colours.optimizer]
         optimizers += [] if self._learnt_gloss is None else self._learnt_gloss.optimizers
-        arrays = [self._deformation.unsound, self._pictures.guard_counts]
-        unsound, rendered, *stepped = self.downloads.read(*arrays, *(each.adam.guard_counts for each in optimizers))
-        counts = [guard_counts(RENDERING_GUARDS, rendered), *(guard_counts(ADAM_GUARDS, each) for each in stepped)]
-        triggered = dict(summed(counts)) | {"held_back": int(unsound[0])}
-        return {name: count for name, count in triggered.items() if count}
+        return [each.adam.guard_counts for each in optimizers]
 
     def state(self, learnt: bool) -> Gaussians:
         """See ``UpdateEngine.state``."""

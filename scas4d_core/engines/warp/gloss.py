@@ -325,15 +325,16 @@ def smooth_changes(
         smooth[i, c] = before[i, c] + change
 
 
-def features_seen(copies: DeviceCopies, state: Gaussians, cameras: wp.array) -> wp.array:
+def features_seen(copies: DeviceCopies, state: Gaussians, cameras: wp.array, plain: wp.array | None = None) -> wp.array:
     """Returns the features of a state as seen by a camera, [N] vec4. The array must not be modified.
 
     Args:
         copies: device copies of the state's arrays.
         state: Gaussians to shade.
         cameras: [1] camera, of type ``Camera``.
+        plain: [N] vec4 features without gloss; those of the state if None.
     """
-    plain = features_on(copies, state)
+    plain = features_on(copies, state) if plain is None else plain
     if state.gloss is None or state.environment is None:
         return plain
     seen, device = wp.empty_like(plain), plain.device

@@ -508,8 +508,6 @@ class PictureLoss:
         replaced = columns > self.columns or rows > self.rows or len(views) > len(self._taken)
         if replaced:
             self._allocate(max(len(views), len(self._taken)), columns, rows)
-        elif self._sent is not None:  # a pending upload must not be overwritten
-            wp.synchronize_event(self._sent)
         floats, levels = list[int](), list[int]()
         copied: list[tuple[int, wp.array]] = []
         taken: dict[int, Array] = {}
@@ -526,11 +524,13 @@ class PictureLoss:
                     rows_there, columns_there = view.finer.shape[1:]
                     copied.append((index, finer[:channels, :rows_there, :columns_there]))
                 elif view.source is None:
+                    self._wait_for_upload()
                     if index not in self._staged_floats:
                         self._staged_floats[index] = self._pinned()
                     self._staged_floats[index].numpy()[:channels, :height, :width] = view.target
                     floats.append(index)
                 else:
+                    self._wait_for_upload()
                     image, mask = view.source
                     self._host_levels[index, :3, :height, :width] = np.moveaxis(image, -1, 0)
                     if mask is not None:
@@ -539,8 +539,8 @@ class PictureLoss:
             loaded[id(view.target)] = index
         cameras = [camera_of(view.camera) for view in views]
         wp.copy(self.cameras, wp.array(cameras, dtype=Camera, device="cpu"), count=len(views))
-        for there, here in ((self.channels, self._channels), (self.exposures, self._exposures)):
-            wp.copy(there, here)
+        for there, here in ((self.channels, self._host_channels), (self.exposures, self._host_exposures)):
+            wp.copy(there, wp.array(here, dtype=there.dtype, device="cpu"))
         size = self.targets.size // len(self._taken)
         for index in floats:
             wp.copy(self.targets, self._staged_floats[index], size * index, 0, size)
@@ -561,9 +561,14 @@ class PictureLoss:
             wp.launch(find_blank, (len(changed), *self._blank.shape[1:]), inputs, device=self._device)
         for index, target in taken.items():  # only now, because an upload may fail if memory is full
             self._taken[index] = target
-        if wp.get_device(self._device).is_cuda:
+        if (floats or levels) and wp.get_device(self._device).is_cuda:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
+
+    def _wait_for_upload(self) -> None:
+        """Waits for the last upload of images, whose page-locked buffers are about to be overwritten."""
+        if self._sent is not None:
+            wp.synchronize_event(self._sent)
 
     def _loaded(self, target: Array, loaded: dict[int, int]) -> wp.array | None:
         """Returns the device copy [4, rows, columns] of a target that is loaded, or None.
@@ -639,13 +644,10 @@ class PictureLoss:
         self.target_means, self.target_squares = (wp.zeros_like(self.targets) for _ in range(2))
         self._blank = wp.zeros((views, -(-rows // TILE), -(-columns // TILE)), dtype=wp.int32, device=device)
         self._by_window = wp.zeros(shape[1:], dtype=wp.vec3, device=device)
-        self._channels = wp.zeros(views, dtype=wp.int32, device="cpu", pinned=pinned)
-        self._exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device="cpu", pinned=pinned)
         self._staged_floats: dict[int, wp.array] = {}
         self._levels = wp.zeros(shape, dtype=wp.uint8, device=device)
         self._staged_levels = wp.zeros(shape, dtype=wp.uint8, device="cpu", pinned=pinned)
-        # NumPy views of the same memory.
-        self._host_channels, self._host_exposures = self._channels.numpy(), self._exposures.numpy()
-        self._host_levels = self._staged_levels.numpy()
-        self._host_exposures[:] = [1, 0]
+        self._host_levels = self._staged_levels.numpy()  # a view of the same memory
+        self._host_channels = np.zeros(views, np.int32)
+        self._host_exposures = np.tile(np.array([1, 0], np.float32), (views, CHANNELS, 1))
         self.columns, self.rows = columns, rows

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from scas4d_core.engines.engine import KEPT_PICTURES, KEPT_ROWS, Thinned, kept_step
 from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.renderer import CHANNELS
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.layout import COLUMNS, Camera
 from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.rasterizer import Rasterizer
@@ -64,6 +65,7 @@ class PicturePass:
         planes: [5, rows, columns] last rendering: RGB before exposure, label, and remaining transmittance.
         exposures: [views, 4] vec2 gain and offset of each channel. They may be changed between launches.
         log: [records, 8] float32 log; see ``layout`` for the columns.
+        kept: [slots, 5, rows, columns] float32 renderings that ``keep`` has copied, subsampled; see ``thinned``.
         generation: number of times that buffers were reallocated.
     """
 
@@ -76,7 +78,7 @@ class PicturePass:
         self.grad_factors = wp.zeros(count, dtype=wp.mat33, device=device)
         self.grad_features = wp.zeros(count, dtype=wp.vec4, device=device)
         self.log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
-        self._kept = wp.zeros((0, 0, 0, 0), dtype=wp.float32, device=device)
+        self.kept = wp.zeros((0, 0, 0, 0), dtype=wp.float32, device=device)
         self.generation = 0
 
     @property
@@ -115,9 +117,9 @@ class PicturePass:
             replaced = True
         sizes = [kept_size(view) for view in views]
         rows, columns = max(rows for rows, _ in sizes), max(columns for _, columns in sizes)
-        if rows > self._kept.shape[2] or columns > self._kept.shape[3]:
-            shape = (KEPT_PICTURES, CHANNELS + 1, max(rows, self._kept.shape[2]), max(columns, self._kept.shape[3]))
-            self._kept = wp.zeros(shape, dtype=wp.float32, device=self._device)
+        if rows > self.kept.shape[2] or columns > self.kept.shape[3]:
+            shape = (KEPT_PICTURES, CHANNELS + 1, max(rows, self.kept.shape[2]), max(columns, self.kept.shape[3]))
+            self.kept = wp.zeros(shape, dtype=wp.float32, device=self._device)
             replaced = True
         self.generation += replaced
 
@@ -174,17 +176,14 @@ class PicturePass:
 
     def keep(self, view: wp.array, slot: wp.array) -> None:
         """Copies the last rendering, subsampled, to a slot. Both arguments are [1] int32 arrays."""
-        inputs = [self._loss.cameras, view, slot, self.planes, self._kept]
-        wp.launch(keep_picture, self._kept.shape[1:], inputs, device=self._device)
+        inputs = [self._loss.cameras, view, slot, self.planes, self.kept]
+        wp.launch(keep_picture, self.kept.shape[1:], inputs, device=self._device)
 
-    def kept(self, slots: Sequence[tuple[int, TrainingView]], downloads: Downloads) -> list[Thinned]:
-        """Waits for the device, and returns the kept rendering for each pair of slot and view."""
-        (kept,), pictures = downloads.read(self._kept), []
-        for slot, view in slots:
-            rows, columns = kept_size(view)
-            every = kept_step(view.camera.height, view.camera.width)
-            pictures.append(Thinned(every, kept[slot, :, :rows, :columns].copy()))
-        return pictures
+
+def thinned(kept: NDArray[np.float32], view: TrainingView) -> Thinned:
+    """Returns the rendering of a view that was kept in a slot, [5, rows, columns] of ``PicturePass.kept``."""
+    rows, columns = kept_size(view)
+    return Thinned(kept_step(view.camera.height, view.camera.width), kept[:, :rows, :columns].copy())
 
 
 def kept_size(view: TrainingView) -> tuple[int, int]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -108,7 +109,6 @@ def take_colour_step(
     sums: wp.array[wp.vec4],
     prior: wp.float32,
     features: wp.array[wp.vec4],
-    stepped: wp.array[wp.vec4],
 ) -> None:
     """Adds the weighted mean residual to the colours of selected Gaussians, with one thread per Gaussian.
 
@@ -116,16 +116,13 @@ def take_colour_step(
         learnt: [N] mask of the selected Gaussians.
         sums: [N] weighted sums of the RGB residuals, and sum of the weights.
         prior: number added to the sum of the weights.
-        features: [N] colours and labels.
-        stepped: [N] output.
+        features: [N] colours and labels, changed in place.
     """
     i = wp.tid()
-    feature = features[i]
     if learnt[i] != wp.uint8(0):
         total = sums[i]
         weight = prior + total[3]
-        feature = feature + wp.vec4(total[0] / weight, total[1] / weight, total[2] / weight, 0.0)
-    stepped[i] = feature
+        features[i] = features[i] + wp.vec4(total[0] / weight, total[1] / weight, total[2] / weight, 0.0)
 
 
 @wp.kernel
@@ -222,12 +219,11 @@ class WarpRenderer:
         self._background = np.array([*background, 0.0], np.float32)
         self._loss = PictureLoss(device, image_weight, 0.0)
         self._copies = copies_on(device)
-        # each reuses one buffer
-        self._downloads, self._log_downloads, self._level_downloads = (Downloads(device) for _ in range(3))
+        self._downloads = Downloads(device)
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
-        self._log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
+        self._log = self._records = wp.zeros(0, dtype=wp.int32, device=device)
         self._near: tuple[Neighbourhoods, wp.array] | tuple[None, None] = None, None
 
     def render(
@@ -250,12 +246,16 @@ class WarpRenderer:
         if background is None:
             background = np.zeros(CHANNELS * len(groups), np.float32)
             background[:CHANNELS] = self._background
-        self._project(state, camera, cameras, groups, sound)
-        drawn = []
-        for place, group in enumerate(groups):
-            self._draw(cameras, group, background[CHANNELS * place : CHANNELS * (place + 1)])
-            planes = self._rasterizer.planes[:, : camera.height, : camera.width]
-            drawn += self._downloads.read(planes.contiguous())
+
+        def draw() -> list[wp.array]:
+            self._project(state, camera, cameras, groups, sound)
+            pictures = []
+            for place, group in enumerate(groups):
+                self._draw(cameras, group, background[CHANNELS * place : CHANNELS * (place + 1)])
+                pictures.append(wp.clone(self._rasterizer.planes[:, : camera.height, : camera.width]))
+            return pictures
+
+        _, *drawn = self._read(draw)
         if len(drawn) == 1:
             return Picture(drawn[0][:CHANNELS], drawn[0][CHANNELS])
         return Picture(np.concatenate([planes[:CHANNELS] for planes in drawn]), drawn[0][CHANNELS])
@@ -266,20 +266,28 @@ class WarpRenderer:
         """See ``Renderer.render_levels``. Only the 8-bit values are downloaded."""
         cameras = self._camera(camera)
         features = features_seen(self._copies, state, cameras)
-        self._project(state, camera, cameras, [features])
-        self._draw(cameras, features, background)
         shape = camera.height, camera.width
         levels = wp.empty((*shape, 1 if opacity else LABEL), dtype=wp.uint8, device=self.device)
         chosen = (CHANNELS, -1.0, 1.0) if opacity else (0, 1.0, 0.0)
-        wp.launch(round_to_levels, shape, [self._rasterizer.planes, *chosen, levels], device=self.device)
-        pixels: NDArray[np.uint8] = self._level_downloads.read(levels)[0]
+
+        def draw() -> list[wp.array]:
+            self._project(state, camera, cameras, [features])
+            self._draw(cameras, features, background)
+            wp.launch(round_to_levels, shape, [self._rasterizer.planes, *chosen, levels], device=self.device)
+            return [levels]
+
+        pixels: NDArray[np.uint8] = self._read(draw)[1]
         return pixels[..., 0] if opacity else pixels
 
     def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
         """See ``Renderer.compare``."""
-        self._render_view(state, view)
-        self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
-        log = self._log_downloads.read(self._log)[0][0].astype(float)
+
+        def draw() -> list[wp.array]:
+            self._render_view(state, view)
+            self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
+            return []
+
+        log = self._read(draw)[0][0].astype(float)
         red, green, blue = log[SHIFT : SHIFT + 3].tolist()
         psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
         return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
@@ -287,34 +295,60 @@ class WarpRenderer:
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """See ``Renderer.gather``."""
         cameras, features = self._camera(camera), wp.zeros(len(state), dtype=wp.vec4, device=self.device)
-        self._project(state, camera, cameras, [features])
-        self._draw(cameras, features, np.zeros(CHANNELS, np.float32))
-        weights = self._rasterizer.g_planes
-        weights.zero_()
         given = wp.array(np.ascontiguousarray(planes, np.float32), dtype=wp.float32, ndim=3, device=self.device)
-        wp.copy(weights[: len(planes), : camera.height, : camera.width], given)
-        return self._sums(state, cameras, features)[:, : len(planes)]
+
+        def draw() -> list[wp.array]:
+            self._project(state, camera, cameras, [features])
+            self._draw(cameras, features, np.zeros(CHANNELS, np.float32))
+            weights = self._rasterizer.g_planes
+            weights.zero_()
+            wp.copy(weights[: len(planes), : camera.height, : camera.width], given)
+            # The sums are the feature gradients of a sum of weighted pixels.
+            self._rasterizer.carry_back(cameras, self._first, features)
+            sums = wp.zeros(len(state), dtype=wp.vec4, device=self.device)
+            wp.launch(add_sums, len(state), [self._rasterizer.records, sums], device=self.device)
+            return [sums]
+
+        gathered: Array = self._read(draw)[1]
+        return gathered[:, : len(planes)]
 
     def step_colours(
-        self, state: Gaussians, views: Sequence[TrainingView], learnt: NDArray[np.uint8], most: float
+        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
-        """See ``Renderer.step_colours``."""
-        count, loss = len(state), self._loss
-        sums = wp.zeros(count, dtype=wp.vec4, device=self.device)
-        for view in views:
-            features, rasterizer = self._render_view(state, view), self._rasterizer
-            target = [loss.cameras, self._first, loss.exposures, loss.targets]
-            inputs = [*target, rasterizer.planes, most, rasterizer.g_planes]
-            wp.launch(weigh_residuals, rasterizer.g_planes.shape, inputs, device=self.device)
-            rasterizer.carry_back(self._camera(view.camera), self._first, features)
-            wp.launch(add_sums, count, [rasterizer.records, sums], device=self.device)
-        chosen, plain = self._copies.of(learnt, wp.uint8), features_on(self._copies, state)
-        stepped = wp.empty_like(plain)
-        wp.launch(take_colour_step, count, [chosen, sums, PRIOR_PIXELS, plain, stepped], device=self.device)
-        features = self._downloads.read(stepped)[0]
+        """See ``Renderer.step_colours``. The host waits only once."""
+        chosen = self._copies.of(learnt, wp.uint8)
+        stepped = wp.empty_like(features_on(self._copies, state))
+        views = [view for subset in subsets for view in subset]
+        self._make_room(state, *largest([view.camera for view in views]))
+
+        def draw() -> list[wp.array]:
+            wp.copy(stepped, features_on(self._copies, state))
+            record = 0
+            for subset in subsets:
+                sums = wp.zeros(len(state), dtype=wp.vec4, device=self.device)
+                for view in subset:
+                    self._add_residuals(state, view, stepped, most, sums, record)
+                    record += 1
+                inputs = [chosen, sums, PRIOR_PIXELS, stepped]
+                wp.launch(take_colour_step, len(state), inputs, device=self.device)
+            return [stepped]
+
+        features = self._read(draw, len(views))[1]
         state = state.replace(colours=np.ascontiguousarray(features[:, :LABEL]))
         self._copies.store(stepped, state.colours, state.foreground)
         return state
+
+    def _add_residuals(
+        self, state: Gaussians, view: TrainingView, plain: wp.array, most: float, sums: wp.array, record: int
+    ) -> None:
+        """Adds the weighted residuals of a view to [N] vec4 sums; ``plain`` are the features without gloss."""
+        loss, features = self._loss, self._render_view(state, view, plain, record)
+        rasterizer = self._rasterizer
+        target = [loss.cameras, self._first, loss.exposures, loss.targets]
+        inputs = [*target, rasterizer.planes, most, rasterizer.g_planes]
+        wp.launch(weigh_residuals, rasterizer.g_planes.shape, inputs, device=self.device)
+        rasterizer.carry_back(self._camera(view.camera), self._first, features)
+        wp.launch(add_sums, len(state), [rasterizer.records, sums], device=self.device)
 
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
         """See ``Renderer.extrapolate``."""
@@ -344,21 +378,33 @@ class WarpRenderer:
     def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
         """See ``Renderer.reached``."""
         cameras, features = self._camera(camera), features_on(self._copies, state)
-        self._project(state, camera, cameras, [features])
         height, width = (-(-size // PADDING) * PADDING // BLOCK for size in (camera.height, camera.width))
-        marks = wp.zeros((height, width), dtype=wp.int32, device=self.device)
-        self._rasterizer.mark(cameras, BLOCK, features, marks)
-        blocks: NDArray[np.bool_] = marks.numpy() != 0
+
+        def draw() -> list[wp.array]:
+            self._project(state, camera, cameras, [features])
+            marks = wp.zeros((height, width), dtype=wp.int32, device=self.device)
+            self._rasterizer.mark(cameras, BLOCK, features, marks)
+            return [marks]
+
+        blocks: NDArray[np.bool_] = self._read(draw)[1] != 0
         return blocks
 
-    def pairs_per_pixel(self, state: Gaussians, camera: CameraArrays, every: int = 1) -> NDArray[np.int32]:
-        """See ``Renderer.pairs_per_pixel``."""
-        self._project(state, camera, self._camera(camera), [features_on(self._copies, state)])
-        shape = -(-camera.height // every), -(-camera.width // every)
-        pairs = wp.empty(shape, dtype=wp.int32, device=self.device)
-        self._rasterizer.count_pairs(every, pairs)
-        counted: NDArray[np.int32] = pairs.numpy()
-        return counted
+    def pairs_per_pixel(
+        self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1
+    ) -> list[NDArray[np.int32]]:
+        """See ``Renderer.pairs_per_pixel``. The host waits only once."""
+        shapes = [(-(-camera.height // every), -(-camera.width // every)) for camera in cameras]
+        counts = [wp.empty(shape, dtype=wp.int32, device=self.device) for shape in shapes]
+        self._make_room(state, *largest(cameras))
+
+        def draw() -> list[wp.array]:
+            for record, (camera, pairs) in enumerate(zip(cameras, counts, strict=True)):
+                features = [features_on(self._copies, state)]
+                self._project(state, camera, self._camera(camera), features, record=record)
+                self._rasterizer.count_pairs(every, pairs)
+            return counts
+
+        return self._read(draw, len(cameras))[1:]
 
     def _camera(self, camera: CameraArrays) -> wp.array:
         return wp.array([camera_of(camera)], dtype=Camera, device=self.device)
@@ -379,6 +425,30 @@ class WarpRenderer:
             return uploaded, None
         return uploaded, np.asarray((np.abs(features) <= FEATURE_CEILING).all(axis=1))
 
+    def _make_room(self, state: Gaussians, columns: int, rows: int) -> None:
+        """Makes a rasterizer for the state and image size, unless the last one holds them."""
+        if len(state) != self._rasterizer.count or not self._rasterizer.holds(columns, rows):
+            self._rasterizer = Rasterizer(self.device, len(state), self.limits)
+            self._rasterizer.resize(columns, rows)
+
+    def _read(self, draw: Callable[[], Sequence[wp.array]], renderings: int = 1) -> list[NDArray[Any]]:
+        """Returns the log, and the arrays that ``draw`` computes, with one wait for the device.
+
+        If tile lists were too small, they are enlarged, and ``draw`` is called again.
+
+        Args:
+            draw: function that enqueues the work, and logs each rendering in a row of its own.
+            renderings: number of rows of the log.
+        """
+        if len(self._log) != renderings:
+            self._log = wp.zeros((renderings, COLUMNS), dtype=wp.float32, device=self.device)
+            self._records = wp.array(np.arange(renderings), dtype=wp.int32, device=self.device)
+        while True:
+            arrays = draw()
+            log, *values = self._downloads.read(self._log, *arrays)
+            if not self._rasterizer.grow(log[:, PAIRS].max()):
+                return [log, *values]
+
     def _project(
         self,
         state: Gaussians,
@@ -386,43 +456,38 @@ class WarpRenderer:
         cameras: wp.array,
         groups: Sequence[wp.array],
         sound: NDArray[np.bool_] | None = None,
+        record: int = 0,
     ) -> None:
-        """Projects a state and builds sufficiently large tile lists; see ``_features`` for the last arguments."""
-        device, count, copies = self.device, len(state), self._copies
-        if count != self._rasterizer.count or not self._rasterizer.holds(camera.width, camera.height):
-            self._rasterizer = Rasterizer(device, count, self.limits)
-            self._rasterizer.resize(camera.width, camera.height)
-        opacities, features = copies.of(state.opacities, wp.float32), groups[0]
+        """Projects a state and builds its tile lists; see ``_features`` for ``groups`` and ``sound``.
+
+        ``_read`` finds out whether the lists were large enough, from the given row of the log.
+        """
+        self._make_room(state, camera.width, camera.height)
+        copies, features = self._copies, groups[0]
+        opacities = copies.of(state.opacities, wp.float32)
         if sound is not None and not sound.all():  # projection can only check one group
-            opacities = wp.array(np.where(sound, state.opacities, np.float32(0)), dtype=wp.float32, device=device)
+            opacities = wp.array(np.where(sound, state.opacities, np.float32(0)), dtype=wp.float32, device=self.device)
         shapes = copies.of(state.means, wp.vec3), copies.of(state.factors, wp.mat33), opacities
-        given = (cameras, self._first, *shapes, features, self._first, self._log)
-        self._rasterizer.project(*given)
-        while self._rasterizer.grow(self._log_downloads.read(self._log)[0][0, PAIRS]):
-            self._rasterizer.project(*given)
+        row = self._records[record : record + 1]
+        self._rasterizer.project(cameras, self._first, *shapes, features, row, self._log)
 
     def _draw(self, cameras: wp.array, features: wp.array, background: Array) -> None:
         """Rasterizes features [N] vec4 of the projected Gaussians."""
         self._behind.assign(background[None])
         self._rasterizer.draw(cameras, self._first, features, self._behind)
 
-    def _render_view(self, state: Gaussians, view: TrainingView) -> wp.array:
+    def _render_view(
+        self, state: Gaussians, view: TrainingView, plain: wp.array | None = None, record: int = 0
+    ) -> wp.array:
         """Renders a state from a view's camera, loads the view, and returns the features that the camera sees."""
         cameras = self._camera(view.camera)
-        features = features_seen(self._copies, state, cameras)
-        self._project(state, view.camera, cameras, [features])
+        features = features_seen(self._copies, state, cameras, plain)
+        self._project(state, view.camera, cameras, [features], record=record)
         self._draw(cameras, features, self._background)
         self._loss.load([view])
         return features
 
-    def _sums(self, state: Gaussians, cameras: wp.array, features: wp.array) -> Array:
-        """Returns the sums [N, 4] of the planes in ``g_planes``, weighted by blending weights.
 
-        They are computed as the feature gradients of a sum of weighted pixels.
-        """
-        rasterizer = self._rasterizer
-        rasterizer.carry_back(cameras, self._first, features)
-        sums = wp.zeros(len(state), dtype=wp.vec4, device=self.device)
-        wp.launch(add_sums, len(state), [rasterizer.records, sums], device=self.device)
-        gathered: Array = self._downloads.read(sums)[0]
-        return gathered
+def largest(cameras: Sequence[CameraArrays]) -> tuple[int, int]:
+    """Returns the largest width and height of the cameras' images."""
+    return max(camera.width for camera in cameras), max(camera.height for camera in cameras)

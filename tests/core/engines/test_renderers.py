@@ -104,22 +104,25 @@ def test_pairs_per_pixel(tested: Renderer) -> None:
     large = state.replace(factors=2 * state.factors)
     dense = large.replace(opacities=np.full(len(state), 0.95, np.float32))  # finishes pixels early
     for each in (state, large, dense):
-        mine, true = (renderer.pairs_per_pixel(each, CAMERA) for renderer in (tested, TRUE))
+        mine, true = (renderer.pairs_per_pixel(each, [CAMERA])[0] for renderer in (tested, TRUE))
         assert mine.dtype == np.int32
         assert np.mean(mine != true) < 0.005  # float32 against float64 at the edges of supports
         assert np.abs(mine - true).max() <= 1
-    assert (true < TRUE.pairs_per_pixel(large, CAMERA)).any()
+    assert (true < TRUE.pairs_per_pixel(large, [CAMERA])[0]).any()
 
 
 def test_gaussians_behind_a_finished_pixel_do_not_count_as_pairs(tested: Renderer) -> None:
     row = Gaussians.of_points([[0, 0, 2 + 0.1 * i] for i in range(30)], radius=0.2)
     camera = CameraArrays.of(Camera("front", [[60, 0, 20], [0, 60, 25], [0, 0, 1]], np.eye(4), 40, 50))
-    assert tested.pairs_per_pixel(row, camera)[25, 20] == 4  # each leaves 0.11, and a fifth would leave less than 1e-4
+    assert (
+        tested.pairs_per_pixel(row, [camera])[0][25, 20] == 4
+    )  # each leaves 0.11, and a fifth would leave less than 1e-4
     faint = row.replace(opacities=np.full(30, 0.01, np.float32))
-    pairs = tested.pairs_per_pixel(faint, camera)
+    (pairs,) = tested.pairs_per_pixel(faint, [camera])
     assert pairs.shape == (50, 40)
     assert pairs[25, 20] == 30
-    np.testing.assert_array_equal(tested.pairs_per_pixel(faint, camera, 4), pairs[::4, ::4])
+    for each in tested.pairs_per_pixel(faint, [camera, camera], 4):
+        np.testing.assert_array_equal(each, pairs[::4, ::4])
     counts = pair_counts(tested, faint, [camera] * 7)
     assert counts.mean == pytest.approx(pairs[::4, ::4].mean())
     assert counts.percentile_99 == np.percentile(pairs[::4, ::4], 99, method="inverted_cdf")
@@ -129,15 +132,17 @@ def test_gaussians_behind_a_finished_pixel_do_not_count_as_pairs(tested: Rendere
 def test_a_colour_step_of_some_gaussians(tested: Renderer, glossy: bool) -> None:
     scene = case(gaussians(glossy=glossy))
     before, learnt = scene.previous, (np.arange(len(scene.previous)) % 3 == 0).astype(np.uint8)
-    mine, true = (renderer.step_colours(before, scene.views[1:4], learnt, 0.05) for renderer in (tested, TRUE))
+    mine, true = (renderer.step_colours(before, [scene.views[1:4]], learnt, 0.05) for renderer in (tested, TRUE))
     steps = [(state.colours - before.colours)[learnt == 1] for state in (mine, true)]
     assert np.abs(steps[1]).max() > 0.01
     assert apart(*steps) < 1e-3  # small differences of pictures
     for state in (mine, true):
         assert np.array_equal(state.colours[learnt == 0], before.colours[learnt == 0])
         assert state.means is before.means
-    again, expected = (renderer.step_colours(mine, scene.views[:2], learnt, 0.05) for renderer in (tested, TRUE))
+    again, expected = (renderer.step_colours(mine, [scene.views[:2]], learnt, 0.05) for renderer in (tested, TRUE))
     assert apart(again.colours - mine.colours, expected.colours - mine.colours) < 2e-3
+    both = tested.step_colours(before, [scene.views[1:4], scene.views[:2]], learnt, 0.05)
+    assert apart(both.colours - mine.colours, again.colours - mine.colours) < 1e-5
 
 
 def test_states_between_and_beyond_frames(tested: Renderer) -> None:

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
 
 from box_scene import RIG, make_box, moved, take_frame
-from warp_cases import Uploads
+from warp_cases import Uploads, Waits
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.evidence import FrameObservation
@@ -90,6 +90,17 @@ def test_an_effect_that_is_on_gives_the_state_of_the_cpu_engine(effect: str) -> 
         losses = [scene.history.report(index)["loss"] for scene in (mine, true)]
         assert losses[0] == pytest.approx(losses[1], rel=0.01)
         assert mine.history.report(index)["candidate"] == true.history.report(index)["candidate"]
+
+
+def test_the_host_waits_at_most_12_times_in_a_whole_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits, states = Waits(monkeypatch), [make_box()]
+    scene = Reconstruction.start(RIG, frames()[0], settings("gpu"), static=first_fit(False))
+    for index in range(1, 6):
+        states.append(moved(states[-1]))
+        waits.count = 0
+        assert scene.step(take_frame(index, index / 30, states[-1], RIG)).outcome == "updated"
+        if index >= 3:  # with colour steps, the times of cameras, and the report
+            assert 8 < waits.count <= 12
 
 
 def test_frame_0_is_as_good_as_that_of_the_cpu_engine() -> None:

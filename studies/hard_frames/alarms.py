@@ -1,0 +1,295 @@
+"""``scripts/bench alarms``: false alarms on clean variants of captures, and which planted faults are found, and when.
+
+Every variant of a capture is updated once without faults. Each fault then replaces the images of one camera in three
+consecutive frames, starting from the state before them. The cameras take turns.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import shift as interpolated
+
+from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
+from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.importers.open_source import CaptureOptions
+from scas4d_core.captures import Capture
+from scas4d_core.captures.frame import Frame
+from scas4d_core.frame_report import FrameReport
+from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
+from studies.captures import open_measured
+from studies.hard_frames.camera_faults import FRAMES, blurred, dirty, noisy, scaled
+from studies.hard_frames.frames import Picture
+from studies.machine import core_version, machine
+from studies.quality.first_frame import started
+from studies.quality.settings import settings_of
+from studies.variants.variants import VARIANTS
+
+AFTER = 5
+"""Number of updates before the faulty frames, at most: half of the frames of a short variant."""
+
+Plant = Callable[[Capture, int, str], "tuple[Picture, Picture | None]"]
+"""Function that returns the faulty image and mask of a camera in a frame of a capture."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A planted fault of one camera.
+
+    Attributes:
+        kind: name of the fault.
+        strength: its size, for tables.
+        plant: function that returns the faulty image and mask.
+    """
+
+    kind: str
+    strength: str
+    plant: Plant
+
+
+def _image(change: Callable[[Picture], Picture]) -> Plant:
+    """Returns a fault that changes only the image."""
+    return lambda capture, index, name: (change(_shown(capture, index, name)[0]), _shown(capture, index, name)[1])
+
+
+def _moved(share: float) -> Plant:
+    """Returns a camera turned sideways, so that its image and mask shift by a share of the image width."""
+
+    def plant(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | None]:
+        image, mask = _shown(capture, index, name)
+        pixels = share * image.shape[1]
+        return (
+            interpolated(image, (0, pixels, 0), order=1, mode="nearest"),
+            None if mask is None else interpolated(mask, (0, pixels), order=0, mode="nearest"),
+        )
+
+    return plant
+
+
+def _late(frames: int) -> Plant:
+    """Returns a camera whose images arrive ``frames`` frames late."""
+    return lambda capture, index, name: _shown(capture, index - frames, name)
+
+
+def _frozen(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | None]:
+    return _shown(capture, first_faulty(capture) - 1, name)
+
+
+def _swapped(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | None]:
+    names = capture.full_rig.names
+    return _shown(capture, index, names[(names.index(name) + 1) % len(names)])
+
+
+def _shown(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | None]:
+    frame = capture.frame(index)
+    return np.asarray(frame.images[name]), None if name not in frame.masks else np.asarray(frame.masks[name])
+
+
+FAULTS = (
+    Fault("moved", "0.2% of the width", _moved(0.002)),
+    Fault("moved", "0.5%", _moved(0.005)),
+    Fault("moved", "2%", _moved(0.02)),
+    Fault("out of focus", "0.3% of the width", _image(lambda picture: blurred(picture, 0.003 * picture.shape[1]))),
+    Fault("dirty", "0.2", _image(lambda picture: dirty(picture, 0.2))),
+    Fault("dirty", "0.5", _image(lambda picture: dirty(picture, 0.5))),
+    Fault("exposure", "0.7", _image(lambda picture: scaled(picture, 0.7))),
+    Fault("white balance", "red 1.25", _image(lambda picture: scaled(picture, (1.25, 1.0, 1.0)))),
+    Fault("noise", "20 levels", _image(lambda picture: noisy(picture, 20))),
+    Fault("late", "1 frame", _late(1)),
+    Fault("late", "3 frames", _late(3)),
+    Fault("frozen", "3 frames", _frozen),
+    Fault("swapped", "with its neighbour", _swapped),
+)  # fmt: skip
+"""The catalogue of planted faults. Lengths are fractions of the image width."""
+
+
+def first_faulty(capture: Capture) -> int:
+    """Returns the index of the first faulty frame."""
+    return max(3, min(1 + AFTER, capture.frame_count // 2))
+
+
+def run(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    variants: Sequence[str] = (),
+    seeds: Sequence[int] = (0,),
+    frames: int | None = None,
+    faults: bool = True,
+    changes: Sequence[str] = (),
+    again: bool = False,
+    options: CaptureOptions = DEFAULT_OPTIONS,
+    report: Report = print,
+) -> list[Row]:
+    """Measures every variant of every capture, and writes the tables to ``out/alarms.md``.
+
+    Args:
+        captures: capture folders.
+        out: study folder, which stores each finished variant; a second call resumes the study.
+        variants: names from ``VARIANTS``; all if empty.
+        seeds: seeds of the updates.
+        frames: maximum number of frames per variant.
+        faults: whether faults are planted, too.
+        changes: changes to the settings, such as ``"scene.image_scale=0.5"``.
+        again: whether to repeat finished variants.
+        options: options for reading the captures.
+        report: callback that prints progress messages.
+
+    Returns:
+        One row per capture, variant and seed.
+    """
+    rows = []
+    for folder in captures:
+        for of in variants or VARIANTS:
+            for seed in seeds:
+                settings = settings_of("scas4d", None, seed, (*VARIANTS[of].changes, *changes))
+                key = digest(settings_record(settings, ()), of, frames, faults, core_version())
+                path = out / "alarms" / f"{folder.resolve().name}-{of.replace(' ', '-')}-{key}.json"
+                measured = partial(_row, folder, of, settings, out, frames, faults, options)
+                row = kept_row(path, measured, again=again)
+                report(_line(row))
+                rows.append(row)
+    text = page(rows)
+    (out / "alarms.md").write_text(text + "\n")
+    report(text)
+    return rows
+
+
+def _row(
+    folder: Path, of: str, settings: Settings, out: Path, frames: int | None, faults: bool, options: CaptureOptions
+) -> Row:
+    capture = VARIANTS[of].made(open_measured(folder, options))
+    count = capture.frame_count if frames is None else min(frames, capture.frame_count)
+    at, names = first_faulty(capture), capture.full_rig.names
+    found, clean = [], []
+    with TemporaryDirectory() as place:
+        scene = started(capture, settings, out, Path(place) / "clean")
+        for index in range(1, count):
+            if index == at:
+                shutil.copytree(Path(place) / "clean", Path(place) / "before")
+            clean.append(_clean(scene.step(capture.frame(index))))
+        for number, fault in enumerate(FAULTS if faults and at + FRAMES <= capture.frame_count else ()):
+            branch = Path(place) / "fault"
+            shutil.copytree(Path(place) / "before", branch)
+            name = names[(number * 5 + 1) % len(names)]
+            scene = Reconstruction.resume(capture.full_rig, settings, History.open(branch))
+            reports = [scene.step(_with(capture, at + n, name, fault)) for n in range(FRAMES)]
+            found.append({"kind": fault.kind, "strength": fault.strength, "camera": name, **_found(reports, name)})
+            shutil.rmtree(branch)
+    identity = {"capture": capture.name, "variant": of, "seed": settings.update.seed, "cameras": len(names)}
+    return {**identity, "clean": clean, "faults": found, "core": core_version(), "machine": machine()}
+
+
+def _with(capture: Capture, index: int, name: str, fault: Fault) -> Frame:
+    frame = capture.frame(index)
+    image, mask = fault.plant(capture, index, name)
+    masks = dict(frame.masks) if mask is None else {**frame.masks, name: mask}
+    return Frame(frame.index, frame.time, {**frame.images, name: image}, masks)
+
+
+def _clean(report: FrameReport) -> dict[str, Any]:
+    return {
+        "index": report.index,
+        "rejected": report.outcome.rejected,
+        "excluded": sorted(report.dropped),
+        "alarms": [asdict(alarm) for alarm in report.alarms],
+    }
+
+
+def _found(reports: Sequence[FrameReport], name: str) -> dict[str, Any]:
+    """Returns the number of the first faulty frame with an alarm for the camera, the kinds, and other alarms."""
+    raised = [[alarm for alarm in report.alarms if alarm.camera == name] for report in reports]
+    return {
+        "by": next((number for number, alarms in enumerate(raised, 1) if alarms), None),
+        "kinds": sorted({alarm.kind for alarms in raised for alarm in alarms}),
+        "others": [
+            f"{report.index} {alarm.camera or 'frame'} {alarm.kind}: {alarm.evidence}"
+            for report in reports
+            for alarm in report.alarms
+            if alarm.camera != name
+        ],
+        "rejected": sum(report.outcome.rejected for report in reports),
+    }
+
+
+def _line(row: Row) -> str:
+    clean, missed = row["clean"], [fault for fault in row["faults"] if fault["by"] is None]
+    lines = [
+        f"{row['capture']}, {row['variant']}, seed {row['seed']}: {len(clean)} clean updates, "
+        f"{len(_camera_alarms(row))} false alarms, {sum(frame['rejected'] for frame in clean)} rejected; "
+        f"{len(row['faults']) - len(missed)} of {len(row['faults'])} faults found"
+    ]
+    lines += [
+        f"  ! {alarm['index']} {alarm['camera']} {alarm['kind']}: {alarm['evidence']}" for alarm in _camera_alarms(row)
+    ]
+    lines += [f"  missed: {fault['kind']} {fault['strength']} ({fault['camera']})" for fault in missed]
+    lines += [
+        f"  beside {fault['kind']} {fault['strength']} ({fault['camera']}): {other}"
+        for fault in row["faults"]
+        for other in fault["others"]
+    ]
+    return "\n".join(lines)
+
+
+def _camera_alarms(row: Row) -> list[dict[str, Any]]:
+    """Returns the alarms of single cameras in frames without faults; all of them are false."""
+    return [
+        {"index": frame["index"], **alarm} for frame in row["clean"] for alarm in frame["alarms"] if alarm["camera"]
+    ]
+
+
+CLEAN = (
+    Column("capture", "capture"),
+    Column("variant", "variant"),
+    Column("updates × cameras", "looks", "d"),
+    Column("false alarms", "alarms", "d"),
+    Column("good cameras left out", "excluded", "d"),
+    Column("frames rejected", "rejected", "d"),
+)
+PLANTED = (
+    Column("fault", "kind"),
+    Column("strength", "strength"),
+    Column("planted", "planted", "d"),
+    Column("found in the first frame", "first", "d"),
+    Column("by the third", "third", "d"),
+    Column("alarms of other cameras", "others", "d"),
+)
+
+
+def page(rows: Sequence[Row]) -> str:
+    """Returns the tables of clean variants and of planted faults."""
+    clean = [
+        {
+            "capture": row["capture"],
+            "variant": row["variant"],
+            "looks": row["cameras"] * len(row["clean"]),
+            "alarms": len(_camera_alarms(row)),
+            "excluded": sum(len(frame["excluded"]) for frame in row["clean"]),
+            "rejected": sum(frame["rejected"] for frame in row["clean"]),
+        }
+        for row in rows
+    ]
+    total: Row = {name: sum(line[name] for line in clean) for name in ("looks", "alarms", "excluded", "rejected")}
+    planted = []
+    for fault in FAULTS:
+        of = [f for row in rows for f in row["faults"] if (f["kind"], f["strength"]) == (fault.kind, fault.strength)]
+        planted.append(
+            {
+                "kind": fault.kind,
+                "strength": fault.strength,
+                "planted": len(of),
+                "first": sum(f["by"] == 1 for f in of),
+                "third": sum(f["by"] is not None for f in of),
+                "others": sum(len(f["others"]) for f in of),
+            }
+        )
+    return "\n\n".join((markdown([*clean, {"capture": "all", **total}], CLEAN), markdown(planted, PLANTED)))
