@@ -16,12 +16,12 @@ def devices(
     iterations: Annotated[int, typer.Option(min=1, help="Iterations per update.")] = 10,
     static: Annotated[int, typer.Option(min=1, help="Iterations of frame 0, which is fitted on the CPU.")] = 600,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the updates.")] = 0,
-    itself: Annotated[
-        bool, typer.Option("--itself", help="Compare the CPU with itself, from a frame 0 that differs in the last bit.")
+    apart: Annotated[
+        bool, typer.Option("--apart", help="Let each device continue from its own states, not from the CPU's.")
     ] = False,
     page: Page = None,
 ) -> None:
-    """Compares images, tracks and times of updates on the CPU and on a GPU, from the same frame 0.
+    """Compares images, tracks and times of updates on the CPU and on a GPU, from the same states.
 
     Without a GPU, the GPU kernels run on the CPU. The results are then comparable, but the times are not.
 
@@ -30,8 +30,8 @@ def devices(
     from studies.devices.devices import compare, table, use_cpu_without_gpu
     from studies.machine import in_words, machine
 
-    stands_for = "the CPU again, from a perturbed frame 0" if itself else use_cpu_without_gpu()
-    rows = [row for folder in captures for row in compare(folder, scale, frames, iterations, static, seed, itself)]
+    stands_for = use_cpu_without_gpu()
+    rows = [row for folder in captures for row in compare(folder, scale, frames, iterations, static, seed, apart)]
     text = f"{table(rows)}\n\n*GPU* is {stands_for}. {in_words(machine())}."
     print(text)
     write_page(page, text)

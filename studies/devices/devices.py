@@ -1,4 +1,4 @@
-"""Updates the same frames on both devices, from the same frame 0, and compares images, tracks and times.
+"""Updates the same frames on both devices, from the same states, and compares images, tracks and times.
 
 Without a GPU, the GPU kernels run on the CPU device of NVIDIA Warp. The results are then comparable, but the times are
 not.
@@ -7,19 +7,22 @@ not.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures import Capture
 from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault, warp_device
-from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics.evaluation import measure_pictures, measure_tracks
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
+from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
 from studies.captures import open_measured
 
 DEVICES: tuple[Device, ...] = ("cpu", "gpu")
@@ -37,8 +40,8 @@ class DeviceRow:
         gaussians: number of Gaussians present, keyed by device.
         distance: median distance between the positions of the same moving Gaussian on both devices, divided by the
             extent of the scene.
-        tracks: median track error over all frames, in percent of the extent, keyed by device; only present for the last
-            frame of a capture with ground truth.
+        tracks: median track error up to this frame, in percent of the extent, keyed by device; empty without ground
+            truth.
     """
 
     capture: str
@@ -70,9 +73,12 @@ def use_cpu_without_gpu() -> str:
 
 
 def compare(
-    folder: Path, scale: float, frames: int, iterations: int, static: int, seed: int = 0, itself: bool = False
+    folder: Path, scale: float, frames: int, iterations: int, static: int, seed: int = 0, apart: bool = False
 ) -> list[DeviceRow]:
     """Updates a capture on both devices and returns a row for each updated frame.
+
+    Every update starts from the state that the CPU has committed, so that the row shows the difference that one update
+    causes. Otherwise, rounding differences grow from frame to frame, because each update continues the last motion.
 
     Args:
         folder: capture folder.
@@ -81,45 +87,40 @@ def compare(
         iterations: iterations per update.
         static: iterations of frame 0, which is fitted on the CPU.
         seed: seed of the updates.
-        itself: whether to compare the CPU with itself instead, from a frame 0 whose positions differ in the last bit.
-            This measures the difference that rounding alone can cause.
+        apart: whether each device continues from its own states instead.
     """
     capture = open_measured(folder, image_scale=scale)
     changes = {
         "static": {"iterations": static, "seconds": None},
         "update": {"iterations": iterations, "stop_gain": 0, "seed": seed},
     }
-    scenes: dict[Device, Reconstruction] = {}
-    for device in DEVICES:
-        settings = preset("scas4d", {**changes, "device": "cpu" if itself else device})
-        first = scenes["cpu"].static if scenes else None
-        if first is not None and itself:
-            first = replace(first, gaussians=with_last_bits_changed(first.gaussians))
-        scenes[device] = Reconstruction.start(
-            capture.rig, capture.frame(0), settings, points=capture.points, static=first
+    settings: dict[Device, Settings] = {device: preset("scas4d", {**changes, "device": device}) for device in DEVICES}
+    rows, last = list[DeviceRow](), min(frames, capture.frame_count - 1)
+    with TemporaryDirectory() as place:
+        folders: dict[Device, Path] = {device: Path(place) / device for device in DEVICES}
+        scenes: dict[Device, Reconstruction] = {}
+        scenes["cpu"] = Reconstruction.start(
+            capture.rig, capture.frame(0), settings["cpu"], points=capture.points, history=History.open(folders["cpu"])
         )
-    extent = capture.extent or float(np.ptp(scenes["cpu"].history.gaussians(0).means, axis=0).max())
-    rows, last = [], min(frames, capture.frame_count - 1)
-    for index in range(1, last + 1):
-        reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
-        psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
-        row = DeviceRow(
-            capture.name, index,
-            psnr={device: value if value is not None else float("nan") for device, value in psnr.items()},
-            seconds={device: sum(report.seconds.values()) for device, report in reports.items()},
-            gaussians={device: report.gaussians for device, report in reports.items()},
-            distance=float(np.median(distances(scenes, index))) / extent,
-            tracks=track_errors(scenes, capture, index) if index == last else {},
-        )  # fmt: skip
-        rows.append(row)
+        extent = capture.extent or float(np.ptp(scenes["cpu"].history.gaussians(0).means, axis=0).max())
+        for index in range(1, last + 1):
+            if index == 1 or not apart:
+                shutil.rmtree(folders["gpu"], ignore_errors=True)
+                shutil.copytree(folders["cpu"], folders["gpu"])
+                history = History.open(folders["gpu"])
+                scenes["gpu"] = Reconstruction.resume(capture.rig, settings["gpu"], history)
+            reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
+            psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
+            row = DeviceRow(
+                capture.name, index,
+                psnr={device: value if value is not None else float("nan") for device, value in psnr.items()},
+                seconds={device: sum(report.seconds.values()) for device, report in reports.items()},
+                gaussians={device: report.gaussians for device, report in reports.items()},
+                distance=float(np.median(distances(scenes, index))) / extent,
+                tracks=track_errors(scenes, capture, index),
+            )  # fmt: skip
+            rows.append(row)
     return rows
-
-
-def with_last_bits_changed(gaussians: Gaussians) -> Gaussians:
-    """Returns the Gaussians with each coordinate moved to the next larger or smaller float32."""
-    up = np.random.default_rng(1).random(gaussians.means.shape) < 0.5
-    towards = np.where(up, np.float32(np.inf), np.float32(-np.inf))
-    return gaussians.replace(means=np.nextafter(gaussians.means, towards))
 
 
 def track_errors(scenes: dict[Device, Reconstruction], capture: Capture, last: int) -> dict[Device, float]:
@@ -151,17 +152,18 @@ def table(rows: Sequence[DeviceRow]) -> str:
     """Formats the rows of one or more captures as a Markdown table, with one line per capture."""
     lines = [
         "| capture | updates | PSNR on the CPU | GPU minus CPU: mean, worst frame | distance, % of the extent | "
-        "track error, % of the extent: CPU, GPU | seconds per update: CPU, GPU |",
+        "track error, % of the extent: GPU minus CPU, worst frame | seconds per update: CPU, GPU |",
         "|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(row.capture for row in rows):
         own = [row for row in rows if row.capture == name]
         differences = np.array([row.difference for row in own])
         seconds = [np.median([row.seconds[device] for row in own]) for device in DEVICES]
-        tracks = [f"{own[-1].tracks[device]:.3f}" if own[-1].tracks else "–" for device in DEVICES]
+        errors = [row.tracks for row in own if len(row.tracks) == len(DEVICES)]
+        tracks = f"{max((each['gpu'] - each['cpu'] for each in errors), key=abs):+.4f}" if errors else "–"
         lines.append(
             f"| {name} | {len(own)} | {np.mean([row.psnr['cpu'] for row in own]):.2f} dB | "
             f"{differences.mean():+.3f} dB, {differences[np.argmax(abs(differences))]:+.3f} dB | "
-            f"{100 * max(row.distance for row in own):.4f} | {', '.join(tracks)} | {seconds[0]:.2f}, {seconds[1]:.2f} |"
+            f"{100 * max(row.distance for row in own):.4f} | {tracks} | {seconds[0]:.2f}, {seconds[1]:.2f} |"
         )
     return "\n".join(lines)

@@ -16,6 +16,7 @@ pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install wa
 from box_scene import RIG, make_box, moved, take_frame
 from warp_cases import Uploads, Waits
 
+from scas4d_core.captures import open_capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.effects.presence import entering
@@ -33,6 +34,7 @@ from tests.helpers.effect_cases import visited_room
 from tests.helpers.effect_cases.visited_room import psnr as room_psnr
 from tests.helpers.effect_cases.visited_room import scene, seen, visitor
 
+SAMPLE = Path(__file__).parents[4] / "samples" / "robot"
 DEVICES: tuple[Device, ...] = ("cpu", "gpu")
 UPDATE = {"clusters": (2, 12), "iterations": 12, "stop_gain": 0, "skip_tolerance": 0}
 
@@ -93,13 +95,14 @@ def test_an_effect_that_is_on_gives_the_state_of_the_cpu_engine(effect: str) -> 
 
 
 def test_the_host_waits_at_most_12_times_in_a_whole_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    waits, states = Waits(monkeypatch), [make_box()]
-    scene = Reconstruction.start(RIG, frames()[0], settings("gpu"), static=first_fit(False))
-    for index in range(1, 6):
-        states.append(moved(states[-1]))
+    capture, waits = open_capture(SAMPLE, image_scale=0.25), Waits(monkeypatch)
+    effects = dict.fromkeys(("entering", "leaving", "uncovered"), "off")  # these look at images that fit badly
+    given = settings("gpu", scene={}, update={"iterations": 30}, static={"iterations": 60}, effects=effects)
+    scene = Reconstruction.start(capture.rig, capture.frame(0), given, points=capture.points)
+    for index in range(1, 5):
         waits.count = 0
-        assert scene.step(take_frame(index, index / 30, states[-1], RIG)).outcome == "updated"
-        if index >= 3:  # with colour steps, the times of cameras, and the report
+        assert scene.step(capture.frame(index)).outcome == "updated"
+        if index >= 3:  # with colour steps, the timing of cameras, and the report
             assert 8 < waits.count <= 12
 
 
