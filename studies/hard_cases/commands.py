@@ -87,7 +87,10 @@ def alarms(
     variant: Annotated[list[str] | None, typer.Option(help="Measure only this variant; default: all.")] = None,
     seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates. May be repeated.")] = None,
     frames: Annotated[int | None, typer.Option(min=2, help="Maximum number of frames per variant.")] = None,
-    faults: Annotated[bool, typer.Option(help="Also plant faults.")] = True,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Plant only faults whose name contains this text. May be repeated.")
+    ] = None,
+    clean: Annotated[bool, typer.Option("--clean", help="Plant no faults.")] = False,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -103,7 +106,7 @@ def alarms(
         variants=variant or (),
         seeds=seed or (0,),
         frames=frames,
-        faults=faults,
+        faults=() if clean else tuple(fault or ("",)),
         changes=changes or (),
         again=again,
         options=options,

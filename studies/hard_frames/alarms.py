@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import shift as interpolated
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
 from client.cli.scores import Column, Row, digest, kept_row, markdown
@@ -62,15 +61,16 @@ def _image(change: Callable[[Picture], Picture]) -> Plant:
 
 
 def _moved(share: float) -> Plant:
-    """Returns a camera turned sideways, so that its image and mask shift by a share of the image width."""
+    """Returns a camera turned sideways, so that its image and mask shift by a share of the image width.
+
+    The shift is a whole number of pixels, and at least one, because interpolation would also blur the image.
+    """
 
     def plant(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | None]:
         image, mask = _shown(capture, index, name)
-        pixels = share * image.shape[1]
-        return (
-            interpolated(image, (0, pixels, 0), order=1, mode="nearest"),
-            None if mask is None else interpolated(mask, (0, pixels), order=0, mode="nearest"),
-        )
+        pixels = max(1, round(share * image.shape[1]))
+        columns = np.maximum(np.arange(image.shape[1]) - pixels, 0)
+        return image[:, columns], None if mask is None else mask[:, columns]
 
     return plant
 
@@ -95,8 +95,8 @@ def _shown(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | 
 
 
 FAULTS = (
-    Fault("moved", "0.2% of the width", _moved(0.002)),
-    Fault("moved", "0.5%", _moved(0.005)),
+    Fault("moved", "0.4% of the width", _moved(0.004)),
+    Fault("moved", "0.8%", _moved(0.008)),
     Fault("moved", "2%", _moved(0.02)),
     Fault("out of focus", "0.3% of the width", _image(lambda picture: blurred(picture, 0.003 * picture.shape[1]))),
     Fault("dirty", "0.2", _image(lambda picture: dirty(picture, 0.2))),
@@ -124,7 +124,7 @@ def run(
     variants: Sequence[str] = (),
     seeds: Sequence[int] = (0,),
     frames: int | None = None,
-    faults: bool = True,
+    faults: Sequence[str] = ("",),
     changes: Sequence[str] = (),
     again: bool = False,
     options: CaptureOptions = DEFAULT_OPTIONS,
@@ -137,8 +137,8 @@ def run(
         out: study folder, which stores each finished variant; a second call resumes the study.
         variants: names from ``VARIANTS``; all if empty.
         seeds: seeds of the updates.
-        frames: maximum number of frames per variant.
-        faults: whether faults are planted, too.
+        frames: maximum number of frames without faults per variant; at least those before the faults are updated.
+        faults: parts of the names of faults to plant; none if empty.
         changes: changes to the settings, such as ``"scene.image_scale=0.5"``.
         again: whether to repeat finished variants.
         options: options for reading the captures.
@@ -152,7 +152,7 @@ def run(
         for of in variants or VARIANTS:
             for seed in seeds:
                 settings = settings_of("scas4d", None, seed, (*VARIANTS[of].changes, *changes))
-                key = digest(settings_record(settings, ()), of, frames, faults, core_version())
+                key = digest(settings_record(settings, ()), of, frames, tuple(faults), core_version())
                 path = out / "alarms" / f"{folder.resolve().name}-{of.replace(' ', '-')}-{key}.json"
                 measured = partial(_row, folder, of, settings, out, frames, faults, options)
                 row = kept_row(path, measured, again=again)
@@ -165,11 +165,17 @@ def run(
 
 
 def _row(
-    folder: Path, of: str, settings: Settings, out: Path, frames: int | None, faults: bool, options: CaptureOptions
+    folder: Path,
+    of: str,
+    settings: Settings,
+    out: Path,
+    frames: int | None,
+    faults: Sequence[str],
+    options: CaptureOptions,
 ) -> Row:
     capture = VARIANTS[of].made(open_measured(folder, options))
-    count = capture.frame_count if frames is None else min(frames, capture.frame_count)
     at, names = first_faulty(capture), capture.full_rig.names
+    count = capture.frame_count if frames is None else min(max(frames, at + 1), capture.frame_count)
     found, clean = [], []
     with TemporaryDirectory() as place:
         scene = started(capture, settings, out, Path(place) / "clean")
@@ -177,7 +183,9 @@ def _row(
             if index == at:
                 shutil.copytree(Path(place) / "clean", Path(place) / "before")
             clean.append(_clean(scene.step(capture.frame(index))))
-        for number, fault in enumerate(FAULTS if faults and at + FRAMES <= capture.frame_count else ()):
+        for number, fault in enumerate(FAULTS if at + FRAMES <= capture.frame_count else ()):
+            if not any(part in fault.kind for part in faults):
+                continue
             branch = Path(place) / "fault"
             shutil.copytree(Path(place) / "before", branch)
             name = names[(number * 5 + 1) % len(names)]
