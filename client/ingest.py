@@ -17,6 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from client.batches import RETRIED_STATUSES, SendingBatch
 from client.calls import Call, NewFrame
+from client.calls.frames import OnRefusal
 from client.errors import ServiceError, error_of
 from client.retries import Retries
 from client.sdk import Client
@@ -34,6 +35,7 @@ class IngestSocket:
     Args:
         client: client that provides the address, token, timeouts and `on_retry` callback.
         scene: scene id.
+        on_refusal: what a frame does to the rest of its batch if its content is refused; see `calls.put_frames`.
 
     >>> n = client.scene(open_scene).next_frame
     >>> with IngestSocket(client, open_scene) as socket:
@@ -43,10 +45,10 @@ class IngestSocket:
     (True, [['c1'], []])
     """
 
-    def __init__(self, client: Client, scene: str) -> None:
+    def __init__(self, client: Client, scene: str, on_refusal: OnRefusal = "skip") -> None:
         self._client = client
         base = "ws" + client.url.removeprefix("http")
-        self._address = f"{base}/v1/scenes/{quote(scene, safe='')}/ingest"
+        self._address = f"{base}/v1/scenes/{quote(scene, safe='')}/ingest?on_refusal={on_refusal}"
         self._connection: ClientConnection | None = None
         self._stack = ExitStack()
 

@@ -18,7 +18,7 @@ import httpx
 from client import calls
 from client.batches import SendingBatch
 from client.calls import Call, NewFrame
-from client.calls.frames import Numbering
+from client.calls.frames import Numbering, OnRefusal
 from client.errors import ServiceError, unexpected_response
 from client.retries import BUSY_S, OUTAGE_S, OnRetry, Retries
 from client.wire import FINISHED, FrameReportModel, IngestAnswer, SceneState, SceneStatus
@@ -209,7 +209,9 @@ class Client(_ClientBase):
     replay = _sends(calls.replay)
     end_replay = _sends(calls.end_replay)
 
-    def put_frames(self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given") -> list[IngestAnswer]:
+    def put_frames(
+        self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given", on_refusal: OnRefusal = "skip"
+    ) -> list[IngestAnswer]:
         """Sends a batch of frames and returns one answer per frame, in order.
 
         Frames for which the queue has no room are sent again. The other arguments and the errors are those of
@@ -222,7 +224,7 @@ class Client(_ClientBase):
         """
         sending = SendingBatch(frames)
         while sending.left:
-            batch = self.send(calls.put_frames(id, sending.left, numbering))
+            batch = self.send(calls.put_frames(id, sending.left, numbering, on_refusal))
             time.sleep(sending.record(batch.answers))
         return sending.answers
 
@@ -367,7 +369,7 @@ class AsyncClient(_ClientBase):
     end_replay = _sends_async(calls.end_replay)
 
     async def put_frames(
-        self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given"
+        self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given", on_refusal: OnRefusal = "skip"
     ) -> list[IngestAnswer]:
         """Sends a batch of frames and returns one answer per frame, in order.
 
@@ -381,7 +383,7 @@ class AsyncClient(_ClientBase):
         """
         sending = SendingBatch(frames)
         while sending.left:
-            batch = await self.send(calls.put_frames(id, sending.left, numbering))
+            batch = await self.send(calls.put_frames(id, sending.left, numbering, on_refusal))
             await asyncio.sleep(sending.record(batch.answers))
         return sending.answers
 

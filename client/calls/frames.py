@@ -20,6 +20,7 @@ from client.wire import (
 from client.wire.frames import FrameList
 
 Numbering = Literal["given", "next"]
+OnRefusal = Literal["skip", "stop"]
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,14 @@ def put_frame(
     return Call("PUT", path(id, "frames", index), json_reader(FrameReceipt), arguments=arguments)
 
 
-def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "given") -> Call[FrameBatch]:
+def put_frames(
+    id: str, frames: Sequence[NewFrame], numbering: Numbering = "given", on_refusal: OnRefusal = "skip"
+) -> Call[FrameBatch]:
     """Sends a batch of frames in one request and returns one answer per frame, in order.
 
     A frame that is refused because of its content does not stop the batch; its answer contains the problem. With
     `numbering="given"`, a frame refused with 413 or 422 is declared missing if the batch continues with the next index.
+    With `on_refusal="stop"`, it ends the batch instead, and can be sent again without the images that were refused.
 
     Frames for which the queue had no room are sent again automatically. A batch should therefore be smaller than the
     scene's `ingest.queue_frames`; otherwise, its last frames are transferred several times.
@@ -87,6 +91,8 @@ def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "give
         frames: the frames, in order.
         numbering: "given" if the frames have their own indices; "next" to assign the next free indices, which requires
             a time for each frame.
+        on_refusal: "skip" to continue after a frame whose content is refused; "stop" to end the batch there, so that
+            all further frames get the same answer.
 
     Raises:
         Busy: the queue has no room for the first frame.
@@ -103,6 +109,7 @@ def put_frames(id: str, frames: Sequence[NewFrame], numbering: Numbering = "give
     <FrameState.MISSING: 'missing'>
     """
     arguments = {**_framed(chunk for frame in frames for chunk in frame.chunks()), "params": {"numbering": numbering}}
+    arguments["params"] |= {} if on_refusal == "skip" else {"on_refusal": on_refusal}
     return Call("POST", path(id, "frames"), json_reader(FrameBatch), arguments=arguments)
 
 

@@ -31,7 +31,7 @@ class Requests:
 
     def batch(self, frames: list[NewFrame]) -> list[IngestAnswer]:
         """Sends several frames in one request."""
-        return self._client.put_frames(self._scene, frames)
+        return self._client.put_frames(self._scene, frames, on_refusal="stop")
 
     def camera(self, index: int, name: str, files: EncodedFrame) -> None:
         """Sends one camera's image and mask."""
@@ -70,7 +70,7 @@ class Sockets:
     def _of(self, sender: str) -> IngestSocket:
         # Each camera has at most one image in flight, so no two threads call this with the same name.
         if sender not in self._sockets:
-            self._sockets[sender] = IngestSocket(self._client, self._scene)
+            self._sockets[sender] = IngestSocket(self._client, self._scene, on_refusal="stop")
         return self._sockets[sender]
 
 
@@ -155,14 +155,20 @@ class Sender:
         self._send_frames(frames)
 
     def _send_frames(self, frames: list[NewFrame]) -> None:
-        if not frames:
-            return
-        for frame, answer in zip(frames, self._way.batch(frames), strict=True):
-            if answer.missing and answer.problem is not None:
-                self._delivery.lost.append(frame.index)
-                self._on_message(f"frame {frame.index}: refused ({answer.problem.detail}), declared missing")
-            elif answer.problem is not None:
-                raise error_of_problem(answer.problem)
+        """Sends frames in batches. A frame that is refused is sent alone, without the images that are refused."""
+        while frames:
+            answers = self._way.batch(frames)
+            refused = next((place for place, answer in enumerate(answers) if answer.problem is not None), None)
+            if refused is None:
+                return
+            problem = answers[refused].problem
+            assert problem is not None
+            error = error_of_problem(problem)
+            if not isinstance(error, InvalidRequest | TooLarge):
+                raise error
+            index = frames[refused].index
+            self._send_files(index, self._sequence.files(index))
+            frames = frames[refused + 1 :]
 
     def _await(self, index: int) -> float:
         """Waits until the frame is due and returns its due time."""

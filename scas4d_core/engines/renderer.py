@@ -176,13 +176,14 @@ class Renderer(Protocol):
     def step_colours(
         self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
-        """Returns a state whose colours are corrected by the mean residual, weighted by blending weights.
+        """Returns a state whose colours are corrected step by step by the mean residual of some views.
 
-        The residual of a pixel is the training image minus the rendering, before exposure.
+        Each step renders the colours of the step before. The mean is weighted by blending weights. The residual of a
+        pixel is the training image minus the rendering, before exposure.
 
         Args:
             state: Gaussians to render.
-            subsets: training views over which the mean of each step is taken, in the order of the steps.
+            subsets: training views of each step, in order.
             learnt: [N] mask that is 1 for Gaussians whose colours are corrected, and 0 for all others.
             most: magnitude to which residuals are clipped; RGB values are in [0, 1].
         """
@@ -208,8 +209,11 @@ class Renderer(Protocol):
 
         Args:
             state: Gaussians to render.
-            cameras: cameras in kernel format.
-            every: step between the rows and columns to count. With 1, the result is [H, W] for each camera.
+            cameras: one or more cameras in kernel format.
+            every: step between the rows and columns to count.
+
+        Returns:
+            One [⌈H / every⌉, ⌈W / every⌉] array for each camera.
         """
 
 

@@ -2,8 +2,9 @@
 
 A frame that is refused because of its content (for example, a damaged image) does not stop the batch. If frames carry
 their own indices, the refused frame is declared missing as soon as a later frame of the batch arrives, because frames
-must arrive without gaps. A refusal that applies to every frame, such as a full queue, stops the batch: later frames get
-the same answer without being read.
+must arrive without gaps. With ``OnRefusal.STOP``, it stops the batch instead, so that its sender can send it again
+without the damaged image. A refusal that applies to every frame, such as a full queue, always stops the batch. Later
+frames then get the same answer without being read.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ MOST_FORM_FRAMES = 100
 """Maximum number of frames in a multipart form, which is parsed completely before its first frame is accepted."""
 STOPPING = (429, 503, 507)
 """Status codes of refusals that apply to every frame: no room in the queue, on the node or on the disk."""
+REFUSED_CONTENT = (413, 422)
+"""Status codes of frames that are refused because of their content."""
 LONGEST_REASON = 500
 """Maximum length of the reason for a missing frame."""
 
@@ -39,22 +42,31 @@ class Numbering(StrEnum):
     NEXT = "next"
 
 
+class OnRefusal(StrEnum):
+    """What a frame that is refused because of its content does to the rest of its batch."""
+
+    SKIP = "skip"
+    STOP = "stop"
+
+
 class Batch:
     """Acceptance of the frames of one batch, in order.
 
     Args:
         frames: the scene's frames.
         numbering: how the frames are numbered.
+        on_refusal: whether a frame that is refused because of its content stops the batch.
 
     Attributes:
         answers: answer to each frame so far.
         stopped: refusal that applies to all further frames, or None.
     """
 
-    def __init__(self, frames: OpenFrames, numbering: Numbering) -> None:
+    def __init__(self, frames: OpenFrames, numbering: Numbering, on_refusal: OnRefusal) -> None:
         self._frames = frames
         self._ingest = frames.ingest
         self._numbering = numbering
+        self._stopping = STOPPING if on_refusal is OnRefusal.SKIP else (*STOPPING, *REFUSED_CONTENT)
         self.answers: list[IngestAnswer] = []
         self.stopped: Problem | None = None
 
@@ -129,15 +141,15 @@ class Batch:
             self.answers.append(IngestAnswer(index=head.index, status=202, receipt=receipt))
 
     def refuse(self, index: int | None, problem: Problem) -> None:
-        """Appends the answer for a refused frame; stops the batch if the refusal applies to every frame."""
-        if problem.status_code in STOPPING:
+        """Appends the answer for a refused frame; stops the batch if the refusal does so."""
+        if problem.status_code in self._stopping:
             self.stopped = problem
         self.answers.append(refusal(index, problem))
 
     async def _skip_refused(self, index: int) -> None:
         """Declares the previous frame missing if it was refused because of its content and blocks frame `index`."""
         before = self.answers[-1] if self.answers else None
-        if before is None or before.problem is None or before.status not in (413, 422):
+        if before is None or before.problem is None or before.status not in REFUSED_CONTENT:
             return
         if before.index == index - 1 == self._ingest.ledger.next_frame:
             self._ingest.refuse_if_stopped()  # a scene that cannot start refuses every frame
@@ -166,13 +178,15 @@ def refusal(index: int | None, problem: Problem) -> IngestAnswer:
     return IngestAnswer(index=index, status=problem.status_code, retry_after=wait, problem=problem.document)
 
 
-async def receive_batch(frames: OpenFrames, numbering: Numbering, body: AsyncIterator[bytes]) -> Batch:
+async def receive_batch(
+    frames: OpenFrames, numbering: Numbering, on_refusal: OnRefusal, body: AsyncIterator[bytes]
+) -> Batch:
     """Receives a batch of S4DF frames, one after another without separators.
 
     Raises:
         Problem: 422 if the body is empty.
     """
-    reader, batch = BodyReader(body), Batch(frames, numbering)
+    reader, batch = BodyReader(body), Batch(frames, numbering, on_refusal)
     try:
         await batch.receive_frames(reader)
     finally:
@@ -180,13 +194,15 @@ async def receive_batch(frames: OpenFrames, numbering: Numbering, body: AsyncIte
     return _with_frames(batch)
 
 
-async def receive_form_batch(frames: OpenFrames, numbering: Numbering, request: Request) -> Batch:
+async def receive_form_batch(
+    frames: OpenFrames, numbering: Numbering, on_refusal: OnRefusal, request: Request
+) -> Batch:
     """Receives a batch of frames as multipart/form-data.
 
     Raises:
         Problem: 422 if the form is empty or has a field without a frame index.
     """
-    batch = Batch(frames, numbering)
+    batch = Batch(frames, numbering, on_refusal)
     await batch.receive_form(request)
     return _with_frames(batch)
 

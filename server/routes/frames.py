@@ -21,7 +21,7 @@ from client.wire import (
     MissingRequest,
 )
 from server.http.immutable import immutable_response
-from server.ingest.batch import Batch, Numbering, receive_batch, receive_form_batch
+from server.ingest.batch import REFUSED_CONTENT, Batch, Numbering, OnRefusal, receive_batch, receive_form_batch
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
 from server.ingest.receive import receive_frame
 from server.problems import Problem
@@ -134,21 +134,26 @@ async def post(
         Numbering,
         Query(description="given: the frames have their own indices; next: they get the next ones, and need a time."),
     ] = Numbering.GIVEN,
+    on_refusal: Annotated[
+        OnRefusal,
+        Query(description="skip: a frame with refused content does not stop the batch; stop: it ends the batch."),
+    ] = OnRefusal.SKIP,
 ) -> FrameBatch:
     """Accepts a batch of one or more frames and returns one answer per frame, in order.
 
     The status is 202 if all frames were accepted and 207 otherwise. A frame that is refused because of its content does
     not stop the batch. Its answer contains the problem; if the batch continues with the next index, the refused frame
-    is declared missing. If no frame can be accepted at present, the response is 429, 503 or 507. If that happens after
-    the first frames, all further frames get this answer. Sending a batch again returns the same answers for frames
-    that were accepted before.
+    is declared missing. With `on_refusal=stop`, it ends the batch instead, so that it can be corrected and sent again;
+    all further frames get its answer. If no frame can be accepted at present, the response is 429, 503 or 507. If that
+    happens after the first frames, all further frames get this answer. Sending a batch again returns the same answers
+    for frames that were accepted before.
     """
     kind = _media_type(request)
     try:
         if kind == FRAME_MEDIA_TYPE:
-            batch = await receive_batch(scene.open_frames, numbering, _body(request))
+            batch = await receive_batch(scene.open_frames, numbering, on_refusal, _body(request))
         elif kind == "multipart/form-data":
-            batch = await receive_form_batch(scene.open_frames, numbering, request)
+            batch = await receive_form_batch(scene.open_frames, numbering, on_refusal, request)
         else:
             raise _media_type_problem(request)
     except ClientDisconnect:
@@ -158,8 +163,9 @@ async def post(
 
 def _answer(batch: Batch, response: Response) -> FrameBatch:
     statuses = {answer.status for answer in batch.answers}
-    if batch.stopped is not None and statuses == {batch.stopped.status_code}:
-        raise batch.stopped
+    stopped = batch.stopped
+    if stopped is not None and statuses == {stopped.status_code} and stopped.status_code not in REFUSED_CONTENT:
+        raise stopped
     response.status_code = 202 if statuses == {202} else 207
     return FrameBatch(answers=batch.answers)
 

@@ -21,7 +21,7 @@ from client.wire.framing import PREFIX
 from client.wire.stream import SCENE_GONE, SCENE_RESTARTS
 from server import problems
 from server.connections.websocket import limit_messages
-from server.ingest.batch import Numbering, receive_batch, refusal
+from server.ingest.batch import Numbering, OnRefusal, receive_batch, refusal
 from server.ingest.camera_files import receive_camera
 from server.ingest.pictures import largest_frame
 from server.ingest.receive import files_size, framing_problem, in_one_piece, receive_frame
@@ -44,11 +44,14 @@ SMALL_BATCH = 64_000_000
 
 
 @router.websocket("/{id}/ingest")
-async def ingest(socket: WebSocket, id: str, numbering: Numbering = Numbering.GIVEN) -> None:
+async def ingest(
+    socket: WebSocket, id: str, numbering: Numbering = Numbering.GIVEN, on_refusal: OnRefusal = OnRefusal.SKIP
+) -> None:
     """Accepts binary messages in the `client.wire.framing` format and answers each frame with JSON text.
 
     A message contains one frame, one camera's files of a frame (`single_camera`, as PUT …/cameras/{c}), or a batch of
-    frames (as POST …/frames). `numbering=next` in the URL gives whole frames the next indices.
+    frames (as POST …/frames). `numbering=next` in the URL gives whole frames the next indices, and
+    `on_refusal=stop` ends a batch at a frame whose content is refused.
 
     The sender may pipeline messages: one is received while the previous one is synced to disk. Each frame is answered
     with an `IngestAnswer`, in order. A rejected frame is also answered, and the socket stays open. The handshake is
@@ -68,12 +71,12 @@ async def ingest(socket: WebSocket, id: str, numbering: Numbering = Numbering.GI
         limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest))
         try:
             await socket.accept()
-            await _serve(socket, scenes, id, numbering)
+            await _serve(socket, scenes, id, numbering, on_refusal)
         finally:
             scene.ingest.remove_socket()
 
 
-async def _serve(socket: WebSocket, scenes: Scenes, id: str, numbering: Numbering) -> None:
+async def _serve(socket: WebSocket, scenes: Scenes, id: str, numbering: Numbering, on_refusal: OnRefusal) -> None:
     """Processes messages until the sender closes the socket or sends text, or the scene becomes unavailable."""
     taking: asyncio.Queue[asyncio.Task[list[IngestAnswer]]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
@@ -102,7 +105,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str, numbering: Numberin
                 await taking.join()  # the outcome of other messages and of whole frames depends on each other
             whole_before = whole
             # Tasks start in the order of the messages, so frames are accepted in that order.
-            await taking.put(asyncio.create_task(_take(scene, numbering, head, data)))
+            await taking.put(asyncio.create_task(_take(scene, numbering, on_refusal, head, data)))
     except WebSocketDisconnect:
         return
     finally:
@@ -134,7 +137,9 @@ def _is_one_frame(head: FrameHead, data: bytes) -> bool:
     return not head.single_camera and len(data) <= PREFIX.size + head_length(data) + files_size(head)
 
 
-async def _take(scene: Scene, numbering: Numbering, head: FrameHead | Problem, data: bytes) -> list[IngestAnswer]:
+async def _take(
+    scene: Scene, numbering: Numbering, on_refusal: OnRefusal, head: FrameHead | Problem, data: bytes
+) -> list[IngestAnswer]:
     if isinstance(head, Problem):
         return [refusal(None, head)]
     body, size = in_one_piece(data), len(data)
@@ -145,7 +150,7 @@ async def _take(scene: Scene, numbering: Numbering, head: FrameHead | Problem, d
         elif numbering is Numbering.GIVEN and _is_one_frame(head, data):
             receipt = await receive_frame(scene.ingest, None, body, size)
         else:
-            return (await receive_batch(scene.open_frames, numbering, body)).answers
+            return (await receive_batch(scene.open_frames, numbering, on_refusal, body)).answers
         return [IngestAnswer(index=head.index, status=202, receipt=receipt)]
     except Problem as problem:
         return [refusal(head.index, problem)]

@@ -108,7 +108,9 @@ def compare(
                 shutil.rmtree(folders["gpu"], ignore_errors=True)
                 shutil.copytree(folders["cpu"], folders["gpu"])
                 history = History.open(folders["gpu"])
-                scenes["gpu"] = Reconstruction.resume(capture.rig, settings["gpu"], history)
+                scenes["gpu"] = again = Reconstruction.resume(capture.rig, settings["gpu"], history)
+                assert again.resumed is not None
+                assert not again.resumed.cold
             reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
             psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
             row = DeviceRow(

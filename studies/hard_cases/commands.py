@@ -84,11 +84,23 @@ def alarms(
     out: Annotated[
         Path, typer.Option(help="Study folder, for rows and frames 0. A second run continues the study.")
     ] = Path("out/alarms"),
-    variant: Annotated[list[str] | None, typer.Option(help="Measure only this variant; default: all.")] = None,
+    variant: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Measure only this variant: as it is, backwards, every second, half the cameras, half the "
+            "pixels or later. May be repeated; default: all."
+        ),
+    ] = None,
     seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates. May be repeated.")] = None,
-    frames: Annotated[int | None, typer.Option(min=2, help="Maximum number of frames per variant.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=2, help="Maximum number of frames without faults, at least those before them.")
+    ] = None,
     fault: Annotated[
-        list[str] | None, typer.Option(help="Plant only faults whose name contains this text. May be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="Plant only this fault: moved, out of focus, dirty, exposure, white balance, noise, late, "
+            "frozen or swapped. May be repeated; default: all."
+        ),
     ] = None,
     clean: Annotated[bool, typer.Option("--clean", help="Plant no faults.")] = False,
     again: Again = False,
@@ -96,21 +108,26 @@ def alarms(
 ) -> None:
     """Counts false alarms on clean variants of captures, and planted faults of single cameras that are found.
 
+    A fault lasts three frames. It counts as found if its camera raises an alarm. See docs/stability.md#alarms.
+
     Example: scripts/bench alarms captures/robot captures/visit --variant backwards --set scene.image_scale=0.5
     """
     from studies.hard_frames.alarms import run
 
-    run(
-        captures,
-        out,
-        variants=variant or (),
-        seeds=seed or (0,),
-        frames=frames,
-        faults=() if clean else tuple(fault or ("",)),
-        changes=changes or (),
-        again=again,
-        options=options,
-    )
+    try:
+        run(
+            captures,
+            out,
+            variants=variant or (),
+            seeds=seed or (0,),
+            frames=frames,
+            faults=() if clean else tuple(fault or ("",)),
+            changes=changes or (),
+            again=again,
+            options=options,
+        )
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
 
 
 def _frame_studies(

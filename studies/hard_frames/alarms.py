@@ -36,8 +36,8 @@ from studies.variants.variants import VARIANTS
 AFTER = 5
 """Number of updates before the faulty frames, at most: half of the frames of a short variant."""
 
-Plant = Callable[[Capture, int, str], "tuple[Picture, Picture | None]"]
-"""Function that returns the faulty image and mask of a camera in a frame of a capture."""
+Plant = Callable[[Capture, int, str], tuple[Picture, Picture | None]]
+"""Function that returns the faulty image of a camera in a frame of a capture, and the mask, or None without masks."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,16 @@ class Fault:
 
 def _image(change: Callable[[Picture], Picture]) -> Plant:
     """Returns a fault that changes only the image."""
-    return lambda capture, index, name: (change(_shown(capture, index, name)[0]), _shown(capture, index, name)[1])
+
+    def plant(capture: Capture, index: int, name: str) -> tuple[Picture, Picture | None]:
+        image, mask = _shown(capture, index, name)
+        return change(image), mask
+
+    return plant
 
 
 def _moved(share: float) -> Plant:
-    """Returns a camera turned sideways, so that its image and mask shift by a share of the image width.
+    """Returns a fault: a camera turned sideways, so that its image and mask shift by a share of the image width.
 
     The shift is a whole number of pixels, and at least one, because interpolation would also blur the image.
     """
@@ -76,7 +81,7 @@ def _moved(share: float) -> Plant:
 
 
 def _late(frames: int) -> Plant:
-    """Returns a camera whose images arrive ``frames`` frames late."""
+    """Returns a fault: a camera whose images arrive ``frames`` frames late."""
     return lambda capture, index, name: _shown(capture, index - frames, name)
 
 
@@ -146,13 +151,24 @@ def run(
 
     Returns:
         One row per capture, variant and seed.
+
+    Raises:
+        ValueError: a variant or fault is unknown.
     """
+    for name in variants:
+        if name not in VARIANTS:
+            raise ValueError(f"unknown variant {name!r}; choose from {', '.join(VARIANTS)}")
+    for part in faults:
+        if not any(part in fault.kind for fault in FAULTS):
+            raise ValueError(
+                f"no fault contains {part!r}; choose from {', '.join({fault.kind: 0 for fault in FAULTS})}"
+            )
     rows = []
     for folder in captures:
         for of in variants or VARIANTS:
             for seed in seeds:
                 settings = settings_of("scas4d", None, seed, (*VARIANTS[of].changes, *changes))
-                key = digest(settings_record(settings, ()), of, frames, tuple(faults), core_version())
+                key = digest(settings_record(settings, ()), of, frames, tuple(faults), options.changed, core_version())
                 path = out / "alarms" / f"{folder.resolve().name}-{of.replace(' ', '-')}-{key}.json"
                 measured = partial(_row, folder, of, settings, out, frames, faults, options)
                 row = kept_row(path, measured, again=again)
@@ -188,8 +204,10 @@ def _row(
                 continue
             branch = Path(place) / "fault"
             shutil.copytree(Path(place) / "before", branch)
-            name = names[(number * 5 + 1) % len(names)]
+            name = names[(number + 1) % len(names)]
             scene = Reconstruction.resume(capture.full_rig, settings, History.open(branch))
+            assert scene.resumed is not None
+            assert not scene.resumed.cold
             reports = [scene.step(_with(capture, at + n, name, fault)) for n in range(FRAMES)]
             found.append({"kind": fault.kind, "strength": fault.strength, "camera": name, **_found(reports, name)})
             shutil.rmtree(branch)
@@ -200,7 +218,9 @@ def _row(
 def _with(capture: Capture, index: int, name: str, fault: Fault) -> Frame:
     frame = capture.frame(index)
     image, mask = fault.plant(capture, index, name)
-    masks = dict(frame.masks) if mask is None else {**frame.masks, name: mask}
+    masks = {other: known for other, known in frame.masks.items() if other != name}
+    if mask is not None:
+        masks[name] = mask
     return Frame(frame.index, frame.time, {**frame.images, name: image}, masks)
 
 
@@ -241,7 +261,7 @@ def _line(row: Row) -> str:
     ]
     lines += [f"  missed: {fault['kind']} {fault['strength']} ({fault['camera']})" for fault in missed]
     lines += [
-        f"  beside {fault['kind']} {fault['strength']} ({fault['camera']}): {other}"
+        f"  other alarm during {fault['kind']} {fault['strength']} ({fault['camera']}): {other}"
         for fault in row["faults"]
         for other in fault["others"]
     ]
@@ -259,7 +279,7 @@ CLEAN = (
     Column("capture", "capture"),
     Column("variant", "variant"),
     Column("updates × cameras", "looks", "d"),
-    Column("false alarms", "alarms", "d"),
+    Column("false alarms of cameras", "alarms", "d"),
     Column("good cameras left out", "excluded", "d"),
     Column("frames rejected", "rejected", "d"),
 )
@@ -269,7 +289,7 @@ PLANTED = (
     Column("planted", "planted", "d"),
     Column("found in the first frame", "first", "d"),
     Column("by the third", "third", "d"),
-    Column("alarms of other cameras", "others", "d"),
+    Column("other alarms", "others", "d"),
 )
 
 

@@ -112,13 +112,34 @@ def test_a_frame_below_the_minimum_is_left_out_and_the_next_one_starts(client, f
     assert "1 frame left out, because fewer than 2 of 2 cameras had a usable image" in delivery.left_out.summary
 
 
+@pytest.mark.parametrize("way", [*WAYS, {"batch": 3, "websocket": True}])
+@pytest.mark.parametrize("frame", [1, 2, 3])
+def test_a_frame_that_only_the_service_can_refuse_goes_on_without_a_camera(client, folder, monkeypatch, way, frame):
+    encoded = Capture.encoded_image
+
+    def truncated(self, index, camera):
+        file = encoded(self, index, camera)
+        return file[:-9] if (index, camera) == (frame, "1") else file
+
+    monkeypatch.setattr(Capture, "encoded_image", truncated)
+    said = []
+    delivery = push(open_source(folder), client, on_message=said.append, **way)
+    reports = [client.frame(delivery.scene, index) for index in range(4)]
+    assert [(report.state, report.used_cameras) for report in reports] == [
+        ("committed", ["0"] if index == frame else ["0", "1"]) for index in range(4)
+    ]
+    assert (delivery.left_out.images, delivery.lost) == (1, [])
+    assert said[-1].startswith(f"frame {frame}, without camera 1: refused by the service: ")
+
+
 def test_the_first_frame_of_a_scene_is_sent_on_its_own(client, folder, monkeypatch):
     spoil(folder, 0, 0)
     batches, put_frames = [], Client.put_frames
 
-    def record(self, scene, frames):
+    def record(self, scene, frames, on_refusal):
         batches.append([frame.index for frame in frames])
-        return put_frames(self, scene, frames)
+        assert on_refusal == "stop"
+        return put_frames(self, scene, frames, on_refusal=on_refusal)
 
     monkeypatch.setattr("client.rig.sender.Client.put_frames", record)
     push(open_source(folder), client, ingest=IngestSettings(minimum_cameras=2), batch=3)

@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 from numpy.typing import NDArray
 
-MOST = 32
-"""Maximum number of page-locked buffers of one instance. A frame downloads about 20 different arrays."""
+MOST_BYTES = 2**28
+"""Size in bytes up to which page-locked buffers are kept, besides those of the current download."""
 
 
 class Downloads:
@@ -29,21 +29,25 @@ class Downloads:
     def read(self, *arrays: wp.array) -> list[NDArray[Any]]:
         """Waits for all work enqueued so far, and returns host copies of the arrays."""
         self.waits += 1
-        if not self._device.is_cuda:
-            return [array.numpy().copy() for array in arrays]
         buffers = [self._buffer(place, array) for place, array in enumerate(arrays)]
         for buffer, array in zip(buffers, arrays, strict=True):
             wp.copy(buffer, array)
         wp.synchronize_stream(self._device)
-        return [buffer.numpy().copy() for buffer in buffers]
+        copies = [buffer.numpy().copy() for buffer in buffers]
+        while self.kept_bytes > MOST_BYTES:
+            self._buffers.popitem(last=False)
+        return copies
+
+    @property
+    def kept_bytes(self) -> int:
+        """Size of all kept buffers in bytes."""
+        return sum(buffer.capacity for buffer in self._buffers.values())
 
     def _buffer(self, place: int, array: wp.array) -> wp.array:
         """Returns the buffer for an array at a place among the arguments of ``read``."""
         key = place, array.shape, array.dtype
         buffer = self._buffers.pop(key, None)
         if buffer is None:
-            buffer = wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=True)
+            buffer = wp.empty(array.shape, dtype=array.dtype, device="cpu", pinned=self._device.is_cuda)
         self._buffers[key] = buffer
-        while len(self._buffers) > MOST:
-            self._buffers.popitem(last=False)
         return buffer

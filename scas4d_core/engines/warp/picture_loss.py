@@ -566,7 +566,7 @@ class PictureLoss:
         return replaced
 
     def _wait_for_upload(self) -> None:
-        """Waits for the last upload of images, whose page-locked buffers are about to be overwritten."""
+        """Waits for the last upload of images, if any, because its page-locked buffers are about to be overwritten."""
         if self._sent is not None:
             wp.synchronize_event(self._sent)
 

@@ -181,7 +181,12 @@ class PicturePass:
 
 
 def thinned(kept: NDArray[np.float32], view: TrainingView) -> Thinned:
-    """Returns the rendering of a view that was kept in a slot, [5, rows, columns] of ``PicturePass.kept``."""
+    """Returns the kept rendering of a view.
+
+    Args:
+        kept: [5, rows, columns] slot of ``PicturePass.kept``, which may be larger than the rendering.
+        view: the rendered view.
+    """
     rows, columns = kept_size(view)
     return Thinned(kept_step(view.camera.height, view.camera.width), kept[:, :rows, :columns].copy())
 

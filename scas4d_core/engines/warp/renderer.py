@@ -223,7 +223,7 @@ class WarpRenderer:
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
         self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
-        self._log = self._records = wp.zeros(0, dtype=wp.int32, device=device)
+        self._log, self._records = self._make_log(1)
         self._near: tuple[Neighbourhoods, wp.array] | tuple[None, None] = None, None
 
     def render(
@@ -315,7 +315,9 @@ class WarpRenderer:
     def step_colours(
         self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
     ) -> Gaussians:
-        """See ``Renderer.step_colours``. The host waits only once."""
+        """See ``Renderer.step_colours``. The host waits only once, if an engine has loaded the images."""
+        if not subsets:
+            return state
         chosen = self._copies.of(learnt, wp.uint8)
         stepped = wp.empty_like(features_on(self._copies, state))
         views = [view for subset in subsets for view in subset]
@@ -347,7 +349,7 @@ class WarpRenderer:
         target = [loss.cameras, self._first, loss.exposures, loss.targets]
         inputs = [*target, rasterizer.planes, most, rasterizer.g_planes]
         wp.launch(weigh_residuals, rasterizer.g_planes.shape, inputs, device=self.device)
-        rasterizer.carry_back(self._camera(view.camera), self._first, features)
+        rasterizer.carry_back(loss.cameras, self._first, features)
         wp.launch(add_sums, len(state), [rasterizer.records, sums], device=self.device)
 
     def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
@@ -425,6 +427,11 @@ class WarpRenderer:
             return uploaded, None
         return uploaded, np.asarray((np.abs(features) <= FEATURE_CEILING).all(axis=1))
 
+    def _make_log(self, renderings: int) -> tuple[wp.array, wp.array]:
+        """Returns a log with one row per rendering, [renderings, COLUMNS], and the indices of its rows."""
+        log = wp.zeros((renderings, COLUMNS), dtype=wp.float32, device=self.device)
+        return log, wp.array(np.arange(renderings), dtype=wp.int32, device=self.device)
+
     def _make_room(self, state: Gaussians, columns: int, rows: int) -> None:
         """Makes a rasterizer for the state and image size, unless the last one holds them."""
         if len(state) != self._rasterizer.count or not self._rasterizer.holds(columns, rows):
@@ -437,12 +444,15 @@ class WarpRenderer:
         If tile lists were too small, they are enlarged, and ``draw`` is called again.
 
         Args:
-            draw: function that enqueues the work, and logs each rendering in a row of its own.
+            draw: function that enqueues the work, and logs each rendering in a row of its own. It must reset everything
+                that it accumulates, and must not need a larger rasterizer after its first rendering (``_make_room``).
             renderings: number of rows of the log.
+
+        Returns:
+            The log [renderings, COLUMNS], followed by a copy of each array.
         """
         if len(self._log) != renderings:
-            self._log = wp.zeros((renderings, COLUMNS), dtype=wp.float32, device=self.device)
-            self._records = wp.array(np.arange(renderings), dtype=wp.int32, device=self.device)
+            self._log, self._records = self._make_log(renderings)
         while True:
             arrays = draw()
             log, *values = self._downloads.read(self._log, *arrays)

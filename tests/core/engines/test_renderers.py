@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import pytest
 from engine_cases import apart, case, gaussians, rig
@@ -18,20 +21,45 @@ from scas4d_core.gaussians import Gaussians
 BACKGROUND, LIMITS = (0.1, 0.2, 0.3), Limits(near=0.2)
 TRUE = TorchRenderer(BACKGROUND, LIMITS)
 CAMERA = CameraArrays.of(rig().cameras[1])
+SHORT = 8
+"""Number of entries of a tile list that is too short for any picture of these tests."""
 CLOSE = 1e-4
 """Relative to the norm: float32 against float64."""
 
 
-@pytest.fixture(params=["cpu", "warp"], scope="module")
-def tested(request) -> Renderer:  # type: ignore[no-untyped-def]
+@pytest.fixture(params=["cpu", "warp", "warp, short lists"], scope="module")
+def tested(request) -> Iterator[Renderer]:  # type: ignore[no-untyped-def]
     if request.param == "cpu":
-        return CpuRenderer(BACKGROUND, limits=LIMITS)
+        yield CpuRenderer(BACKGROUND, limits=LIMITS)
+        return
     pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
     from warp_cases import DEVICE
 
+    from scas4d_core.engines.warp import rasterizer
     from scas4d_core.engines.warp.renderer import WarpRenderer
 
-    return WarpRenderer(BACKGROUND, LIMITS, DEVICE)
+    class ShortLists(WarpRenderer):
+        """Begins every call with tile lists that are too short, so that all work is repeated."""
+
+        repeats = 0
+
+        def _read(self, *given: Any) -> Any:
+            if self._rasterizer.holds(1, 1):
+                self._rasterizer.capacity = SHORT
+                self._rasterizer.resize(self._rasterizer._columns, self._rasterizer._rows)
+            read = super()._read(*given)
+            self.repeats += self._rasterizer.capacity > SHORT
+            return read
+
+    if request.param == "warp":
+        yield WarpRenderer(BACKGROUND, LIMITS, DEVICE)
+        return
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(rasterizer, "LEAST_CAPACITY", SHORT)
+        patched.setattr(rasterizer, "TILES_EACH", 0)
+        renderer = ShortLists(BACKGROUND, LIMITS, DEVICE)
+        yield renderer
+        assert renderer.repeats > 10
 
 
 @pytest.mark.parametrize("glossy", [False, True])

@@ -97,6 +97,17 @@ def test_a_refused_frame_at_the_end_can_be_sent_again(http, paused):
     assert statuses(post(http, paused, framed(2), framed(3))) == [202, 202]
 
 
+def test_a_batch_can_stop_at_a_refused_frame_which_is_then_sent_without_the_image(http, paused):
+    answer = post(http, paused, framed(1), framed(2, DAMAGED), framed(3), on_refusal="stop")
+    assert statuses(answer) == [202, 422, 422]
+    assert [entry["index"] for entry in answer.json()["answers"]] == [1, 2, 3]
+    assert not any(entry["missing"] for entry in answer.json()["answers"])
+    assert states(http, paused) == ["committed", "queued"]
+    assert statuses(post(http, paused, framed(2, DAMAGED), framed(3), on_refusal="stop")) == [422, 422]
+    assert statuses(post(http, paused, framed(2), framed(3), on_refusal="stop")) == [202, 202]
+    assert problem(post(http, paused, framed(4), on_refusal="wait"), 422)["field"] == "query.on_refusal"
+
+
 def test_several_refused_frames_in_a_row_are_missing(http, paused):
     answer = post(http, paused, framed(1, DAMAGED), framed(2, {"c0": picture()}), framed(3))
     assert statuses(answer) == [422, 422, 202]
