@@ -14,8 +14,8 @@ frame makes these calls, in order::
     engine.probe(...)                       # for the stopping criterion, and at the end
     engine.state(learnt=True)               # Θ_t
 
-Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` synchronize the host with the device. This
-happens at most 12 times per update, and never during an iteration.
+Results are read by ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains``, never during an iteration.
+``wait`` only limits how far the host runs ahead of the device.
 """
 
 from __future__ import annotations
