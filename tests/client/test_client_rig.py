@@ -226,9 +226,9 @@ def test_a_rig_sends_several_frames_at_once(service, capture_folder, monkeypatch
     sender = IngestSocket if websocket else Client
     put_frames = sender.put_frames
 
-    def recorded(self, *arguments):
+    def recorded(self, *arguments, **named):
         sent.append([frame.index for frame in arguments[-1]])
-        return put_frames(self, *arguments)
+        return put_frames(self, *arguments, **named)
 
     monkeypatch.setattr(sender, "put_frames", recorded)
     pace = Pace(drop=0.4, seed=next(seed for seed in range(99) if _drops(seed) == {5}))
