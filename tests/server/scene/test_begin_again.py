@@ -68,8 +68,10 @@ def cloud(count):
 
 def test_a_first_frame_that_failed_is_tried_again_with_other_settings(http, sdk, service, make):
     id = make()
+    http.post(f"/v1/scenes/{id}/pause")  # the frames arrive before the first one fails
     for index, red in enumerate((fakes.PICKY, 20, 30)):
         put_form(http, id, index, pictures(red))
+    http.post(f"/v1/scenes/{id}/resume")
     failed = settled(http, id)
     assert (failed["state"], failed["committed"], failed["failed"]) == ("failed", 0, 3)
     assert f"PUT /v1/scenes/{id}/reconstructions/1" in failed["error"]
