@@ -108,8 +108,8 @@ def put_frames(
     >>> client.frame(open_scene, n + 1).state
     <FrameState.MISSING: 'missing'>
     """
-    arguments = {**_framed(chunk for frame in frames for chunk in frame.chunks()), "params": {"numbering": numbering}}
-    arguments["params"] |= {} if on_refusal == "skip" else {"on_refusal": on_refusal}
+    params = {"numbering": numbering, "on_refusal": on_refusal}
+    arguments = {**_framed(chunk for frame in frames for chunk in frame.chunks()), "params": params}
     return Call("POST", path(id, "frames"), json_reader(FrameBatch), arguments=arguments)
 
 

@@ -157,12 +157,10 @@ class Sender:
     def _send_frames(self, frames: list[NewFrame]) -> None:
         """Sends frames in batches. A frame that is refused is sent alone, without the images that are refused."""
         while frames:
-            answers = self._way.batch(frames)
-            refused = next((place for place, answer in enumerate(answers) if answer.problem is not None), None)
-            if refused is None:
+            problems = [(n, answer.problem) for n, answer in enumerate(self._way.batch(frames)) if answer.problem]
+            if not problems:
                 return
-            problem = answers[refused].problem
-            assert problem is not None
+            refused, problem = problems[0]  # the batch stops here, so the frames after it were not accepted
             error = error_of_problem(problem)
             if not isinstance(error, InvalidRequest | TooLarge):
                 raise error

@@ -7,7 +7,6 @@ not.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from studies.captures import open_measured
+from studies.quality.first_frame import continued
 
 DEVICES: tuple[Device, ...] = ("cpu", "gpu")
 
@@ -105,12 +105,7 @@ def compare(
         extent = capture.extent or float(np.ptp(scenes["cpu"].history.gaussians(0).means, axis=0).max())
         for index in range(1, last + 1):
             if index == 1 or not apart:
-                shutil.rmtree(folders["gpu"], ignore_errors=True)
-                shutil.copytree(folders["cpu"], folders["gpu"])
-                history = History.open(folders["gpu"])
-                scenes["gpu"] = again = Reconstruction.resume(capture.rig, settings["gpu"], history)
-                assert again.resumed is not None
-                assert not again.resumed.cold
+                scenes["gpu"] = continued(folders["cpu"], folders["gpu"], capture.rig, settings["gpu"])
             reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
             psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
             row = DeviceRow(

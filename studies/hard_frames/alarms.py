@@ -22,14 +22,12 @@ from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
-from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.storage.history import History
 from studies.captures import open_measured
 from studies.hard_frames.camera_faults import FRAMES, blurred, dirty, noisy, scaled
 from studies.hard_frames.frames import Picture
 from studies.machine import core_version, machine
-from studies.quality.first_frame import started
+from studies.quality.first_frame import continued, started
 from studies.quality.settings import settings_of
 from studies.variants.variants import VARIANTS
 
@@ -165,12 +163,14 @@ def run(
             )
     rows = []
     for folder in captures:
-        for of in variants or VARIANTS:
+        for variant in variants or VARIANTS:
             for seed in seeds:
-                settings = settings_of("scas4d", None, seed, (*VARIANTS[of].changes, *changes))
-                key = digest(settings_record(settings, ()), of, frames, tuple(faults), options.changed, core_version())
-                path = out / "alarms" / f"{folder.resolve().name}-{of.replace(' ', '-')}-{key}.json"
-                measured = partial(_row, folder, of, settings, out, frames, faults, options)
+                settings = settings_of("scas4d", None, seed, (*VARIANTS[variant].changes, *changes))
+                key = digest(
+                    settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()
+                )
+                path = out / "alarms" / f"{folder.resolve().name}-{variant.replace(' ', '-')}-{key}.json"
+                measured = partial(_row, folder, variant, settings, out, frames, faults, options)
                 row = kept_row(path, measured, again=again)
                 report(_line(row))
                 rows.append(row)
@@ -182,36 +182,31 @@ def run(
 
 def _row(
     folder: Path,
-    of: str,
+    variant: str,
     settings: Settings,
     out: Path,
     frames: int | None,
     faults: Sequence[str],
     options: CaptureOptions,
 ) -> Row:
-    capture = VARIANTS[of].made(open_measured(folder, options))
-    at, names = first_faulty(capture), capture.full_rig.names
-    count = capture.frame_count if frames is None else min(max(frames, at + 1), capture.frame_count)
+    capture = VARIANTS[variant].made(open_measured(folder, options))
+    first, names = first_faulty(capture), capture.full_rig.names
+    count = capture.frame_count if frames is None else min(max(frames, first + 1), capture.frame_count)
     found, clean = [], []
     with TemporaryDirectory() as place:
         scene = started(capture, settings, out, Path(place) / "clean")
         for index in range(1, count):
-            if index == at:
+            if index == first:
                 shutil.copytree(Path(place) / "clean", Path(place) / "before")
             clean.append(_clean(scene.step(capture.frame(index))))
-        for number, fault in enumerate(FAULTS if at + FRAMES <= capture.frame_count else ()):
+        for number, fault in enumerate(FAULTS if first + FRAMES <= capture.frame_count else ()):
             if not any(part in fault.kind for part in faults):
                 continue
-            branch = Path(place) / "fault"
-            shutil.copytree(Path(place) / "before", branch)
             name = names[(number + 1) % len(names)]
-            scene = Reconstruction.resume(capture.full_rig, settings, History.open(branch))
-            assert scene.resumed is not None
-            assert not scene.resumed.cold
-            reports = [scene.step(_with(capture, at + n, name, fault)) for n in range(FRAMES)]
+            scene = continued(Path(place) / "before", Path(place) / "fault", capture.full_rig, settings)
+            reports = [scene.step(_with(capture, first + n, name, fault)) for n in range(FRAMES)]
             found.append({"kind": fault.kind, "strength": fault.strength, "camera": name, **_found(reports, name)})
-            shutil.rmtree(branch)
-    identity = {"capture": capture.name, "variant": of, "seed": settings.update.seed, "cameras": len(names)}
+    identity = {"capture": capture.name, "variant": variant, "seed": settings.update.seed, "cameras": len(names)}
     return {**identity, "clean": clean, "faults": found, "core": core_version(), "machine": machine()}
 
 
@@ -278,7 +273,7 @@ def _camera_alarms(row: Row) -> list[dict[str, Any]]:
 CLEAN = (
     Column("capture", "capture"),
     Column("variant", "variant"),
-    Column("updates × cameras", "looks", "d"),
+    Column("updates × cameras", "images", "d"),
     Column("false alarms of cameras", "alarms", "d"),
     Column("good cameras left out", "excluded", "d"),
     Column("frames rejected", "rejected", "d"),
@@ -299,14 +294,14 @@ def page(rows: Sequence[Row]) -> str:
         {
             "capture": row["capture"],
             "variant": row["variant"],
-            "looks": row["cameras"] * len(row["clean"]),
+            "images": row["cameras"] * len(row["clean"]),
             "alarms": len(_camera_alarms(row)),
             "excluded": sum(len(frame["excluded"]) for frame in row["clean"]),
             "rejected": sum(frame["rejected"] for frame in row["clean"]),
         }
         for row in rows
     ]
-    total: Row = {name: sum(line[name] for line in clean) for name in ("looks", "alarms", "excluded", "rejected")}
+    total: Row = {name: sum(line[name] for line in clean) for name in ("images", "alarms", "excluded", "rejected")}
     planted = []
     for fault in FAULTS:
         of = [f for row in rows for f in row["faults"] if (f["kind"], f["strength"]) == (fault.kind, fault.strength)]

@@ -14,11 +14,11 @@ from client.cli.reconstruct import FRAME_ALARMS
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.camera_faults import camera_faults
 from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, named, violations
+from studies.quality.first_frame import continued
 
 AT = 5
 """Index of the frame at which each case begins. By then, the checks have learned the usual values."""
@@ -108,11 +108,8 @@ class FrameStudy:
 
     def _branch(self, name: str) -> Reconstruction:
         """Returns a copy of the scene as it was before the case, which continues bit-identically."""
-        folder = self.folder / name
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(self.folder / "before", folder)
         with all_varied(self.footage.constants):
-            return Reconstruction.resume(self.footage.rig, self.footage.settings, History.open(folder))
+            return continued(self.folder / "before", self.folder / name, self.footage.rig, self.footage.settings)
 
     def _measured(self, scene: Reconstruction, index: int, truth: Pictures) -> float:
         return float(

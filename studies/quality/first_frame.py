@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from dataclasses import fields
 from pathlib import Path
 from time import perf_counter
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.first_frame.static_result import StaticResult
@@ -124,3 +126,22 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
     return Reconstruction.start(
         capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
     )
+
+
+def continued(states: Path, copy: Path, rig: Rig, settings: Settings) -> Reconstruction:
+    """Returns a reconstruction that continues committed states in a copy of their folder.
+
+    On the device that committed them, it continues bit-identically.
+
+    Args:
+        states: folder of the committed states, which is left unchanged.
+        copy: folder of the copy; its contents are deleted.
+        rig: cameras of the reconstruction.
+        settings: reconstruction settings.
+    """
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(states, copy)
+    scene = Reconstruction.resume(rig, settings, History.open(copy))
+    assert scene.resumed is not None
+    assert not scene.resumed.cold  # otherwise, the motion and the usual values of the cameras would be missing
+    return scene

@@ -142,9 +142,8 @@ def test_pairs_per_pixel(tested: Renderer) -> None:
 def test_gaussians_behind_a_finished_pixel_do_not_count_as_pairs(tested: Renderer) -> None:
     row = Gaussians.of_points([[0, 0, 2 + 0.1 * i] for i in range(30)], radius=0.2)
     camera = CameraArrays.of(Camera("front", [[60, 0, 20], [0, 60, 25], [0, 0, 1]], np.eye(4), 40, 50))
-    assert (
-        tested.pairs_per_pixel(row, [camera])[0][25, 20] == 4
-    )  # each leaves 0.11, and a fifth would leave less than 1e-4
+    (counted,) = tested.pairs_per_pixel(row, [camera])
+    assert counted[25, 20] == 4  # each leaves 0.11, and a fifth would leave less than 1e-4
     faint = row.replace(opacities=np.full(30, 0.01, np.float32))
     (pairs,) = tested.pairs_per_pixel(faint, [camera])
     assert pairs.shape == (50, 40)
