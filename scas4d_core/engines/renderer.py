@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import log10
@@ -152,6 +152,15 @@ class Renderer(Protocol):
                 channels.
         """
 
+    def render_each(
+        self, shots: Sequence[tuple[Gaussians, CameraArrays]], *, depth_channel: int = -1
+    ) -> Iterator[Picture]:
+        """Renders several pairs of a state and a camera, in order; see ``render``.
+
+        All states have the same number of Gaussians. The next picture may overwrite the last one. On a GPU, the host
+        waits once for several pictures.
+        """
+
     def render_levels(
         self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
     ) -> NDArray[np.uint8]:
@@ -164,8 +173,8 @@ class Renderer(Protocol):
             opacity: whether to return the opacity [H, W] instead of the colours [H, W, 3].
         """
 
-    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
-        """Renders a state and compares it with the training image of a view; see ``render``."""
+    def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
+        """Renders a state from each view and compares it with the view's training image; see ``render``."""
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """Returns the sums [N, P] of ``planes`` [P, H, W] over pixels, weighted by each Gaussian's blending weights.
@@ -194,10 +203,11 @@ class Renderer(Protocol):
     def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
         """Returns a state whose normals rotated with their neighbourhoods; see ``with_turned_normals``."""
 
-    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
-        """Returns a mask [h, w] of the ``BLOCK``-pixel blocks that the supports of moving Gaussians intersect.
+    def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
+        """Finds the ``BLOCK``-pixel blocks of each camera's image that the supports of moving Gaussians intersect.
 
-        The mask covers the image padded to a multiple of 32 pixels.
+        Returns:
+            One mask [h, w] for each camera. It covers the image padded to a multiple of 32 pixels.
         """
 
     def pairs_per_pixel(

@@ -172,19 +172,19 @@ def compensate_exposure(
         The gain, and both lists of views with the gain removed; 1 and the unchanged views if the gain is within the
         usual range.
     """
-    shown = [_shown(renderer, state, view) for view in views]
+    shown = _shown(renderer, state, views)
     gain = _gain(views, shown)
     if gain is None or 1 / EXPOSURE <= gain <= EXPOSURE:
         return 1.0, list(views), list(others)
     every = [*views, *others]
-    shown += [_shown(renderer, state, view) for view in others]
+    shown += _shown(renderer, state, others)
     without = [factory.retouched(view, _without(view, gain, now)) for view, now in zip(every, shown, strict=True)]
     return gain, without[: len(views)], without[len(views) :]
 
 
 def measure_light_gain(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
     """Returns the brightness of a frame relative to renderings of Θ_{t−1}, or None if no camera is usable."""
-    return _gain(views, [_shown(renderer, state, view) for view in views])
+    return _gain(views, _shown(renderer, state, views))
 
 
 def with_light_gain(state: Gaussians, gain: float) -> Gaussians:
@@ -193,11 +193,13 @@ def with_light_gain(state: Gaussians, gain: float) -> Gaussians:
     return state.replace(colours=np.minimum(np.float32(gain) * colours, np.maximum(colours, np.float32(1))))
 
 
-def _shown(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
-    """Returns the [3, H, W] rendering of the state with the camera's exposure."""
-    planes = renderer.render(state, view.camera).features[:LABEL]
-    shown: Array = view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None]
-    return shown
+def _shown(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> list[Array]:
+    """Returns the [3, H, W] rendering of the state in each view, with the camera's exposure."""
+    pictures = renderer.render_each([(state, view.camera) for view in views])
+    return [
+        view.exposure[:LABEL, 0, None, None] * picture.features[:LABEL] + view.exposure[:LABEL, 1, None, None]
+        for view, picture in zip(views, pictures, strict=True)
+    ]
 
 
 def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None:

@@ -44,9 +44,10 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Ren
     still = gaussians.replace(opacities=np.where(rows, np.float32(0), gaussians.opacities))
     rays_before: list[tuple[Float, Float]] = []
     rays_now: list[tuple[Float, Float]] = []
+    pictures = renderer.render_each([(state, view.camera) for view in views for state in (gaussians, still)])
     for view in views:
-        before = renderer.render(gaussians, view.camera).features[LABEL] > 0.5
-        behind = renderer.render(still, view.camera).features[:3]
+        before = next(pictures).features[LABEL] > 0.5
+        behind = next(pictures).features[:3]
         shown = view.exposure[:3, 0, None, None] * behind + view.exposure[:3, 1, None, None]
         now = np.abs(view.target[:3] - shown).max(axis=0) > DIFFERENT
         if not before.any() or not SMALLEST_AREA <= now.sum() / before.sum() <= 1 / SMALLEST_AREA:

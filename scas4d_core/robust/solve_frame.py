@@ -428,7 +428,8 @@ class FrameSolver:
 
     def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """Returns the PSNR of a state in each view in dB, keyed by camera name."""
-        return {view.name: self._renderer.compare(state, view).psnr for view in views}
+        compared = self._renderer.compare(state, views)
+        return {view.name: one.psnr for view, one in zip(views, compared, strict=True)}
 
 
 def _with_colours_of(state: Gaussians, before: Gaussians) -> Gaussians:

@@ -10,6 +10,7 @@ over cameras is defined as 0. Nothing is corrected, and no state depends on thes
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import islice
 from math import inf, sqrt
 from statistics import median
 from typing import NamedTuple
@@ -161,11 +162,13 @@ def record_timing(
     views.sort(key=lambda one: looks.get(one.name, CameraTimingSums()).last)  # least recently measured first
     ahead, back = (renderer.extrapolate(before, after, share) for share in (HALF, -HALF))
     most = max(1, min(LOOKS, trace.iterations // ITERATIONS))
+    # if the end was kept, its rendering exists already
+    states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)
+    pictures = renderer.render_each([(state, view.camera) for view in views[:most] for state in states])
     for view in views[:most]:
         every, planes = trace.shown[view.name]
-        # if the end was kept, its rendering exists already
-        states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)
-        here, there, *now = (_rendered(renderer, state, view)[:, ::every, ::every].copy() for state in states)
+        several = islice(pictures, len(states))
+        here, there, *now = (picture.features[:3, ::every, ::every].copy() for picture in several)
         shown = now[0] if now else planes[:3]
         shifts = measure_shift(
             view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there))
@@ -178,10 +181,6 @@ def record_timing(
 def astuple(looks: CameraTimingSums) -> Row:
     """Returns the sums as a row of ``Past.timing``."""
     return looks.weight, looks.squares, looks.offset, looks.spread, looks.frame, looks.last
-
-
-def _rendered(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
-    return renderer.render(state, view.camera).features[:3]
 
 
 def _exposed(view: TrainingView, shown: Array) -> Array:

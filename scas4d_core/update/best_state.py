@@ -144,7 +144,8 @@ def committed_errors(rig: Rig, renderer: Renderer, views: Sequence[TrainingView]
         state: the committed state.
     """
     chosen = probe_views(rig, views, CONFIRMING)
-    return {view.name + COMMITTED: renderer.compare(state, view).image_loss for view in chosen}
+    compared = renderer.compare(state, chosen)
+    return {view.name + COMMITTED: one.image_loss for view, one in zip(chosen, compared, strict=True)}
 
 
 class BestState:

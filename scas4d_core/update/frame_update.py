@@ -118,9 +118,9 @@ class FrameUpdate:
             if stopping.needs_error(iteration):
                 stopping.record_error(iteration, best.error())
                 watch.lap("looks")
+        trace.kept = attempt.kept = best.end(iteration, trace.left_out)  # an engine reads its log with these errors
         trace.load_log(engine.log(), views)
         trace.planned, trace.errors = stopping.planned_so_far, best.errors
-        trace.kept = attempt.kept = best.end(iteration, trace.left_out)
         trace.whole = best.whole
         watch.lap("end")
         state = self._finish(attempt)

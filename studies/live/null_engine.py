@@ -52,9 +52,9 @@ class NullRenderer(CpuRenderer):
         planes[:3] = self.images.get(_key(camera), 0.0)
         return Picture(planes, np.zeros((camera.height, camera.width), np.float32))
 
-    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
+    def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
         """Returns the same figures for every view."""
-        return Comparison(PSNR_DB, LOSS, (0.0, 0.0, 0.0))
+        return [Comparison(PSNR_DB, LOSS, (0.0, 0.0, 0.0)) for _ in views]
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """Returns zeros: no Gaussian is in a changed pixel."""

@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.engines.renderer import Neighbourhoods
@@ -56,13 +54,11 @@ class Direction(Effect):
         state = seen.result.gaussians
         matte = state.replace(gloss=None, environment=None)
         chosen = set(spread_cameras(seen.rig, [view.name for view in seen.views], FEW))
-        left = np.zeros(2)
-        for view in seen.views:
-            if view.name not in chosen:
-                continue
-            for which, shown in enumerate((matte, state)):
-                left[which] += 10 ** (-seen.renderer.compare(shown, view).psnr / 10)
-        share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))
+        views = [view for view in seen.views if view.name in chosen]
+        plain, glossy = (
+            sum(10 ** (-one.psnr / 10) for one in seen.renderer.compare(shown, views)) for shown in (matte, state)
+        )
+        share = max(0.0, 1 - glossy / max(plain, 1e-12))
         return Evidence(share, f"view-dependent colour explains {100 * share:.0f}% of the residual")
 
     def register(self, builder: PlanBuilder) -> None:

@@ -7,8 +7,9 @@ cameras.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from scas4d_core.engines.renderer import Renderer
     from scas4d_core.engines.views import TrainingView
     from scas4d_core.settings import Settings
+
+Mask = NDArray[np.bool_]
 
 NAME = "shadows"
 CHANGED = 0.02
@@ -55,7 +58,7 @@ class ShadowsPart(UpdatePart):
         known = [view for view in attempt.views if view.name in before]
         if len(known) < ENOUGH * len(before):
             return state
-        compared = [_compared(before[view.name], view, state, attempt.renderer) for view in known]
+        compared = _compared(before, known, state, attempt.renderer)
         if sum((squares & stands).sum() for squares, stands in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
         return follow_pictures(state, known, attempt.renderer, self._stands)
@@ -78,13 +81,13 @@ class Shadows(Effect):
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:
             return None
-        arrays = {}
-        for view in seen.views:
-            means = _means(view)
-            # If all Gaussians appear to move, as without masks, the static ones are not known yet.
-            hidden = _hidden(view, state, seen.renderer) if stands else np.zeros(means.shape[:2])
-            arrays[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
-        return arrays
+        means = [_means(view) for view in seen.views]
+        # If all Gaussians appear to move, as without masks, the static ones are not known yet.
+        hidden = _hidden(seen.views, state, seen.renderer) if stands else [np.zeros(each.shape[:2]) for each in means]
+        return {
+            view.name: np.concatenate([mean, behind[..., None]], axis=-1).astype(np.float16)
+            for view, mean, behind in zip(seen.views, means, hidden, strict=True)
+        }
 
     def on_at_first(self, seen: FrameObservation) -> bool:
         """Returns whether enough of the scene is static."""
@@ -95,14 +98,12 @@ class Shadows(Effect):
         before: Arrays = seen.result.carried.get(NAME, {})
         if seen.result.gaussians.moving.all():
             return None
-        changed = compared = 0
-        for view in seen.views:
-            if view.name in before:
-                squares, stands = _compared(before[view.name], view, seen.result.gaussians, seen.renderer)
-                changed += int((squares & stands).sum())
-                compared += int(stands.sum())
         if not before:
             return Evidence(0.0, "")  # the arrays of frame 0 were lost
+        known = [view for view in seen.views if view.name in before]
+        masks = _compared(before, known, seen.result.gaussians, seen.renderer)
+        changed = sum(int((squares & stands).sum()) for squares, stands in masks)
+        compared = sum(int(stands.sum()) for _, stands in masks)
         if compared == 0:
             return None
         share = changed / compared
@@ -120,19 +121,29 @@ def _means(view: TrainingView) -> Array:
 
 
 def _compared(
-    before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Returns [h, w] masks of changed blocks, and of blocks without moving Gaussians in frame 0 and in this frame."""
-    changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
-    return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
+    before: Arrays, views: Sequence[TrainingView], state: Gaussians, renderer: Renderer
+) -> list[tuple[Mask, Mask]]:
+    """Compares views with frame 0.
+
+    Returns:
+        For each view, [h, w] masks of changed blocks, and of blocks without moving Gaussians in frame 0 and now.
+    """
+    compared = []
+    for view, hidden in zip(views, _hidden(views, state, renderer), strict=True):
+        first = before[view.name]
+        changed = np.abs(_means(view) - first[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
+        compared.append((changed, (first[..., 3] == 0) & ~hidden))
+    return compared
 
 
-def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray[np.bool_]:
-    """Returns the [h, w] mask of blocks that moving Gaussians reach."""
-    height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
-    blocks = renderer.reached(state, view.camera)
-    grid = blocks[: height * each, : width * each]
-    return np.asarray(grid.reshape(height, each, width, each).any(axis=(1, 3)))
+def _hidden(views: Sequence[TrainingView], state: Gaussians, renderer: Renderer) -> list[Mask]:
+    """Returns the [h, w] mask of each view's blocks that moving Gaussians reach."""
+    masks, each = [], SIDE // BLOCK
+    for view, blocks in zip(views, renderer.reached(state, [view.camera for view in views]), strict=True):
+        height, width = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE
+        grid = blocks[: height * each, : width * each].reshape(height, each, width, each)
+        masks.append(np.asarray(grid.any(axis=(1, 3))))
+    return masks
 
 
 EFFECT = Shadows(

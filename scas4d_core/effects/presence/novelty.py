@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
     from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.engines.engine import Thinned
-    from scas4d_core.engines.renderer import Renderer
+    from scas4d_core.engines.renderer import Picture, Renderer
     from scas4d_core.engines.views import TrainingView
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.result import UpdateTrace
@@ -192,11 +192,12 @@ def measure_novelty(
         renderer: renderer for the state.
     """
     shown = state.replace(colours=colours)
-    return [_novelty(shown, view, rig[view.name], renderer) for view in views]
+    pictures = renderer.render_each([(shown, view.camera) for view in views])
+    return [_novelty(view, rig[view.name], picture) for view, picture in zip(views, pictures, strict=True)]
 
 
-def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Renderer) -> Novelty:
-    planes, transmittance = renderer.render(state, view.camera)
+def _novelty(view: TrainingView, camera: Camera, picture: Picture) -> Novelty:
+    planes, transmittance = picture
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
     difference: Array = view.target[:3] - (gain * planes[:3] + offset)
     label = planes[3]

@@ -19,7 +19,7 @@ from scas4d_core.posed_pictures import pixels_inside
 
 if TYPE_CHECKING:
     from scas4d_core.effects.presence.novelty import Novelty
-    from scas4d_core.engines.renderer import Renderer
+    from scas4d_core.engines.renderer import Picture, Renderer
     from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
@@ -67,7 +67,9 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
         renderer: renderer for the state.
     """
     standing = state.retire(state.moving)
-    clouds = [_points(one, standing, renderer) for one in seen if one.bare.any()]
+    bare = [one for one in seen if one.bare.any()]
+    pictures = renderer.render_each([(standing, one.view.camera) for one in bare], depth_channel=LABEL)
+    clouds = [_points(one, picture) for one, picture in zip(bare, pictures, strict=True)]
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     if not len(points):
         return UncoveredPoints(points, np.zeros((0, 3), np.float32), 0.0)
@@ -82,9 +84,9 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
     return UncoveredPoints(points[agreed], colours[agreed], cell)
 
 
-def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
-    """Returns the [P, 3] surface points in the bare pixels of a camera."""
-    planes, rest = renderer.render(standing, one.view.camera, depth_channel=LABEL)
+def _points(one: Novelty, picture: Picture) -> Float:
+    """Returns the [P, 3] surface points in the bare pixels of a camera, from the static scene's colours and depth."""
+    planes, rest = picture
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = (1 - rest) / planes[LABEL]
     known = (rest < OPAQUE) & one.behind & np.isfinite(inverse)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -99,16 +99,25 @@ class CpuRenderer:
         given = (state.means, state.factors, state.opacities, shown, camera, background)
         return self.rasterizer.forward(*given, depth_channel)
 
+    def render_each(
+        self, shots: Sequence[tuple[Gaussians, CameraArrays]], *, depth_channel: int = -1
+    ) -> Iterator[Picture]:
+        """See ``Renderer.render_each``."""
+        return (self.render(state, camera, depth_channel=depth_channel) for state, camera in shots)
+
     def render_levels(
         self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
     ) -> NDArray[np.uint8]:
         """See ``Renderer.render_levels``."""
         return picture_levels(self.render(state, camera, background=background), opacity)
 
-    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
+    def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
         """See ``Renderer.compare``."""
-        self.forward(state.means, state.factors, state.opacities, features_seen(state, view.camera), view)
-        return Comparison(self.psnr, self.image_part, self.colour_shift(view))
+        compared = []
+        for view in views:
+            self.forward(state.means, state.factors, state.opacities, features_seen(state, view.camera), view)
+            compared.append(Comparison(self.psnr, self.image_part, self.colour_shift(view)))
+        return compared
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """See ``Renderer.gather``."""
@@ -145,14 +154,14 @@ class CpuRenderer:
         """See ``Renderer.turn_normals``."""
         return with_turned_normals(before, after, near)
 
-    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
+    def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
         """See ``Renderer.reached``."""
         rows = np.flatnonzero(state.moving)
-        features = np.zeros((len(state), CHANNELS), np.float32)
-        means, factors, opacities, features = (
-            np.take(array, rows, axis=0) for array in (state.means, state.factors, state.opacities, features)
+        means, factors, opacities = (
+            np.take(each, rows, axis=0) for each in (state.means, state.factors, state.opacities)
         )
-        return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
+        moving = means, factors, opacities, np.zeros((len(rows), CHANNELS), np.float32)
+        return [as_grid(blocks_of(self.rasterizer, *moving, camera), camera) for camera in cameras]
 
     def pairs_per_pixel(
         self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -59,14 +59,23 @@ class TorchRenderer:
         picture = self._drawn(state, camera, shown, background)
         return Picture(picture.features.permute(2, 0, 1).float().numpy(), (1 - picture.alpha).float().numpy())
 
+    def render_each(
+        self, shots: Sequence[tuple[Gaussians, CameraArrays]], *, depth_channel: int = -1
+    ) -> Iterator[Picture]:
+        """See ``Renderer.render_each``."""
+        return (self.render(state, camera, depth_channel=depth_channel) for state, camera in shots)
+
     def render_levels(
         self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
     ) -> NDArray[np.uint8]:
         """See ``Renderer.render_levels``."""
         return picture_levels(self.render(state, camera, background=background), opacity)
 
-    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
+    def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
         """See ``Renderer.compare``."""
+        return [self._compared(state, view) for view in views]
+
+    def _compared(self, state: Gaussians, view: TrainingView) -> Comparison:
         planes = leaf(self.render(state, view.camera).features[:LABEL])
         shown = planes * leaf(view.exposure[:3, 0])[:, None, None] + leaf(view.exposure[:3, 1])[:, None, None]
         picture, target = shown.permute(1, 2, 0), leaf(view.target[:LABEL]).permute(1, 2, 0)
@@ -108,9 +117,13 @@ class TorchRenderer:
         """See ``Renderer.turn_normals``."""
         return with_turned_normals(before, after, near)
 
-    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
+    def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
         """See ``Renderer.reached``. A block is marked if a support contains one of its pixel centres."""
-        chosen = state.rows(np.flatnonzero(state.moving))
+        moving = state.rows(np.flatnonzero(state.moving))
+        return [self._blocks(moving, camera) for camera in cameras]
+
+    def _blocks(self, chosen: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
+        """Returns the mask of the blocks in which a Gaussian's support contains a pixel centre."""
         params = CameraParams.of_arrays(camera)
         drawn = project(leaf(chosen.means), leaf(chosen.factors), params, self._limits)
         u = torch.arange(camera.width, dtype=torch.float64) + 0.5

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
 from scas4d_core.engines.plan import Structure, UpdatePlan
@@ -23,7 +26,7 @@ TABLES = 4
 class WarpDeformation:
     """The parameters of a deformation with their optimizers, and the resulting Gaussians.
 
-    No method waits for the device. ``forward`` and ``backward`` can be captured in a CUDA graph.
+    Only ``read_tables`` waits for the device. ``forward`` and ``backward`` can be captured in a CUDA graph.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -116,13 +119,17 @@ class WarpDeformation:
             else:  # by default, the deltas always start at 0
                 table.zero_()
 
-    def tables(self, downloads: Downloads) -> Tables:
-        """Waits for the device, and returns host tables of the parameters. ``set_tables`` does not upload them."""
+    def read_tables(self, downloads: Downloads, *others: wp.array) -> tuple[Tables, list[NDArray[Any]]]:
+        """Waits for the device, and returns host tables of the parameters, and copies of other arrays.
+
+        ``set_tables`` does not upload these tables.
+        """
         tables = [*self.clusters, self.deltas]
-        values = downloads.read(*tables)
-        for table, host in zip(tables, values, strict=True):
+        values = downloads.read(*tables, *others)
+        for table, host in zip(tables, values, strict=False):
             self._copies.store(wp.clone(table), host)
-        return Tables(values[:-1], values[-1])
+        clusters = len(self.clusters)
+        return Tables(values[:clusters], values[clusters]), values[clusters + 1 :]
 
     def begin(self, start: AttemptStart) -> bool:
         """Starts an attempt from the current parameters. ``restart`` must be called next.

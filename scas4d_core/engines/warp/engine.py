@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -117,6 +117,7 @@ class WarpEngine:
         self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
         self._graphs, self._captured_for, self._generation = Graphs(device), object(), -1
         self._events: deque[wp.Event] = deque()
+        self._tables: Tables | None = None
         self._views: list[TrainingView] = []
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
@@ -163,6 +164,7 @@ class WarpEngine:
         """See ``UpdateEngine.set_tables``."""
         self._deformation.set_tables(tables)
         self._unchanged = 0
+        self._tables = None
 
     def begin(self, start: AttemptStart) -> None:
         """See ``UpdateEngine.begin``."""
@@ -179,10 +181,12 @@ class WarpEngine:
         wp.copy(self._features, self._previous_features)
         self._losses.zero_()
         self._log, self._history = IterationLog(), list[tuple[Sequence[int], StepScalars | None]]()
+        self._log_is_unread = True
         self._pending: list[Sequence[int]] = []
         self._slots: dict[int, int] = {}
         self._used_rows = self._unchanged = 0
         self._smoothed = self._keeps_unread = False
+        self._tables = None
         if self._start is None:
             return
         self._deformation.restart(self._start)
@@ -198,6 +202,7 @@ class WarpEngine:
         if self._used_rows + len(views) > LOG_ROWS:
             self._settle()
         self._history.append((views, step))
+        self._tables = None
         keeps = [self._slot(view) if step.keep_pictures else 0 for view in views]
         rows = range(self._used_rows, self._used_rows + len(views))
         self._records.write(
@@ -288,19 +293,30 @@ class WarpEngine:
         while self._pending and self._read_log() is None:
             pass
 
-    def _read_log(self, probes: int = 0, *others: wp.array) -> list[NDArray[Any]] | None:
+    def _read_log(self, probes: int = 0) -> Array | None:
         """Waits for the device, and reads the log of the pending iterations and the log rows of the probes.
 
         Returns:
-            [probes, 8] log rows of the probes, and copies of the other arrays; or None if an image was incomplete
-            because its tile lists were too small. In this case, the lists have been enlarged. If an iteration was
-            affected, all iterations have been enqueued again.
+            [probes, 8] log rows of the probes; or None if an image was incomplete because its tile lists were too
+            small. In this case, the lists have been enlarged. If an iteration was affected, all iterations have been
+            enqueued again.
         """
-        log, losses, *values = self.downloads.read(self._pictures.log, self._losses, *others)
+        self._log_is_unread = False
+        guards = self._deformation.unsound, self._pictures.guard_counts, *self._adam_counts()
+        kept = [self._pictures.kept] if self._keeps_unread else []
+        log, losses, unsound, rendered, *values = self.downloads.read(self._pictures.log, self._losses, *guards, *kept)
         rows, probed = log[: self._used_rows], log[LOG_ROWS : LOG_ROWS + probes]
         if self._pictures.grow(rows[:, PAIRS].max(initial=0)):
             self._repeat()
             return None
+        if kept:
+            self._keeps_unread = False
+            pictures = values.pop()
+            for view, slot in self._slots.items():
+                self._log.keep(view, thinned(pictures[slot], self._views[view]))
+        counts = [guard_counts(RENDERING_GUARDS, rendered), *(guard_counts(ADAM_GUARDS, each) for each in values)]
+        triggered = dict(summed(counts)) | {"held_back": int(unsound[0])}
+        self._log.guards = {name: count for name, count in triggered.items() if count}
         first = 0
         for views, terms in zip(self._pending, losses, strict=False):
             own = rows[first : first + len(views)]
@@ -311,7 +327,7 @@ class WarpEngine:
             first += len(views)
         self._pending, self._used_rows = [], 0
         self._losses.zero_()
-        return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else [probed, *values]
+        return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else probed
 
     def _repeat(self) -> None:
         """Enqueues all iterations of the attempt again, after buffers were reallocated."""
@@ -328,9 +344,9 @@ class WarpEngine:
         """See ``UpdateEngine.probe``."""
         while True:
             self._launch_probes(which, moved, learnt)
-            read = self._read_log(len(which))
-            if read is not None:
-                return [float(loss) for loss in read[0][:, IMAGE_LOSS]]
+            rows = self._read_log(len(which))
+            if rows is not None:
+                return [float(loss) for loss in rows[:, IMAGE_LOSS]]
 
     def _launch_probes(self, which: Iterable[int], moved: bool, learnt: bool) -> None:
         """Enqueues renderings of probe views; see ``UpdateEngine.probe``."""
@@ -352,26 +368,16 @@ class WarpEngine:
             pictures.measure(self._probe_view, self._probe_row, means, factors, self._opacities, seen)
 
     def tables(self) -> Tables:
-        """See ``UpdateEngine.tables``."""
-        self._settle()
-        return self._deformation.tables(self.downloads)
+        """See ``UpdateEngine.tables``. The host does not wait if the tables were read with the state."""
+        if self._tables is None:
+            self._settle()
+            self._tables = self._deformation.read_tables(self.downloads)[0]
+        return self._tables
 
     def log(self) -> IterationLog:
-        """See ``UpdateEngine.log``."""
-        read = None
-        while read is None:
-            kept = [self._pictures.kept] if self._keeps_unread else []
-            counted = self._deformation.unsound, self._pictures.guard_counts
-            read = self._read_log(0, *counted, *kept, *self._adam_counts())
-        _, unsound, rendered, *values = read
-        if kept:
-            self._keeps_unread = False
-            pictures = values.pop(0)
-            for view, slot in self._slots.items():
-                self._log.keep(view, thinned(pictures[slot], self._views[view]))
-        counts = [guard_counts(RENDERING_GUARDS, rendered), *(guard_counts(ADAM_GUARDS, each) for each in values)]
-        triggered = dict(summed(counts)) | {"held_back": int(unsound[0])}
-        self._log.guards = {name: count for name, count in triggered.items() if count}
+        """See ``UpdateEngine.log``. The host only waits if it has not read the log since the last iteration."""
+        while (self._pending or self._log_is_unread) and self._read_log() is None:
+            pass
         return self._log
 
     def _adam_counts(self) -> list[wp.array]:
@@ -389,7 +395,7 @@ class WarpEngine:
         arrays = [deformation.means, deformation.factors, deformation.turns]
         if learnt:
             arrays += [self._features, *([] if self._gloss is None else self._gloss.tables)]
-        means, factors, turns, *looks = self.downloads.read(*arrays)
+        self._tables, (means, factors, turns, *looks) = self._deformation.read_tables(self.downloads, *arrays)
         rotations = turned_rotations(previous.rotations, self._rows, turns)
         state = previous.replace(means=means, factors=factors, rotations=rotations)
         self._copies.store(wp.clone(deformation.means), means)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,8 @@ wp.set_module_options({"enable_backward": False})
 Array = NDArray[np.float32]
 PADDING = 32
 """Tile size in pixels. ``reached`` pads images to a multiple of this size."""
+PIXELS_AT_ONCE = 2**23
+"""Approximate number of pixels, of four features and transmittance each, that ``render_each`` downloads at once."""
 
 
 @wp.kernel
@@ -239,26 +241,52 @@ class WarpRenderer:
         cameras = self._camera(camera)
         groups, sound = self._features(state, cameras, features)
         if depth_channel >= 0:
-            group = groups[depth_channel // CHANNELS]
-            groups[depth_channel // CHANNELS] = changed = wp.empty_like(group)
-            inputs = [cameras, self._copies.of(state.means, wp.vec3), depth_channel % CHANNELS, group, changed]
-            wp.launch(set_depth, len(state), inputs, device=self.device)
+            place, channel = divmod(depth_channel, CHANNELS)
+            groups[place] = self._with_depth(state, cameras, groups[place], channel)
         if background is None:
             background = np.zeros(CHANNELS * len(groups), np.float32)
             background[:CHANNELS] = self._background
 
         def draw() -> list[wp.array]:
             self._project(state, camera, cameras, groups, sound)
-            pictures = []
-            for place, group in enumerate(groups):
-                self._draw(cameras, group, background[CHANNELS * place : CHANNELS * (place + 1)])
-                pictures.append(wp.clone(self._rasterizer.planes[:, : camera.height, : camera.width]))
-            return pictures
+            backgrounds = background.reshape(len(groups), CHANNELS)
+            return [self._drawn(camera, cameras, *each) for each in zip(groups, backgrounds, strict=True)]
 
         _, *drawn = self._read(draw)
         if len(drawn) == 1:
             return Picture(drawn[0][:CHANNELS], drawn[0][CHANNELS])
         return Picture(np.concatenate([planes[:CHANNELS] for planes in drawn]), drawn[0][CHANNELS])
+
+    def render_each(
+        self, shots: Sequence[tuple[Gaussians, CameraArrays]], *, depth_channel: int = -1
+    ) -> Iterator[Picture]:
+        """See ``Renderer.render_each``."""
+        if not shots:
+            return
+        columns, rows = largest([camera for _, camera in shots])
+        count = max(1, PIXELS_AT_ONCE // (columns * rows))
+        for first in range(0, len(shots), count):
+            for planes in self._render_at_once(shots[first : first + count], depth_channel):
+                yield Picture(planes[:CHANNELS], planes[CHANNELS])
+
+    def _render_at_once(
+        self, shots: Sequence[tuple[Gaussians, CameraArrays]], depth_channel: int
+    ) -> list[NDArray[Any]]:
+        """Returns the planes [5, H, W] of each picture, with one wait for the device."""
+        self._make_room(shots[0][0], *largest([camera for _, camera in shots]))
+
+        def draw() -> list[wp.array]:
+            pictures = []
+            for record, (state, camera) in enumerate(shots):
+                cameras = self._camera(camera)
+                features = features_seen(self._copies, state, cameras)
+                if depth_channel >= 0:
+                    features = self._with_depth(state, cameras, features, depth_channel)
+                self._project(state, camera, cameras, [features], record=record)
+                pictures.append(self._drawn(camera, cameras, features, self._background))
+            return pictures
+
+        return self._read(draw, len(shots))[1:]
 
     def render_levels(
         self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
@@ -279,18 +307,25 @@ class WarpRenderer:
         pixels: NDArray[np.uint8] = self._read(draw)[1]
         return pixels[..., 0] if opacity else pixels
 
-    def compare(self, state: Gaussians, view: TrainingView) -> Comparison:
-        """See ``Renderer.compare``."""
+    def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
+        """See ``Renderer.compare``. The host waits only once, if an engine has loaded the images."""
+        if not views:
+            return []
+        self._make_room(state, *largest([view.camera for view in views]))
 
         def draw() -> list[wp.array]:
-            self._render_view(state, view)
-            self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
+            for record, view in enumerate(views):
+                self._render_view(state, view, record=record)
+                row = self._records[record : record + 1]
+                self._loss.measure(self._first, row, self._rasterizer, self._behind, self._log)
             return []
 
-        log = self._read(draw)[0][0].astype(float)
-        red, green, blue = log[SHIFT : SHIFT + 3].tolist()
-        psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
-        return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
+        compared = []
+        for log, view in zip(self._read(draw, len(views))[0].astype(float), views, strict=True):
+            red, green, blue = log[SHIFT : SHIFT + 3].tolist()
+            psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
+            compared.append(Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue)))
+        return compared
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """See ``Renderer.gather``."""
@@ -377,19 +412,25 @@ class WarpRenderer:
         self._copies.store(turned, normals)
         return after.replace(gloss=normals)
 
-    def reached(self, state: Gaussians, camera: CameraArrays) -> NDArray[np.bool_]:
-        """See ``Renderer.reached``."""
-        cameras, features = self._camera(camera), features_on(self._copies, state)
-        height, width = (-(-size // PADDING) * PADDING // BLOCK for size in (camera.height, camera.width))
+    def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
+        """See ``Renderer.reached``. The host waits only once."""
+        if not cameras:
+            return []
+        features = features_on(self._copies, state)
+        self._make_room(state, *largest(cameras))
 
         def draw() -> list[wp.array]:
-            self._project(state, camera, cameras, [features])
-            marks = wp.zeros((height, width), dtype=wp.int32, device=self.device)
-            self._rasterizer.mark(cameras, BLOCK, features, marks)
-            return [marks]
+            marked = []
+            for record, camera in enumerate(cameras):
+                arrays = self._camera(camera)
+                self._project(state, camera, arrays, [features], record=record)
+                shape = (-(-size // PADDING) * PADDING // BLOCK for size in (camera.height, camera.width))
+                marks = wp.zeros(tuple(shape), dtype=wp.int32, device=self.device)
+                self._rasterizer.mark(arrays, BLOCK, features, marks)
+                marked.append(marks)
+            return marked
 
-        blocks: NDArray[np.bool_] = self._read(draw)[1] != 0
-        return blocks
+        return [marks != 0 for marks in self._read(draw, len(cameras))[1:]]
 
     def pairs_per_pixel(
         self, state: Gaussians, cameras: Sequence[CameraArrays], every: int = 1
@@ -426,6 +467,18 @@ class WarpRenderer:
         if len(uploaded) == 1:
             return uploaded, None
         return uploaded, np.asarray((np.abs(features) <= FEATURE_CEILING).all(axis=1))
+
+    def _with_depth(self, state: Gaussians, cameras: wp.array, features: wp.array, channel: int) -> wp.array:
+        """Returns a copy of [N] vec4 features in which one channel is the depth of each mean."""
+        changed = wp.empty_like(features)
+        inputs = [cameras, self._copies.of(state.means, wp.vec3), channel, features, changed]
+        wp.launch(set_depth, len(state), inputs, device=self.device)
+        return changed
+
+    def _drawn(self, camera: CameraArrays, cameras: wp.array, features: wp.array, background: Array) -> wp.array:
+        """Returns a copy of the planes [5, H, W] of features of the projected Gaussians; see ``_draw``."""
+        self._draw(cameras, features, background)
+        return wp.clone(self._rasterizer.planes[:, : camera.height, : camera.width])
 
     def _make_log(self, renderings: int) -> tuple[wp.array, wp.array]:
         """Returns a log with one row per rendering, [renderings, COLUMNS], and the indices of its rows."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from scas4d_core.gaussians import Gaussians
 BACKGROUND, LIMITS = (0.1, 0.2, 0.3), Limits(near=0.2)
 TRUE = TorchRenderer(BACKGROUND, LIMITS)
 CAMERA = CameraArrays.of(rig().cameras[1])
+CAMERAS = [CAMERA, *(CameraArrays.of(rig().cameras[number].scaled(2)) for number in (0, 2))]
 SHORT = 8
 """Number of entries of a tile list that is too short for any picture of these tests."""
 CLOSE = 1e-4
@@ -74,6 +76,25 @@ def test_pictures(tested: Renderer, glossy: bool) -> None:
         assert apart(dull.features, true.features) > 0.01
 
 
+@pytest.mark.parametrize("at_once", [1, 2**23])
+@pytest.mark.parametrize("depth_channel", [-1, LABEL])
+def test_pictures_of_several_cameras(
+    tested: Renderer, depth_channel: int, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with suppress(ImportError):
+        monkeypatch.setattr("scas4d_core.engines.warp.renderer.PIXELS_AT_ONCE", at_once)
+    state = gaussians(glossy=True)
+    other = state.replace(means=state.means + np.float32(0.05))
+    assert list(tested.render_each([])) == []
+    shots = [(each, camera) for camera in CAMERAS for each in (state, other)]
+    several = tested.render_each(shots, depth_channel=depth_channel)
+    for (each, camera), mine in zip(shots, several, strict=True):
+        true = TRUE.render(each, camera, depth_channel=depth_channel)
+        assert mine.features.shape == true.features.shape == (4, camera.height, camera.width)
+        assert apart(mine.features, true.features) < CLOSE
+        assert apart(mine.transmittance, true.transmittance) < CLOSE
+
+
 @pytest.mark.parametrize("glossy", [False, True])
 def test_pictures_in_8_bits_are_the_rounded_ones(tested: Renderer, glossy: bool) -> None:
     state, behind = gaussians(glossy=glossy), np.float32([1.2, -0.3, 0.5, 0])  # some values are clipped
@@ -111,8 +132,9 @@ def test_eight_features_of_gaussians_that_are_not_all_sound(tested: Renderer) ->
 
 def test_comparisons(tested: Renderer) -> None:
     scene = case(gaussians())
-    for view in scene.views[:3]:
-        mine, true = (renderer.compare(scene.previous, view) for renderer in (tested, TRUE))
+    assert tested.compare(scene.previous, []) == []
+    several = (renderer.compare(scene.previous, scene.views[:3]) for renderer in (tested, TRUE))
+    for mine, true in zip(*several, strict=True):
         assert mine.psnr == pytest.approx(true.psnr, abs=1e-3)
         assert mine.image_loss == pytest.approx(true.image_loss, rel=CLOSE)
         assert mine.colour_shift == pytest.approx(true.colour_shift, abs=1e-6)
@@ -184,10 +206,13 @@ def test_states_between_and_beyond_frames(tested: Renderer) -> None:
 def test_blocks_that_are_reached(tested: Renderer) -> None:
     state = gaussians()
     state = state.replace(foreground=(np.arange(len(state)) < 40).astype(np.float32))
-    mine, true = (renderer.reached(state, CAMERA) for renderer in (tested, TRUE))
-    assert mine.shape == true.shape
-    assert not (true & ~mine).any()  # a support may pass between the centres of pixels
-    assert (mine & ~true).sum() <= 0.2 * mine.sum()
+    assert tested.reached(state, []) == []
+    several = [renderer.reached(state, CAMERAS) for renderer in (tested, TRUE)]
+    for mine, true in zip(*several, strict=True):
+        assert mine.shape == true.shape
+        assert not (true & ~mine).any()  # a support may pass between the centres of pixels
+        assert (mine & ~true).sum() <= 0.2 * mine.sum()
+    assert several[0][0].shape != several[0][1].shape
 
 
 def test_normals_turn_with_their_neighbourhoods(tested: Renderer) -> None:

@@ -37,7 +37,7 @@ def credits_of(frame: Frame, names: list[str], rig: Rig = RIG) -> dict[str, floa
 def error_of(frame: Frame, name: str, rig: Rig = RIG) -> float:
     factory = ViewFactory(rig)
     (view,) = (view for view in factory.views(frame, {}) if view.name == name)
-    return CpuRenderer((0, 0, 0)).compare(BOX, view).psnr
+    return CpuRenderer((0, 0, 0)).compare(BOX, [view])[0].psnr
 
 
 def test_an_object_that_enters_is_confirmed() -> None:

@@ -420,7 +420,7 @@ def test_suspects_are_looked_at_in_the_light_that_the_colours_are_in() -> None:
 
 
 def _shown(view: TrainingView) -> float:
-    return RENDERER.compare(FITTED, view).psnr
+    return RENDERER.compare(FITTED, [view])[0].psnr
 
 
 def errors(still: float, end: float) -> Callable[[UpdateTrace], UpdateTrace]:

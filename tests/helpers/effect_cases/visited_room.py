@@ -103,4 +103,4 @@ def seen(
 
 def psnr(state: Gaussians, frame: FrameObservation) -> float:
     """DB of a state, mean over the views of a frame."""
-    return float(np.mean([frame.renderer.compare(state, view).psnr for view in frame.views]))
+    return float(np.mean([one.psnr for one in frame.renderer.compare(state, frame.views)]))

@@ -32,7 +32,7 @@ def shown(frame: FrameObservation, kept: Candidate = Candidate.END, most: int = 
     """The frame with the renderings that an update leaves, of every other camera."""
     log, state = IterationLog(), frame.result.gaussians
     for number in range(0, len(frame.views), 2)[:most]:
-        frame.renderer.compare(state, frame.views[number])
+        frame.renderer.compare(state, [frame.views[number]])
         log.keep(number, Thinned.of(*frame.renderer.shown(frame.views[number])))  # type: ignore[attr-defined]
     trace = UpdateTrace(kept=kept)
     trace.load_log(log, frame.views)
