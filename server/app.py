@@ -14,13 +14,13 @@ from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
-from server import problems
 from server.connections.client_limit import ClientLimit
 from server.connections.guard import ConnectionGuard, ConnectionLimits
 from server.health.readiness import Readiness
 from server.http import handlers
 from server.http.authentication import AuthMiddleware
 from server.http.middleware import AccessLog, BodyLimit, HeadAsGet, compress_responses
+from server.http.openapi import RESPONSES
 from server.http.tickets import Tickets
 from server.hub import Hub
 from server.peers.peers import Peers
@@ -93,7 +93,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         version=__version__,
         summary="Online 4D reconstruction from calibrated multi-camera rigs.",
         lifespan=lifespan,
-        responses=problems.RESPONSES,
+        responses=RESPONSES,
         docs_url=None,  # `routes.reference` serves the API reference
         redoc_url=None,
     )

@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
@@ -121,6 +120,8 @@ class Neighbourhoods:
     @cached_property
     def rows(self) -> NDArray[np.int64]:
         """[M, count] rows of the nearest Gaussians, starting with the Gaussian itself."""
+        from scipy.spatial import cKDTree  # deferred import: processes that only render start faster
+
         nearest: NDArray[np.int64] = np.asarray(cKDTree(self.means).query(self.means, self.count)[1])
         return nearest.reshape(len(self.means), -1)
 

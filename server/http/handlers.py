@@ -14,7 +14,8 @@ from starlette.routing import compile_path
 
 from client.wire import ProblemDetails
 from server.http import validation
-from server.problems import Problem, internal_error, openapi_document, problem_response
+from server.http.openapi import openapi_document
+from server.problems import Problem, internal_error, problem_response
 
 JSON = re.compile(r"application/([\w.-]+\+)?json")
 
