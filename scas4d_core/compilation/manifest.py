@@ -103,6 +103,7 @@ KERNELS = (
         "kernels.turns.turn_neighbourhoods f2 f2 i2 d3",
         "kernels.turns.shortest_axes f3 d2",
         "kernels.pictures.mark_changes y3 y3 i i f2",
+        "kernels.states.axes_are_within f2 i1 f2 f f",
         "kernels.states.find_implausible f2 f3 f2 f3 f2 f2 i1 f f f b1 f2",
         "kernels.deform.load_blocks f2 f3 i2 f4 f2",
         "kernels.states.find_finite f2 f3 i1 b1",

@@ -59,6 +59,24 @@ def find_implausible(
 
 
 @kernel
+def axes_are_within(squares, rows, lengths, least, most):
+    """Returns whether all axes of the moving Gaussians are within their bounds; false if a length is not finite.
+
+    Args:
+        squares: [M, 3] squared axis lengths.
+        rows: [M] rows of the moving Gaussians.
+        lengths: [N, 3] axis lengths to which the bounds are relative.
+        least, most: bounds of an axis, relative to its length.
+    """
+    within = True
+    for i in range(len(rows)):
+        for k in range(3):
+            shortest, longest = least * lengths[rows[i], k], most * lengths[rows[i], k]
+            within &= shortest * shortest <= squares[i, k] <= longest * longest
+    return within
+
+
+@kernel
 def find_finite(means, factors, rows, finite):
     """Marks the Gaussians whose mean and factor are finite.
 

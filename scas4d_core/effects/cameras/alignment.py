@@ -137,7 +137,9 @@ def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equatio
         depth: depth of the image centre; see ``Equations``.
     """
     residual = (seen.target - seen.shown).astype(np.float64).reshape(-1)
-    terms = -np.einsum("cdp,dkp->kcp", seen.slopes.astype(np.float64), moved).reshape(moved.shape[1], -1)
+    slopes = seen.slopes.astype(np.float64)
+    # One sum instead of an einsum, which takes five times as long for two terms.
+    terms = -(slopes[:, 0] * moved[0, :, None] + slopes[:, 1] * moved[1, :, None]).reshape(moved.shape[1], -1)
     weights = _weights(residual)
     matrix = (terms * weights) @ terms.T
     way = np.linalg.solve(matrix + SMALLEST * np.trace(matrix) * np.eye(len(matrix)), (terms * weights) @ residual)
@@ -173,7 +175,12 @@ def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
     Roll is measured as the displacement of a point a quarter of the image width away from the centre. The equations do
     not depend on depth.
     """
-    return equations(seen, np.einsum("dkp,kl->dlp", flow(lens, seen.places)[:, 3:], turn_from_pixels(lens)))
+    fx, fy, cx, cy, width = (float(number) for number in lens[:5])
+    x, y = (seen.places[0] - cx) / fx, (seen.places[1] - cy) / fy
+    # This is flow(lens, seen.places)[:, 3:] times turn_from_pixels(lens), without its zeros.
+    across = [1 + x * x, fx / fy * x * y, -4 * fx / width * y]
+    down = [fy / fx * x * y, 1 + y * y, 4 * fy / width * x]
+    return equations(seen, np.stack([*across, *down]).reshape(2, 3, -1))
 
 
 def turn_from_pixels(lens: Array) -> Double:

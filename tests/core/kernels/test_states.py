@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.kernels.states import (
+    axes_are_within,
     count_votes,
     extrapolate_rows,
     find_finite,
@@ -79,6 +80,16 @@ def test_a_mirrored_factor_is_marked() -> None:
         bad, np.empty((2, 3), np.float32),
     )  # fmt: skip
     np.testing.assert_array_equal(bad, [False, True])
+
+
+@pytest.mark.parametrize(
+    ("length", "within"), [(1, True), (0.11, True), (0.09, False), (9.9, True), (10.1, False), (np.nan, False)]
+)
+def test_axes_are_within_a_tenth_and_ten_times_their_length(length: float, within: bool) -> None:
+    lengths = np.array([[0.5, 0.5, 0.5], [1, 2, 3], [np.nan] * 3], np.float32)  # the last row does not move
+    squares = np.square(lengths[:2])
+    squares[1, 2] *= length**2
+    assert axes_are_within(squares, np.arange(2), lengths, np.float32(0.1), np.float32(10)) == within
 
 
 def test_gaussians_behind_or_beside_all_cameras_are_outside() -> None:

@@ -96,6 +96,8 @@ def test_a_turn_is_found_from_a_thinned_rendering_and_without_depth(every: int) 
     assert told is not None
     one = turn_equations(LENS, told)
     np.testing.assert_allclose(np.linalg.solve(one.matrix, one.vector), pixels, atol=0.04)
+    moved = np.einsum("dkp,kl->dlp", flow(LENS, told.places)[:, 3:], turn_from_pixels(LENS))
+    np.testing.assert_allclose(one.matrix, equations(told, moved).matrix, rtol=1e-9)
 
 
 def test_a_bare_wall_tells_nothing() -> None:
