@@ -2,7 +2,7 @@
 
 Each node contains the part's Gaussians as they are in the first frame, in the part's local
 coordinates. A linear animation contains the part's translation and rotation, with times in seconds
-since the first frame. Gaussians without a part do not move and are stored in the node ``standing``.
+since the first frame. Gaussians without a part do not move and are stored in the node ``static``.
 Axes, units and attributes are the same as in ``gltf``. Deformation within a part, Gaussians born
 later, and changes of colour and size are lost. Highlights rotate with the part instead of staying
 fixed in the world.
@@ -153,7 +153,7 @@ class PartAsset:
                 samplers.append({"input": times[tuple(keys.times)], "output": output, "interpolation": "LINEAR"})
             nodes.append(node)
         if left.any():
-            nodes.append({"name": "standing", "mesh": len(meshes)})
+            nodes.append({"name": "static", "mesh": len(meshes)})
             meshes.append({"primitives": [splat_primitive(binary, cloud.rows(left))]})
         binary.write(
             self.path,

@@ -129,7 +129,7 @@ def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
             nodes = read_asset(file, history.times - history.times[0])
             extent = capture.extent or float(np.ptp(truth.points.reshape(-1, 3), axis=0).max())
             compared = compare(nodes, wanted, truth.points[0], truth.part_id, history.indices, extent)
-            figures.append(AssetFigures(words, len([node for node in nodes if node.name != "standing"]), compared))
+            figures.append(AssetFigures(words, len([node for node in nodes if node.name != "static"]), compared))
     return figures
 
 

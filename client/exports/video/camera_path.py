@@ -56,8 +56,8 @@ def fixed_path(camera: Camera, size: tuple[int, int]) -> CameraPath:
     >>> fixed_path(camera, (64, 48))(3.0).cx
     32.0
     """
-    standing = fit_to_size(camera, size)
-    return lambda seconds: standing
+    fixed = fit_to_size(camera, size)
+    return lambda seconds: fixed
 
 
 def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> CameraPath:

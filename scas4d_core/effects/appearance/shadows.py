@@ -39,7 +39,7 @@ HARDLY = 0.005
 `basketball` gains 0.06 dB on changed pixels, but noise is more likely to be learnt."""
 ENOUGH = 0.5
 """Minimum share of frame 0's cameras that a frame must contain for an update; with fewer, noise would be learnt."""
-STANDS = 0.05
+MIN_STATIC = 0.05
 """Minimum share of static Gaussians; with fewer, there is no background to receive shadows."""
 
 
@@ -47,21 +47,21 @@ class ShadowsPart(UpdatePart):
     """Updates the colours of static Gaussians at the end of an update."""
 
     def __init__(self, builder: PlanBuilder) -> None:
-        self._stands = np.ones(len(builder.first), np.uint8)
-        self._stands[builder.hierarchy.rows] = 0
+        self._static = np.ones(len(builder.first), np.uint8)
+        self._static[builder.hierarchy.rows] = 0
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Updates the colours if the final state of the update is kept and the frame looks different from frame 0."""
-        if attempt.kept is not Candidate.END or not self._stands.any() or attempt.rates.static_colour == 0:
+        if attempt.kept is not Candidate.END or not self._static.any() or attempt.rates.static_colour == 0:
             return state
         before: Arrays = attempt.carried.get(NAME, {})
         known = [view for view in attempt.views if view.name in before]
         if len(known) < ENOUGH * len(before):
             return state
         compared = _compared(before, known, state, attempt.renderer)
-        if sum((squares & stands).sum() for squares, stands in compared) <= HARDLY * sum(s.sum() for _, s in compared):
+        if sum((squares & static).sum() for squares, static in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
-        return follow_pictures(state, known, attempt.renderer, self._stands)
+        return follow_pictures(state, known, attempt.renderer, self._static)
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,12 @@ class Shadows(Effect):
         An array contains the mean colour of each block of pixels, followed by 1 if moving Gaussians reach the block.
         """
         state = seen.result.gaussians
-        stands = float((~state.moving).mean())
-        if 0 < stands < STANDS:
+        share = float((~state.moving).mean())
+        if 0 < share < MIN_STATIC:
             return None
         means = [_means(view) for view in seen.views]
         # If all Gaussians appear to move, as without masks, the static ones are not known yet.
-        hidden = _hidden(seen.views, state, seen.renderer) if stands else [np.zeros(each.shape[:2]) for each in means]
+        hidden = _hidden(seen.views, state, seen.renderer) if share else [np.zeros(each.shape[:2]) for each in means]
         return {
             view.name: np.concatenate([mean, behind[..., None]], axis=-1).astype(np.float16)
             for view, mean, behind in zip(seen.views, means, hidden, strict=True)
@@ -91,7 +91,7 @@ class Shadows(Effect):
 
     def on_at_first(self, seen: FrameObservation) -> bool:
         """Returns whether enough of the scene is static."""
-        return bool((~seen.result.gaussians.moving).mean() >= STANDS)
+        return bool((~seen.result.gaussians.moving).mean() >= MIN_STATIC)
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
         """Returns the share of changed blocks among all blocks that are static in frame 0 and in this frame."""
@@ -102,8 +102,8 @@ class Shadows(Effect):
             return Evidence(0.0, "")  # the arrays of frame 0 were lost
         known = [view for view in seen.views if view.name in before]
         masks = _compared(before, known, seen.result.gaussians, seen.renderer)
-        changed = sum(int((squares & stands).sum()) for squares, stands in masks)
-        compared = sum(int(stands.sum()) for _, stands in masks)
+        changed = sum(int((squares & static).sum()) for squares, static in masks)
+        compared = sum(int(static.sum()) for _, static in masks)
         if compared == 0:
             return None
         share = changed / compared

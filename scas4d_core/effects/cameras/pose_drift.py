@@ -68,7 +68,7 @@ tracking lags behind the motion."""
 SHARE = 0.5
 """Share of the difference by which poses and recorded offsets are updated per frame. A drift is followed with a
 lag of one frame's change. A frame in which the scene tracking lags causes only half of the error."""
-STANDING = 6
+FIXED_CAMERAS = 6
 """Number of fixed cameras that are rendered while the effect is on (different cameras in each frame). They show which
 part of a twist is scene motion."""
 LARGEST, TURN = 0.02, radians(1)
@@ -178,8 +178,8 @@ def step_twists(
         follow: [C] mask of the cameras whose twists are updated.
     """
     matrix, vector = np.eye(6) * 1e-6, np.zeros(6)
-    standing = [row for row in aligned if not follow[row]] or list(aligned)
-    for row in standing:
+    fixed = [row for row in aligned if not follow[row]] or list(aligned)
+    for row in fixed:
         one, camera, _ = aligned[row]
         units = to_camera_twist(one, camera.world_to_camera)
         matrix += units.T @ one.matrix @ units
@@ -278,11 +278,11 @@ def _says(seen: FrameObservation) -> bool:
 def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
     """Returns the views of all drifted or excluded cameras, and of a few fixed ones that vary between frames."""
     off = poses.drifted()
-    standing = [view for view in seen.views if not off[rows[view.name]]]
-    count = len(standing)
-    some = {(seen.index + count * k // STANDING) % count for k in range(STANDING)} if count else set()
+    fixed = [view for view in seen.views if not off[rows[view.name]]]
+    count = len(fixed)
+    some = {(seen.index + count * k // FIXED_CAMERAS) % count for k in range(FIXED_CAMERAS)} if count else set()
     others = [view for view in seen.views if off[rows[view.name]]]
-    return [*(standing[k] for k in sorted(some)), *others, *seen.suspects]
+    return [*(fixed[k] for k in sorted(some)), *others, *seen.suspects]
 
 
 def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:

@@ -34,7 +34,7 @@ IN_CHANGE = 0.5
 MAJORITY = 0.5
 """Share of the voting cameras that must agree that a Gaussian moves; at least two cameras must agree."""
 
-STANDING_SHARE = 0.1
+MIN_STATIC = 0.1
 """Minimum share of static Gaussians in a scene with a static part; below it, static labels are noise."""
 
 INSIDE_SHARE = 0.8
@@ -101,12 +101,12 @@ def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
     not move.
 
     >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
-    >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
-    >>> int(with_reliable_labels(few_stand).moving.sum())  # 5 static labels in 100 are noise
+    >>> few_static = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
+    >>> int(with_reliable_labels(few_static).moving.sum())  # 5 static labels in 100 are noise
     100
     """
-    standing = int((~gaussians.moving).sum())
-    if not 0 < standing < STANDING_SHARE * len(gaussians):
+    static = int((~gaussians.moving).sum())
+    if not 0 < static < MIN_STATIC * len(gaussians):
         return gaussians
     return gaussians.replace(foreground=np.where(gaussians.moving, gaussians.foreground, np.float32(1)))
 

@@ -137,14 +137,14 @@ def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
     difference = sum(_corners(np.abs(target[:3] - (gain * shown[:3] + offset)).mean(axis=0))) / 4
     label, transmittance = shown[3], shown[4]
     if len(target) > 3:
-        new, stands = (target[3] > 0.5) & (label < ABSENT), (target[3] <= 0.5) & (label < ABSENT)
+        new, static = (target[3] > 0.5) & (label < ABSENT), (target[3] <= 0.5) & (label < ABSENT)
         new_squares = _all_corners(new)
     else:
-        stands = label < ABSENT
+        static = label < ABSENT
         new_squares = _all_corners(label < THERE) & (
             difference > max(DIFFERENT, TIMES_USUAL * float(np.median(difference)))
         )
-    bare = _all_corners(stands & (transmittance > BARE)) & (difference > DIFFERENT)
+    bare = _all_corners(static & (transmittance > BARE)) & (difference > DIFFERENT)
     return CoarseNovelty(view, float(new_squares.mean()), float(bare.mean()))
 
 

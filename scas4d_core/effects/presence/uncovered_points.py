@@ -66,9 +66,9 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
         state: state Θ_t.
         renderer: renderer for the state.
     """
-    standing = state.retire(state.moving)
+    static_scene = state.retire(state.moving)
     bare = [one for one in seen if one.bare.any()]
-    pictures = renderer.render_each([(standing, one.view.camera) for one in bare], depth_channel=LABEL)
+    pictures = renderer.render_each([(static_scene, one.view.camera) for one in bare], depth_channel=LABEL)
     clouds = [_points(one, picture) for one, picture in zip(bare, pictures, strict=True)]
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     if not len(points):

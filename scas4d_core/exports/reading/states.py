@@ -26,7 +26,7 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-STANDS = 1e-6
+STATIC = 1e-6
 """Displacement, relative to the extent of all Gaussians, below which a Gaussian counts as static; float32 resolves
 a tenth of it."""
 
@@ -142,7 +142,7 @@ class ExportedStates:
             opacities[rows, 0] = np.maximum(opacities[rows, 0], of.opacities)
         extent = float(np.ptp(first, axis=0).max(initial=0)) if len(first) else 0.0
         far = float(np.abs(first).max(initial=0))  # ignore differences below float32's resolution
-        least = max(STANDS * extent, 4 * float(np.finfo(np.float32).eps) * far)
+        least = max(STATIC * extent, 4 * float(np.finfo(np.float32).eps) * far)
         return _GaussianTable(
             np.fromiter(ids, np.int64, len(ids)), moving[:, 0] > least, opacities[:, 0].astype(np.float32), turns
         )

@@ -23,17 +23,17 @@ def written(path, states, times=None, labels=moving.LABELS):
 def test_the_animation_puts_every_gaussian_where_it_is(tmp_path):
     found = written(tmp_path / "a.glb", [moving.state(frame) for frame in range(FRAMES)])
     by_name = {node.name: node for node in found.nodes()}
-    assert set(by_name) == {"part 0", "part 1", "standing"}
+    assert set(by_name) == {"part 0", "part 1", "static"}
     for frame in range(FRAMES):
         truth = corner.wanted(moving.state(frame), corner.Y_UP, metres=True)
-        for name, label in (("part 0", 0), ("part 1", 1), ("standing", -1)):
+        for name, label in (("part 0", 0), ("part 1", 1), ("static", -1)):
             got = found.animated(by_name[name], frame / moving.RATE)
             measured = corner.errors(got, truth.rows(label == moving.LABELS))
             assert measured["means"] < 3e-6
             assert measured["covariances"] < 1e-5
             assert measured["colours"] < 1e-6
             assert measured["opacities"] < 1e-7
-    whole = [found.animated(by_name[name], 0.0) for name in ("part 0", "part 1", "standing")]
+    whole = [found.animated(by_name[name], 0.0) for name in ("part 0", "part 1", "static")]
     columns = zip(*(vars(one).values() for one in whole), strict=True)
     together = corner.Found(*(np.concatenate(arrays) for arrays in columns))
     truth = corner.wanted(moving.state(0), corner.Y_UP, metres=True)

@@ -32,7 +32,7 @@ def test_a_known_motion_has_no_error_and_another_has_its_own(tmp_path: Path) -> 
     states = ((frame, frame / moving.RATE, moving.state(frame)) for frame in range(FRAMES))
     export_sequence(states, "glb-parts", file, world=corner.WORLD, parts=moving.LABELS)
     nodes = read_asset(file, np.arange(FRAMES) / moving.RATE)
-    assert [node.name for node in nodes] == ["part 0", "part 1", "standing"]
+    assert [node.name for node in nodes] == ["part 0", "part 1", "static"]
     off = np.eye(4)
     off[:3, 3] = [7, -2, 1]
     points = corner.wanted(moving.state(0)).means
