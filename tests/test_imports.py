@@ -174,3 +174,8 @@ def test_reconstructing_on_the_cpu_needs_no_torch() -> None:
 def test_the_doors_of_the_server_are_light() -> None:
     """The process that answers requests holds no kernels: the workers do."""
     assert not loaded_by("server.app") & {"torch", "numba", "pycolmap", "sklearn"}
+
+
+def test_workers_and_readers_start_without_heavy_packages() -> None:
+    loaded = loaded_by("server.processes.worker", "server.processes.reader_process")
+    assert not loaded & {"torch", "numba", "pycolmap", "sklearn", "scipy", "fastapi"}

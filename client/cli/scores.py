@@ -115,6 +115,7 @@ QUALITY = (
     Column("changed dB", "psnr_changed"),
     Column("SSIM", "ssim", ".4f"),
     Column("FLIP", "flip", ".4f"),
+    Column("mTV × 100", "mtv", ".3f"),
     Column("3D %", "track_3d_median"),
     Column("lost parts", "parts_lost", ".0f"),
     Column("2D %", "mte_2d"),

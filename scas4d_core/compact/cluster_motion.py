@@ -73,10 +73,10 @@ class Clusters:
         """Averages the columns [P, N] over each cluster; returns [P, count]."""
         return self.sums(columns) / self.sizes
 
-    def spread(self, values: NDArray[Any], static: float) -> Array:
-        """Maps values per cluster [count] to values per Gaussian, [N] float32; static Gaussians get ``static``."""
+    def spread(self, values: NDArray[Any], static_value: float) -> Array:
+        """Returns values per cluster [count] as values per Gaussian, [N] float32; static ones get ``static_value``."""
         table = np.empty(self.count + 1, np.float32)
-        table[NO_CLUSTER], table[1:] = static, values
+        table[NO_CLUSTER], table[1:] = static_value, values
         return table[self.labels]
 
     def rows(self, rows: NDArray[np.intp]) -> Clusters:
@@ -162,7 +162,10 @@ class ClusterMotion:
         factors = np.stack(multiply_rows(spread, reference.factors))
         turns = polar_rotations(maps)
         own = np.stack(
-            [clusters.spread(one, static) for one, static in zip(quaternions_of(turns).T, IDENTITY, strict=True)]
+            [
+                clusters.spread(one, static_value)
+                for one, static_value in zip(quaternions_of(turns).T, IDENTITY, strict=True)
+            ]
         )
         gloss = reference.gloss
         if gloss is not None:

@@ -12,6 +12,7 @@ frame makes these calls, in order::
     engine.iterate(views, step)             # once per iteration: deform, render, compare, backward, Adam
     engine.log(), engine.leave_out(views)   # once all cameras have been rendered: exclude outlier cameras
     engine.probe(...)                       # for the stopping criterion, and at the end
+    engine.log()                            # losses, kept renderings and guards; read with the last probe
     engine.state(learnt=True)               # Θ_t
 
 Results are read by ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains``, never during an iteration.

@@ -120,7 +120,7 @@ class Neighbourhoods:
     @cached_property
     def rows(self) -> NDArray[np.int64]:
         """[M, count] rows of the nearest Gaussians, starting with the Gaussian itself."""
-        from scipy.spatial import cKDTree  # deferred import: processes that only render start faster
+        from scipy.spatial import cKDTree  # deferred import: workers and readers start without SciPy
 
         nearest: NDArray[np.int64] = np.asarray(cKDTree(self.means).query(self.means, self.count)[1])
         return nearest.reshape(len(self.means), -1)
@@ -158,8 +158,12 @@ class Renderer(Protocol):
     ) -> Iterator[Picture]:
         """Renders several pairs of a state and a camera, in order; see ``render``.
 
-        All states have the same number of Gaussians. The next picture may overwrite the last one. On a GPU, the host
-        waits once for several pictures.
+        Pictures may be rendered only when they are requested. Use or copy each one before the next call of the
+        renderer, which may overwrite it. On a GPU, the host waits once for several pictures.
+
+        Args:
+            shots: states, with the same number of Gaussians each, and cameras in kernel format.
+            depth_channel: channel to overwrite with the depth of each mean (metres along z), or −1.
         """
 
     def render_levels(
@@ -175,7 +179,7 @@ class Renderer(Protocol):
         """
 
     def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
-        """Renders a state from each view and compares it with the view's training image; see ``render``."""
+        """Returns one comparison per view, of a rendering of the state with the view's training image."""
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """Returns the sums [N, P] of ``planes`` [P, H, W] over pixels, weighted by each Gaussian's blending weights.

@@ -181,13 +181,16 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
 
 
 def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Computes the flicker, in 8-bit levels, and the number of still pixels over which it is averaged.
+    """Computes two measures of flicker over the pixels of the test cameras that are still in all frames.
 
-    The flicker is None if there are fewer than ``MIN_STILL`` still pixels.
+    ``flicker`` is the standard deviation over time, in 8-bit levels. ``mtv`` is the masked total variation: 100 times
+    the mean absolute change between consecutive frames, with values in [0, 1] (mTV × 100, as in OR², Kim et al. 2025).
+    ``still_pixels`` counts the pixels. Both measures are None if there are fewer than ``MIN_STILL``.
     """
     rig = capture.test_rig
     assert rig is not None
     deviations: list[NDArray[Any]] = []
+    variations: list[NDArray[Any]] = []
     for camera in rig.cameras:
         # Frames are loaded one at a time, because a long capture does not fit into memory.
         lowest = highest = capture.test_frame(indices[0]).images[camera.name]
@@ -195,17 +198,23 @@ def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequen
             true = capture.test_frame(index).images[camera.name]
             lowest, highest = np.minimum(lowest, true), np.maximum(highest, true)
         still = ((highest - lowest).max(axis=-1) <= STILL_LEVELS) & (highest.max(axis=-1) > 0)
-        mean, squares = np.float64(0), np.float64(0)
+        mean, squares, changes = (np.zeros((int(still.sum()), 3)) for _ in range(3))
+        last: NDArray[np.float64] | None = None
         for count, index in enumerate(indices, 1):
             shown = np.clip(reconstruction.render(camera, index).colour[still], 0, 1).astype(np.float64)
             before = shown - mean
             mean = mean + before / count
             squares = squares + before * (shown - mean)
+            changes = changes + (0 if last is None else np.abs(shown - last))
+            last = shown
         deviations.append(255 * np.sqrt(squares / len(indices)))
-    flicker = np.concatenate(deviations)
+        variations.append(100 * changes / max(1, len(indices) - 1))
+    flicker, variation = np.concatenate(deviations), np.concatenate(variations)
+    enough = len(flicker) >= MIN_STILL
     return {
         "still_pixels": float(len(flicker)),
-        "flicker": float(flicker.mean()) if len(flicker) >= MIN_STILL else None,
+        "flicker": float(flicker.mean()) if enough else None,
+        "mtv": float(variation.mean()) if enough else None,
     }
 
 

@@ -118,8 +118,8 @@ class FrameUpdate:
             if stopping.needs_error(iteration):
                 stopping.record_error(iteration, best.error())
                 watch.lap("looks")
-        trace.kept = attempt.kept = best.end(iteration, trace.left_out)  # an engine reads its log with these errors
-        trace.load_log(engine.log(), views)
+        trace.kept = attempt.kept = best.end(iteration, trace.left_out)
+        trace.load_log(engine.log(), views)  # after the errors of `end`: a GPU engine downloads its log with them
         trace.planned, trace.errors = stopping.planned_so_far, best.errors
         trace.whole = best.whole
         watch.lap("end")

@@ -1,1 +1,1 @@
-"""HTTP middleware and helpers: authentication, permissions, origin checks, body limits, compression and errors."""
+"""HTTP middleware and helpers: authentication, permissions, origin checks, body limits, errors and OpenAPI document."""

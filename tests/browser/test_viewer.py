@@ -74,7 +74,7 @@ def test_the_effects_are_listed_with_what_switched_them(page, service):
         assert usual.startswith("In every update: ")
         assert "rigidity" in usual
         assert "floor" in idle
-        assert "standing" not in usual + idle
+        assert "static colour" not in usual + idle
         sdk.delete_scene(id)
 
 

@@ -85,8 +85,8 @@ class Shadows(Effect):
         # If all Gaussians appear to move, as without masks, the static ones are not known yet.
         hidden = _hidden(seen.views, state, seen.renderer) if share else [np.zeros(each.shape[:2]) for each in means]
         return {
-            view.name: np.concatenate([mean, behind[..., None]], axis=-1).astype(np.float16)
-            for view, mean, behind in zip(seen.views, means, hidden, strict=True)
+            view.name: np.concatenate([mean, reached[..., None]], axis=-1).astype(np.float16)
+            for view, mean, reached in zip(seen.views, means, hidden, strict=True)
         }
 
     def on_at_first(self, seen: FrameObservation) -> bool:
@@ -138,7 +138,7 @@ def _compared(
 
 def _hidden(views: Sequence[TrainingView], state: Gaussians, renderer: Renderer) -> list[Mask]:
     """Returns the [h, w] mask of each view's blocks that moving Gaussians reach."""
-    masks, each = [], SIDE // BLOCK
+    masks, each = [], SIDE // BLOCK  # blocks per side of a square
     for view, blocks in zip(views, renderer.reached(state, [view.camera for view in views]), strict=True):
         height, width = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE
         grid = blocks[: height * each, : width * each].reshape(height, each, width, each)

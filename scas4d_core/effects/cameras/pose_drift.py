@@ -18,7 +18,7 @@ frames with misaligned cameras, but it uses all cameras.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
 from typing import TYPE_CHECKING, Any
@@ -250,8 +250,9 @@ class PoseDrift(Effect):
             for row, (one, _, lens) in aligned.items():
                 poses.moved[row] = pixel_offset(lens, poses.twists[row], one.depth)
         elif not on:
-            for view in [*(view for view in seen.views if seems[rows[view.name]]), *seen.suspects]:
-                _record_offset(poses, rows[view.name], view, _rendered(seen, view)[0], 1)
+            suspects = [*(view for view in seen.views if seems[rows[view.name]]), *seen.suspects]
+            for view, shown, _ in _rendered(seen, suspects):
+                _record_offset(poses, rows[view.name], view, shown, 1)
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
@@ -288,8 +289,7 @@ def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) ->
 def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
     """Returns the equations, camera and lens of each view with enough texture, keyed by camera row."""
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
-    for view in views:
-        shown, depth = _rendered(seen, view)
+    for view, shown, depth in _rendered(seen, views):
         compared = align_pixels(view.target[:3], _exposed(view, shown))
         if compared is not None:
             equations = twist_equations(view.camera.lens, compared, depth)
@@ -307,13 +307,16 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
     return view.exposure[:3, 0, None, None] * shown + view.exposure[:3, 1, None, None]
 
 
-def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]:
-    """Returns a view's rendering [3, H, W] without exposure, and its depth [H, W] along z in metres, NaN if empty."""
-    state = seen.result.gaussians
-    planes, rest = seen.renderer.render(state, view.camera, depth_channel=LABEL)
-    alpha = 1 - rest
-    depth = np.where(alpha > COVERED, planes[LABEL] / np.maximum(alpha, np.float32(COVERED)), np.float32(np.nan))
-    return planes[:3].copy(), depth
+def _rendered(seen: FrameObservation, views: Sequence[TrainingView]) -> Iterator[tuple[TrainingView, Array, Array]]:
+    """Yields each view with its rendering [3, H, W] without exposure, valid until the next one, and its depth.
+
+    The depth [H, W] is along z in metres, or NaN where nothing is rendered.
+    """
+    shots = [(seen.result.gaussians, view.camera) for view in views]
+    for view, (planes, rest) in zip(views, seen.renderer.render_each(shots, depth_channel=LABEL), strict=True):
+        alpha = 1 - rest
+        depth = np.where(alpha > COVERED, planes[LABEL] / np.maximum(alpha, np.float32(COVERED)), np.float32(np.nan))
+        yield view, planes[:3], depth
 
 
 EFFECT = PoseDrift(

@@ -105,8 +105,8 @@ def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
     >>> int(with_reliable_labels(few_static).moving.sum())  # 5 static labels in 100 are noise
     100
     """
-    static = int((~gaussians.moving).sum())
-    if not 0 < static < MIN_STATIC * len(gaussians):
+    static_count = int((~gaussians.moving).sum())
+    if not 0 < static_count < MIN_STATIC * len(gaussians):
         return gaussians
     return gaussians.replace(foreground=np.where(gaussians.moving, gaussians.foreground, np.float32(1)))
 

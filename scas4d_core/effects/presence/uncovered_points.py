@@ -85,7 +85,12 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
 
 
 def _points(one: Novelty, picture: Picture) -> Float:
-    """Returns the [P, 3] surface points in the bare pixels of a camera, from the static scene's colours and depth."""
+    """Returns the [P, 3] surface points in the bare pixels of a camera.
+
+    Args:
+        one: novelty map of the camera.
+        picture: rendering of the static scene, with the depth along z in metres in the label channel.
+    """
     planes, rest = picture
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = (1 - rest) / planes[LABEL]

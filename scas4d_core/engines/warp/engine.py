@@ -162,6 +162,8 @@ class WarpEngine:
 
     def set_tables(self, tables: Tables) -> None:
         """See ``UpdateEngine.set_tables``."""
+        if self._pending:  # if they were repeated later, they would replace the tables
+            self._settle()
         self._deformation.set_tables(tables)
         self._unchanged = 0
         self._tables = None
@@ -202,6 +204,7 @@ class WarpEngine:
         if self._used_rows + len(views) > LOG_ROWS:
             self._settle()
         self._history.append((views, step))
+        self._log_is_unread = True
         self._tables = None
         keeps = [self._slot(view) if step.keep_pictures else 0 for view in views]
         rows = range(self._used_rows, self._used_rows + len(views))
@@ -290,7 +293,7 @@ class WarpEngine:
 
     def _settle(self) -> None:
         """Reads the log of all pending iterations, repeating the attempt until all tile lists are large enough."""
-        while self._pending and self._read_log() is None:
+        while self._log_is_unread and self._read_log() is None:
             pass
 
     def _read_log(self, probes: int = 0) -> Array | None:
@@ -376,8 +379,7 @@ class WarpEngine:
 
     def log(self) -> IterationLog:
         """See ``UpdateEngine.log``. The host only waits if it has not read the log since the last iteration."""
-        while (self._pending or self._log_is_unread) and self._read_log() is None:
-            pass
+        self._settle()
         return self._log
 
     def _adam_counts(self) -> list[wp.array]:

@@ -38,8 +38,9 @@ wp.set_module_options({"enable_backward": False})
 Array = NDArray[np.float32]
 PADDING = 32
 """Tile size in pixels. ``reached`` pads images to a multiple of this size."""
-PIXELS_AT_ONCE = 2**23
-"""Approximate number of pixels, of four features and transmittance each, that ``render_each`` downloads at once."""
+PIXELS_AT_ONCE = 2**21
+"""Maximum number of pixels that ``render_each`` downloads at once, but at least one picture. A pixel takes 20 bytes,
+so the pictures take at most 42 MB, or as much as one larger picture."""
 
 
 @wp.kernel

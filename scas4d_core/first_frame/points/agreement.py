@@ -100,9 +100,9 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     # Two cameras can agree by chance anywhere along an epipolar line, so surfaces that are fitted
     # to such points are unreliable.
     if not plain and min_views > 2 and len(triangulated.positions) >= 10:
-        static = triangulated.positions[~_in_foreground(views, triangulated)]
+        static_points = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
-            static,
+            static_points,
             np.array([view.camera.centre for view in views]),
             TOLERANCE * search.radius,
             seed=seed,

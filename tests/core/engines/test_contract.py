@@ -183,6 +183,21 @@ def test_tables_come_back_as_they_were_set(engine: UpdateEngine) -> None:
     assert np.array_equal(engine.tables().deltas, back.deltas)
 
 
+def test_tables_after_a_state_are_those_of_the_last_iteration(engine: UpdateEngine) -> None:
+    scene = case()
+    loaded(engine, scene)
+    seen = []
+    for view in (0, 1):
+        engine.iterate([view], step())
+        engine.state(learnt=True)  # an engine may read the tables with it
+        seen.append(engine.tables())
+    engine.iterate([2], step())
+    seen.append(engine.tables())
+    assert len({tables.deltas.tobytes() for tables in seen}) == 3
+    engine.set_tables(seen[0])
+    assert np.array_equal(engine.tables().deltas, seen[0].deltas)
+
+
 def test_a_probe_of_the_state_before_does_not_depend_on_the_tables(engine: UpdateEngine) -> None:
     scene = case()
     loaded(engine, scene)
@@ -231,11 +246,14 @@ def test_layers_that_rest_do_not_move(engine: UpdateEngine) -> None:
     assert not np.array_equal(after.clusters[1], tables.clusters[1])
 
 
-def test_the_log_has_every_rendering_and_the_last_pictures(engine: UpdateEngine) -> None:
+@pytest.mark.parametrize("probed", [False, True])
+def test_the_log_has_every_rendering_and_the_last_pictures(engine: UpdateEngine, probed: bool) -> None:
     scene = case()
     loaded(engine, scene)
     for iteration in range(4):
         engine.iterate([iteration, 4], step(keep_pictures=iteration >= 2))
+    if probed:
+        engine.probe([0], moved=True, learnt=True)  # an engine may read the log with it
     log = engine.log()
     assert len(log.losses) == 4
     assert [row.view for row in log.rendered] == [0, 4, 1, 4, 2, 4, 3, 4]

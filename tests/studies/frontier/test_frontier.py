@@ -333,8 +333,12 @@ def test_flicker_is_told_of_pixels_that_show_something_and_stand(monkeypatch):
     found = measures.measure_flicker(scene, capture, range(4))
     assert found["still_pixels"] == 50 * 20
     assert found["flicker"] == pytest.approx((255 * shown[:, 30, 5, 0]).std())
+    assert found["mtv"] == pytest.approx(100 * np.abs(np.diff(shown[:, 30, 5, 0])).mean())
+    assert found["mtv"] > 1
     monkeypatch.setattr(measures, "MIN_STILL", 1001)
-    assert measures.measure_flicker(scene, capture, range(4))["flicker"] is None
+    few = measures.measure_flicker(scene, capture, range(4))
+    assert few["flicker"] is None
+    assert few["mtv"] is None
 
 
 def test_the_drift_goes_through_whole_captures(tmp_path):
