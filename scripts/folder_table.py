@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
-PACKAGES = ("scas4d_core", "server", "client")
+PACKAGES = ("scas4d_core", "server", "client", "studies")
 BEGIN, END = "<!-- folders: written by scripts/folder_table.py -->\n", "<!-- end of folders -->"
 
 
@@ -30,10 +30,9 @@ def first_line(package: Path) -> str:
 
 
 def folders() -> Iterator[Path]:
-    """Yields every product package, parents before children, then `studies` without its subpackages."""
+    """Yields every package, parents before children."""
     for name in PACKAGES:
         yield from sorted(path.parent for path in (ROOT / name).rglob("__init__.py"))
-    yield ROOT / "studies"
 
 
 def table() -> str:

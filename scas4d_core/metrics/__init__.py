@@ -1,4 +1,4 @@
-"""Metrics that compare images, tracks and parts with ground truth."""
+"""Metrics that compare images, tracks and parts with ground truth, and the flicker of still pixels."""
 
 from scas4d_core.metrics.benchmarks import (
     BenchmarkScores,
