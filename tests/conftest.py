@@ -48,6 +48,8 @@ SECOND_PROCESSOR = (
     "tests/studies/hard_cases/",
 )  # fmt: skip
 """The same folders are named in .ci/run."""
+SAME_ON_ALL = ("tests/core/engines/warp/",)
+"""Of these, tests whose kernels do not depend on Numba's processor: Warp compiles its own."""
 
 
 def path_of(item: pytest.Item) -> str:
@@ -62,7 +64,7 @@ def add_marks(item: pytest.Item) -> None:
         item.add_marker("slow")
     if path.startswith(BROWSER):
         item.add_marker("browser")
-    if path.startswith(SECOND_PROCESSOR) and not path.startswith(WITHOUT_KERNELS):
+    if path.startswith(SECOND_PROCESSOR) and not path.startswith((*WITHOUT_KERNELS, *SAME_ON_ALL)):
         item.add_marker("second_processor")
     if SERVICE_FIXTURES & set(item.fixturenames) or SERVICE_STARTERS & vars(item.module).keys():
         item.add_marker("service")
