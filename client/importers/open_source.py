@@ -104,7 +104,7 @@ def open_source(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder")
+        raise CaptureError(f"{folder}: no such folder; check the path")
     if fps is not None and not 0 < fps < 1e6:
         raise CaptureError(f"fps must be a positive number; got {fps!r}")
     if calibration is None and (folder / TRAIN_META).exists():

@@ -55,7 +55,7 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder")
+        raise CaptureError(f"{folder}: no such folder; check the path")
     if (folder / TRAIN_META).exists():
         return read_dynamic3dgs(folder, **options)
     raise CaptureError(f"{folder}: unknown capture layout; Dynamic3DGaussians captures contain {TRAIN_META}")
