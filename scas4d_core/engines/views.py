@@ -76,6 +76,11 @@ class TrainingView:
             return self.source[0]
         return np.ascontiguousarray(np.moveaxis(np.rint(255 * self.target[:3]).astype(np.uint8), 0, -1))
 
+    def exposed(self, colours: Array) -> Array:
+        """Returns a rendering's colours [3, H, W], which may be subsampled, with the camera's exposure applied."""
+        exposed: Array = self.exposure[:3, 0, None, None] * colours + self.exposure[:3, 1, None, None]
+        return exposed
+
     @cached_property
     def mean(self) -> NDArray[np.float64]:
         """Mean RGB [3] of the image in [0, 1], computed on first access."""

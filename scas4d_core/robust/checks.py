@@ -196,10 +196,7 @@ def with_light_gain(state: Gaussians, gain: float) -> Gaussians:
 def _shown(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> list[Array]:
     """Returns the [3, H, W] rendering of the state in each view, with the camera's exposure."""
     pictures = renderer.render_each([(state, view.camera) for view in views])
-    return [
-        view.exposure[:LABEL, 0, None, None] * picture.features[:LABEL] + view.exposure[:LABEL, 1, None, None]
-        for view, picture in zip(views, pictures, strict=True)
-    ]
+    return [view.exposed(picture.features[:LABEL]) for view, picture in zip(views, pictures, strict=True)]
 
 
 def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None:

@@ -113,10 +113,9 @@ def cell_errors(view: TrainingView, factory: ViewFactory, renderer: Renderer, st
     while max(view.camera.width, view.camera.height) >= 2 * RENDERED:
         scale /= 2
         view = factory.coarser(view, scale)
-    gain, offset = view.exposure[:LABEL, 0, None, None], view.exposure[:LABEL, 1, None, None]
     features, transmittance = renderer.render(state, view.camera)
     edge = max(SMALLEST, -(-max(transmittance.shape) // CELLS))
-    squares = _cells(np.square(view.target[:LABEL] - (gain * features[:LABEL] + offset)).mean(axis=0), edge)
+    squares = _cells(np.square(view.target[:LABEL] - view.exposed(features[:LABEL])).mean(axis=0), edge)
     opaque = squares[_cells(transmittance, edge) < 0.5]
     usual = float(np.percentile(opaque, USUAL_PERCENTILE)) if len(opaque) else 0.0
     return CellErrors(squares, usual, edge * full / view.camera.width)

@@ -48,8 +48,7 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Ren
     for view in views:
         before = next(pictures).features[LABEL] > 0.5
         behind = next(pictures).features[:3]
-        shown = view.exposure[:3, 0, None, None] * behind + view.exposure[:3, 1, None, None]
-        now = np.abs(view.target[:3] - shown).max(axis=0) > DIFFERENT
+        now = np.abs(view.target[:3] - view.exposed(behind)).max(axis=0) > DIFFERENT
         if not before.any() or not SMALLEST_AREA <= now.sum() / before.sum() <= 1 / SMALLEST_AREA:
             continue
         camera = rig[view.name]

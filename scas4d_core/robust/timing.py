@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.engines.renderer import Renderer
-from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import CameraTiming, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.outliers import Past
@@ -170,9 +169,7 @@ def record_timing(
         several = islice(pictures, len(states))
         here, there, *now = (picture.features[:3, ::every, ::every].copy() for picture in several)
         shown = now[0] if now else planes[:3]
-        shifts = measure_shift(
-            view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there))
-        )
+        shifts = measure_shift(view.target[:3, ::every, ::every], *(view.exposed(one) for one in (shown, here, there)))
         known = replace(looks.get(view.name, CameraTimingSums()), last=float(index))
         looks[view.name] = known if shifts is None else known.with_picture(shifts, way, frame)
     return replace(past, timing={name: astuple(one) for name, one in looks.items()})
@@ -181,11 +178,6 @@ def record_timing(
 def astuple(looks: CameraTimingSums) -> Row:
     """Returns the sums as a row of ``Past.timing``."""
     return looks.weight, looks.squares, looks.offset, looks.spread, looks.frame, looks.last
-
-
-def _exposed(view: TrainingView, shown: Array) -> Array:
-    exposed: Array = view.exposure[:3, 0, None, None] * shown + view.exposure[:3, 1, None, None]
-    return exposed
 
 
 def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> PictureTiming | None:

@@ -290,7 +290,7 @@ def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tup
     """Returns the equations, camera and lens of each view with enough texture, keyed by camera row."""
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view, shown, depth in _rendered(seen, views):
-        compared = align_pixels(view.target[:3], _exposed(view, shown))
+        compared = align_pixels(view.target[:3], view.exposed(shown))
         if compared is not None:
             equations = twist_equations(view.camera.lens, compared, depth)
             by_row[rows[view.name]] = (equations, seen.rig[view.name], view.camera.lens)
@@ -298,13 +298,9 @@ def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tup
 
 
 def _record_offset(poses: Poses, row: int, view: TrainingView, shown: Array, every: int) -> None:
-    compared = align_pixels(view.target[:3], _exposed(view, shown), every)
+    compared = align_pixels(view.target[:3], view.exposed(shown), every)
     if compared is not None:
         poses.record_offset(row, turn_equations(view.camera.lens, compared))
-
-
-def _exposed(view: TrainingView, shown: Array) -> Array:
-    return view.exposure[:3, 0, None, None] * shown + view.exposure[:3, 1, None, None]
 
 
 def _rendered(seen: FrameObservation, views: Sequence[TrainingView]) -> Iterator[tuple[TrainingView, Array, Array]]:

@@ -133,8 +133,7 @@ def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
     """Returns a coarse estimate from a view and its rendering. All four pixels of a 2 × 2 block must agree."""
     every, shown = thinned
     target = view.target[:, ::every, ::every]
-    gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
-    difference = sum(_corners(np.abs(target[:3] - (gain * shown[:3] + offset)).mean(axis=0))) / 4
+    difference = sum(_corners(np.abs(target[:3] - view.exposed(shown[:3])).mean(axis=0))) / 4
     label, transmittance = shown[3], shown[4]
     if len(target) > 3:
         new, static = (target[3] > 0.5) & (label < ABSENT), (target[3] <= 0.5) & (label < ABSENT)
@@ -199,7 +198,7 @@ def measure_novelty(
 def _novelty(view: TrainingView, camera: Camera, picture: Picture) -> Novelty:
     planes, transmittance = picture
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
-    difference: Array = view.target[:3] - (gain * planes[:3] + offset)
+    difference: Array = view.target[:3] - view.exposed(planes[:3])
     label = planes[3]
     blurred = uniform_filter(np.abs(difference).mean(axis=0), RIM)
     if len(view.target) > 3:
