@@ -220,6 +220,20 @@ class IterationLog:
             del self.pictures[old]
 
 
+class Probe(NamedTuple):
+    """Request to compare a state with probe views; see ``UpdateEngine.probe``.
+
+    Attributes:
+        views: indices of the probe views.
+        moved: whether to deform Θ_{t−1} with the current tables.
+        learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
+    """
+
+    views: Sequence[int]
+    moved: bool
+    learnt: bool
+
+
 class UpdateEngine(Protocol):
     """Interface of an engine that runs the updates of one scene on one device.
 
@@ -271,13 +285,13 @@ class UpdateEngine(Protocol):
     def wait(self, iteration: int) -> None:
         """Waits until only a few iterations are pending, so that host timings reflect the work on the device."""
 
-    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
-        """Returns the image loss of a state on each of the selected probe views.
+    def probe(self, *probes: Probe, state_next: bool = False) -> list[list[float]]:
+        """Returns the image losses of each probe, one per view. A GPU engine waits once for all probes.
 
         Args:
-            which: indices of the probe views.
-            moved: whether to deform Θ_{t−1} with the current tables.
-            learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
+            probes: the states to render, and the probe views to compare them with.
+            state_next: whether ``state(learnt=True)`` will be called next. A GPU engine then downloads the state with
+                the losses.
         """
 
     def tables(self) -> Tables:

@@ -12,7 +12,7 @@ from math import nan
 import numpy as np
 
 from scas4d_core.cameras import Rig, farthest_first
-from scas4d_core.engines.engine import Tables, UpdateEngine
+from scas4d_core.engines.engine import Probe, Tables, UpdateEngine
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
@@ -83,7 +83,7 @@ class ProbeViews:
 
     Attributes:
         views: the probe views at full size, followed by the scaled ones if they are used.
-        whole: whether full-size images are compared; known after the first comparison.
+        whole: whether full-size images are compared; known after ``start_errors``.
     """
 
     def __init__(self, factory: ViewFactory, engine: UpdateEngine, views: Sequence[TrainingView]) -> None:
@@ -95,29 +95,44 @@ class ProbeViews:
         self._names = [view.name for view in whole]
         self._whole = range(len(whole))
         self._compared = self._whole if self.whole else range(len(whole), 2 * len(whole))
-        self._engine, self._looked = engine, self.whole
+        self._engine = engine
 
-    def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
+    def start_errors(self, warm: bool) -> list[dict[str, float]]:
+        """Returns the errors of Θ_{t−1} and, if ``warm``, of Θ_{t−1} deformed by the current tables.
+
+        If the small images show aliasing in Θ_{t−1}, this call and all later ones compare full-size images.
+        """
+        states = [False, True] if warm else [False]
+        if not self._names:
+            return [{} for _ in states]
+        probes = [Probe(self._compared, moved, learnt=False) for moved in states]
+        if self.whole:
+            losses = self._engine.probe(*probes)
+        else:
+            *losses, (whole,) = self._engine.probe(*probes, Probe(self._whole[:1], moved=False, learnt=False))
+            if losses[0][0] > ALIASED * whole:
+                self._compared, self.whole = self._whole, True
+                losses = self._engine.probe(*[probe._replace(views=self._whole) for probe in probes])
+        return [dict(zip(self._names, each, strict=True)) for each in losses]
+
+    def errors(self, *, moved: bool, learnt: bool, state_next: bool = False) -> dict[str, float]:
         """Returns the image loss of a state in each probe view, keyed by camera name.
 
         Args:
-            moved, learnt: select the state; see ``UpdateEngine.probe``.
+            moved, learnt: select the state; see ``Probe``.
+            state_next: whether the learnt state is read next; see ``UpdateEngine.probe``.
         """
-        if not self._looked and self._names:  # the first evaluated state is that of the previous frame
-            self._looked = True
-            small, whole = (
-                self._engine.probe([views[0]], moved=moved, learnt=learnt)[0] for views in (self._compared, self._whole)
-            )
-            if small > ALIASED * whole:
-                self._compared, self.whole = self._whole, True
-        return self._errors(self._compared, moved, learnt)
+        return self._errors(self._compared, moved, learnt, state_next)
 
     def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         """Returns ``errors`` on full-size images."""
         return self._errors(self._whole, moved, learnt)
 
-    def _errors(self, which: Sequence[int], moved: bool, learnt: bool) -> dict[str, float]:
-        return dict(zip(self._names, self._engine.probe(which, moved=moved, learnt=learnt), strict=True))
+    def _errors(self, views: Sequence[int], moved: bool, learnt: bool, state_next: bool = False) -> dict[str, float]:
+        if not self._names:
+            return {}
+        (losses,) = self._engine.probe(Probe(views, moved, learnt), state_next=state_next)
+        return dict(zip(self._names, losses, strict=True))
 
 
 def is_slow_motion(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
@@ -192,10 +207,11 @@ class BestState:
                 None, the motion is extrapolated over the whole time since it was measured.
         """
         motion = self._motion
-        self._record(Candidate.PREVIOUS, self._probes.errors(moved=False, learnt=False))
         tables = self._set(motion)
+        starts = [Candidate.PREVIOUS] if motion is None else [Candidate.PREVIOUS, Candidate.WARM]
+        for candidate, errors in zip(starts, self._probes.start_errors(warm=motion is not None), strict=True):
+            self._record(candidate, errors)
         if motion is not None and self.errors:
-            self._record(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
             if step is not None:
                 tables = self._try_after_pause(motion, step)
             if self._mean(Candidate.PREVIOUS) < self._mean(Candidate.WARM):
@@ -264,7 +280,7 @@ class BestState:
         if not self.errors:
             return Candidate.END
         if iterations:
-            self._record(Candidate.END, self._probes.errors(moved=True, learnt=True))
+            self._record(Candidate.END, self._probes.errors(moved=True, learnt=True, state_next=True))
         names = [name for name in self.errors[Candidate.PREVIOUS] if name not in left_out]
         # the first of equal candidates wins
         compared = [candidate for candidate in Candidate if candidate in self.errors]

@@ -16,7 +16,7 @@ from scas4d_core import preparation, reconstruction
 from scas4d_core.engines.choose import Device
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
-from scas4d_core.engines.engine import REPORT, StepScalars, Thinned, UpdateEngine, ViewRecord
+from scas4d_core.engines.engine import REPORT, Probe, StepScalars, Thinned, UpdateEngine, ViewRecord
 from scas4d_core.engines.limits import Limits
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import CHANNELS, Comparison, Picture, Renderer
@@ -105,9 +105,9 @@ class NullEngine(CpuEngine):
                 self._log.keep(index, Thinned.of(features, np.zeros_like(target[0])))
         self._start.lap(REPORT)
 
-    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
+    def probe(self, *probes: Probe, state_next: bool = False) -> list[list[float]]:
         """Returns the same loss for every probe view."""
-        return [LOSS for _ in which]
+        return [[LOSS for _ in probe.views] for probe in probes]
 
 
 def _key(camera: CameraArrays) -> bytes:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, Update
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.engines.renderer import Renderer
-    from scas4d_core.engines.views import TrainingView
+    from scas4d_core.engines.views import CameraArrays, TrainingView
     from scas4d_core.settings import Settings
 
 Mask = NDArray[np.bool_]
@@ -41,6 +42,11 @@ ENOUGH = 0.5
 """Minimum share of frame 0's cameras that a frame must contain for an update; with fewer, noise would be learnt."""
 MIN_STATIC = 0.05
 """Minimum share of static Gaussians; with fewer, there is no background to receive shadows."""
+
+
+_hidden_cache: WeakKeyDictionary[Gaussians, dict[str, tuple[CameraArrays, Mask]]] = WeakKeyDictionary()
+"""Camera and mask of each view of a state, keyed by camera name; see ``_hidden``. The update and the evidence use
+them."""
 
 
 class ShadowsPart(UpdatePart):
@@ -61,7 +67,9 @@ class ShadowsPart(UpdatePart):
         compared = _compared(before, known, state, attempt.renderer)
         if sum((squares & static).sum() for squares, static in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
-        return follow_pictures(state, known, attempt.renderer, self._static)
+        followed = follow_pictures(state, known, attempt.renderer, self._static)
+        _hidden_cache[followed] = _hidden_cache[state]  # only colours have changed
+        return followed
 
 
 @dataclass(frozen=True)
@@ -138,12 +146,13 @@ def _compared(
 
 def _hidden(views: Sequence[TrainingView], state: Gaussians, renderer: Renderer) -> list[Mask]:
     """Returns the [h, w] mask of each view's blocks that moving Gaussians reach."""
-    masks, each = [], SIDE // BLOCK  # blocks per side of a square
-    for view, blocks in zip(views, renderer.reached(state, [view.camera for view in views]), strict=True):
+    known, each = _hidden_cache.setdefault(state, {}), SIDE // BLOCK  # blocks per side of a square
+    missing = [view for view in views if view.name not in known or known[view.name][0] is not view.camera]
+    for view, blocks in zip(missing, renderer.reached(state, [view.camera for view in missing]), strict=True):
         height, width = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE
         grid = blocks[: height * each, : width * each].reshape(height, each, width, each)
-        masks.append(np.asarray(grid.any(axis=(1, 3))))
-    return masks
+        known[view.name] = view.camera, np.asarray(grid.any(axis=(1, 3)))
+    return [known[view.name][1] for view in views]
 
 
 EFFECT = Shadows(

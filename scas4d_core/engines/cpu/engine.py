@@ -20,6 +20,7 @@ from scas4d_core.engines.engine import (
     REPORT,
     AttemptStart,
     IterationLog,
+    Probe,
     StepScalars,
     Tables,
     Thinned,
@@ -217,19 +218,23 @@ class CpuEngine:
     def wait(self, iteration: int) -> None:
         """See ``UpdateEngine.wait``. Does nothing, because the host itself is the device."""
 
-    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
+    def probe(self, *probes: Probe, state_next: bool = False) -> list[list[float]]:
         """See ``UpdateEngine.probe``."""
+        return [self._losses(probe) for probe in probes]
+
+    def _losses(self, probe: Probe) -> list[float]:
+        """Returns the image loss on each view of a probe."""
         state, turns = self._previous, None
-        if learnt:
+        if probe.learnt:
             state = self._with_looks(state)
-        if moved:
+        if probe.moved:
             self._forward()
             if state.gloss is not None:
                 turns = without_turn(len(state))
                 turns[self._rows] = self._deformation.turns
             state = state.replace(means=self._deformation.means, factors=self._deformation.factors)
         losses = []
-        for index in which:
+        for index in probe.views:
             view = self._probes[index]
             features = features_seen(state, view.camera, turns)
             self.renderer.forward(state.means, state.factors, state.opacities, features, view)

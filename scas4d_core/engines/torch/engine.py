@@ -23,6 +23,7 @@ from scas4d_core.engines.engine import (
     GAINS_MISSING,
     AttemptStart,
     IterationLog,
+    Probe,
     StepScalars,
     Tables,
     Thinned,
@@ -210,18 +211,24 @@ class TorchEngine:
         """See ``UpdateEngine.wait``. Does nothing, because the host itself is the device."""
 
     @torch.no_grad()
-    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
+    def probe(self, *probes: Probe, state_next: bool = False) -> list[list[float]]:
         """See ``UpdateEngine.probe``."""
+        return [self._losses(probe) for probe in probes]
+
+    def _losses(self, probe: Probe) -> list[float]:
+        """Returns the image loss on each view of a probe."""
         scene, previous = self._scene, self._scene.previous
-        now = scene.moved(self._parameters) if moved else Moved(scene.means, scene.factors, no_turns(len(scene.rows)))
+        now = Moved(scene.means, scene.factors, no_turns(len(scene.rows)))
+        if probe.moved:
+            now = scene.moved(self._parameters)
         colours, looks = scene.colours, self._parameters.gloss
         gloss = None if previous.gloss is None else leaf(previous.gloss)
         environment = None if previous.environment is None else leaf(previous.environment)
-        if learnt:
+        if probe.learnt:
             colours = scene.all_colours(self._parameters)
             gloss, environment = (gloss, environment) if looks is None else (looks.gloss, looks.environment)
         errors = []
-        for index in which:
+        for index in probe.views:
             view = self._probes[index]
             features = scene.seen(now, colours, gloss, environment, view.camera)
             planes, _ = self._rendered(view, now, features)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.warp import cluster_map, gaussian_deltas
 from scas4d_core.engines.warp.adam import Optimizer
 from scas4d_core.engines.warp.copies import DeviceCopies, structures_on, upload
-from scas4d_core.engines.warp.downloads import Downloads
 from scas4d_core.engines.warp.lanes import lanes_of
 from scas4d_core.engines.warp.nearest import nearest
 from scas4d_core.engines.warp.neighbour_terms import neighbour_terms, weigh_pairs
@@ -26,7 +26,7 @@ TABLES = 4
 class WarpDeformation:
     """The parameters of a deformation with their optimizers, and the resulting Gaussians.
 
-    Only ``read_tables`` waits for the device. ``forward`` and ``backward`` can be captured in a CUDA graph.
+    No method waits for the device. ``forward`` and ``backward`` can be captured in a CUDA graph.
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0".
@@ -60,7 +60,7 @@ class WarpDeformation:
         wp.launch(gaussian_deltas.find_entries, count, inputs, device=device)
         self.clusters = [self._zeros((size, cluster_map.COLUMNS)) for size in hierarchy.sizes]
         self.deltas = self._zeros((count, 9))
-        tables = [*self.clusters, self.deltas]
+        tables = self.parameters
         self.gradients, self._saved = ([wp.zeros_like(table) for table in tables] for _ in range(2))
         self.optimizers = [Optimizer(table.shape, records.optimizer(k)) for k, table in enumerate(tables)]
         self._pivots = [self._zeros(size, wp.vec3) for size in hierarchy.sizes]
@@ -113,23 +113,23 @@ class WarpDeformation:
 
     def set_tables(self, tables: Tables) -> None:
         """Sets the parameters from host tables."""
-        for table, values in zip([*self.clusters, self.deltas], [*tables.clusters, tables.deltas], strict=True):
+        for table, values in zip(self.parameters, [*tables.clusters, tables.deltas], strict=True):
             if values.any():
                 wp.copy(table, self._copies.of(values, wp.float32))
             else:  # by default, the deltas always start at 0
                 table.zero_()
 
-    def read_tables(self, downloads: Downloads, *others: wp.array) -> tuple[Tables, list[NDArray[Any]]]:
-        """Waits for the device, and returns host tables of the parameters, and copies of other arrays.
+    @property
+    def parameters(self) -> list[wp.array]:
+        """Tables of all layers, followed by the deltas."""
+        return [*self.clusters, self.deltas]
 
-        ``set_tables`` does not upload these tables.
-        """
-        tables = [*self.clusters, self.deltas]
-        values = downloads.read(*tables, *others)
-        for table, host in zip(tables, values, strict=False):
+    def tables_of(self, values: Sequence[NDArray[Any]]) -> Tables:
+        """Returns the tables whose host copies ``values`` starts with. ``set_tables`` does not upload them again."""
+        for table, host in zip(self.parameters, values, strict=False):
             self._copies.store(wp.clone(table), host)
         clusters = len(self.clusters)
-        return Tables(values[:clusters], values[clusters]), values[clusters + 1 :]
+        return Tables(list(values[:clusters]), values[clusters])
 
     def begin(self, start: AttemptStart) -> bool:
         """Starts an attempt from the current parameters. ``restart`` must be called next.
@@ -137,7 +137,7 @@ class WarpDeformation:
         Returns:
             Whether buffers were reallocated, which invalidates captured graphs.
         """
-        for table, saved in zip([*self.clusters, self.deltas], self._saved, strict=True):
+        for table, saved in zip(self.parameters, self._saved, strict=True):
             wp.copy(saved, table)
         self._sample_sizes = [len(sample) for sample in start.samples]
         samples = np.full((len(start.samples), max(self._sample_sizes, default=0)), -1, np.int32)
@@ -154,7 +154,7 @@ class WarpDeformation:
         betas = start.beta1, start.beta2
         for optimizer, columns in zip(self.optimizers, [*start.cluster_columns, start.delta_columns], strict=True):
             optimizer.begin(columns, betas)
-        for table, saved in zip([*self.clusters, self.deltas], self._saved, strict=True):
+        for table, saved in zip(self.parameters, self._saved, strict=True):
             wp.copy(table, saved)
 
     def scalars(self, step: StepScalars) -> list[float]:

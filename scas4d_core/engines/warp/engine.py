@@ -8,9 +8,9 @@ update loop requests them. If a tile list turns out to be too small, the lists a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,7 @@ from scas4d_core.engines.engine import (
     KEPT_PICTURES,
     AttemptStart,
     IterationLog,
+    Probe,
     StepScalars,
     Tables,
     ViewRecord,
@@ -53,6 +54,8 @@ LOG_ROWS = 1024
 """Maximum number of renderings that the device logs before the host must read the log."""
 ITERATIONS = "iterations"
 """Name of the update stage in which the host enqueues iterations."""
+STATES_AT_ONCE = 2
+"""Maximum number of states that one call of ``probe`` compares with every probe view."""
 AHEAD = 2
 """Maximum number of pending iterations, which bounds how far host timings run ahead of the device."""
 
@@ -118,13 +121,14 @@ class WarpEngine:
         self._graphs, self._captured_for, self._generation = Graphs(device), object(), -1
         self._events: deque[wp.Event] = deque()
         self._tables: Tables | None = None
+        self._state: list[NDArray[Any]] | None = None
         self._views: list[TrainingView] = []
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
         """See ``UpdateEngine.load_views``."""
         self._views = list(views)
         self._pictures.load_views([*views, *probes])
-        self._pictures.reserve(LOG_ROWS + len(probes))
+        self._pictures.reserve(LOG_ROWS + STATES_AT_ONCE * len(probes))
         if self._gains is not None:
             rows = [self._camera_rows[view.name] for view in (*views, *probes)]
             if self._gains.load_views(rows, len(views)):
@@ -166,7 +170,7 @@ class WarpEngine:
             self._settle()
         self._deformation.set_tables(tables)
         self._unchanged = 0
-        self._tables = None
+        self._tables = self._state = None
 
     def begin(self, start: AttemptStart) -> None:
         """See ``UpdateEngine.begin``."""
@@ -188,7 +192,7 @@ class WarpEngine:
         self._slots: dict[int, int] = {}
         self._used_rows = self._unchanged = 0
         self._smoothed = self._keeps_unread = False
-        self._tables = None
+        self._tables = self._state = None
         if self._start is None:
             return
         self._deformation.restart(self._start)
@@ -205,7 +209,7 @@ class WarpEngine:
             self._settle()
         self._history.append((views, step))
         self._log_is_unread = True
-        self._tables = None
+        self._tables = self._state = None
         keeps = [self._slot(view) if step.keep_pictures else 0 for view in views]
         rows = range(self._used_rows, self._used_rows + len(views))
         self._records.write(
@@ -296,19 +300,25 @@ class WarpEngine:
         while self._log_is_unread and self._read_log() is None:
             pass
 
-    def _read_log(self, probes: int = 0) -> Array | None:
-        """Waits for the device, and reads the log of the pending iterations and the log rows of the probes.
+    def _read_log(self, probed: int = 0, with_state: bool = False) -> Array | None:
+        """Waits for the device, and reads the log of the pending iterations and the losses of the probes.
+
+        Args:
+            probed: number of renderings that probes have logged.
+            with_state: whether to read the learnt state as well, for the next call of ``state``.
 
         Returns:
-            [probes, 8] log rows of the probes; or None if an image was incomplete because its tile lists were too
-            small. In this case, the lists have been enlarged. If an iteration was affected, all iterations have been
-            enqueued again.
+            [probed] image losses; or None if an image was incomplete because its tile lists were too small. In this
+            case, the lists have been enlarged. If an iteration was affected, all iterations have been enqueued again.
         """
         self._log_is_unread = False
         guards = self._deformation.unsound, self._pictures.guard_counts, *self._adam_counts()
         kept = [self._pictures.kept] if self._keeps_unread else []
-        log, losses, unsound, rendered, *values = self.downloads.read(self._pictures.log, self._losses, *guards, *kept)
-        rows, probed = log[: self._used_rows], log[LOG_ROWS : LOG_ROWS + probes]
+        state = self._arrays_of_state(learnt=True) if with_state else []
+        read = self.downloads.read(self._pictures.log, self._losses, *guards, *kept, *state)
+        self._state = read[len(read) - len(state) :] or None
+        log, losses, unsound, rendered, *values = read[: len(read) - len(state)]
+        rows, probe_rows = log[: self._used_rows], log[LOG_ROWS : LOG_ROWS + probed]
         if self._pictures.grow(rows[:, PAIRS].max(initial=0)):
             self._repeat()
             return None
@@ -330,7 +340,7 @@ class WarpEngine:
             first += len(views)
         self._pending, self._used_rows = [], 0
         self._losses.zero_()
-        return None if self._pictures.grow(probed[:, PAIRS].max(initial=0)) else probed
+        return None if self._pictures.grow(probe_rows[:, PAIRS].max(initial=0)) else probe_rows[:, IMAGE_LOSS]
 
     def _repeat(self) -> None:
         """Enqueues all iterations of the attempt again, after buffers were reallocated."""
@@ -343,26 +353,28 @@ class WarpEngine:
             else:
                 self.iterate(views, step)
 
-    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
+    def probe(self, *probes: Probe, state_next: bool = False) -> list[list[float]]:
         """See ``UpdateEngine.probe``."""
-        while True:
-            self._launch_probes(which, moved, learnt)
-            rows = self._read_log(len(which))
-            if rows is not None:
-                return [float(loss) for loss in rows[:, IMAGE_LOSS]]
+        ends = np.cumsum([len(probe.views) for probe in probes])
+        losses = None
+        while losses is None:
+            for probe, end in zip(probes, ends, strict=True):
+                self._launch_probe(probe, LOG_ROWS + int(end) - len(probe.views))
+            losses = self._read_log(int(ends[-1]), state_next)
+        return [each.tolist() for each in np.split(losses, ends[:-1])]
 
-    def _launch_probes(self, which: Iterable[int], moved: bool, learnt: bool) -> None:
-        """Enqueues renderings of probe views; see ``UpdateEngine.probe``."""
-        deformation, pictures = self._deformation, self._pictures
+    def _launch_probe(self, probe: Probe, row: int) -> None:
+        """Enqueues the renderings of a probe, which log their losses from the given row on."""
+        deformation, pictures, learnt = self._deformation, self._pictures, probe.learnt
         means, factors = deformation.previous
-        if moved:
+        if probe.moved:
             deformation.forward()
             means, factors = deformation.means, deformation.factors
         features = self._features if learnt else self._previous_features
-        turns = deformation.turns if moved else None
-        for place, index in enumerate(which):
+        turns = deformation.turns if probe.moved else None
+        for place, index in enumerate(probe.views):
             self._probe_view.fill_(len(self._views) + index)
-            self._probe_row.fill_(LOG_ROWS + place)
+            self._probe_row.fill_(row + place)
             seen = features
             if self._gloss is not None:
                 tables = self._gloss.tables if learnt else self._gloss.before
@@ -374,7 +386,7 @@ class WarpEngine:
         """See ``UpdateEngine.tables``. The host does not wait if the tables were read with the state."""
         if self._tables is None:
             self._settle()
-            self._tables = self._deformation.read_tables(self.downloads)[0]
+            self._tables = self._deformation.tables_of(self.downloads.read(*self._deformation.parameters))
         return self._tables
 
     def log(self) -> IterationLog:
@@ -393,11 +405,9 @@ class WarpEngine:
         """See ``UpdateEngine.state``."""
         self._settle()
         previous, deformation = self._previous, self._deformation
-        deformation.forward()
-        arrays = [deformation.means, deformation.factors, deformation.turns]
-        if learnt:
-            arrays += [self._features, *([] if self._gloss is None else self._gloss.tables)]
-        self._tables, (means, factors, turns, *looks) = self._deformation.read_tables(self.downloads, *arrays)
+        values = (self._state if learnt else None) or self.downloads.read(*self._arrays_of_state(learnt))
+        means, factors, turns, *looks = values[len(deformation.parameters) :]
+        self._tables = deformation.tables_of(values)
         rotations = turned_rotations(previous.rotations, self._rows, turns)
         state = previous.replace(means=means, factors=factors, rotations=rotations)
         self._copies.store(wp.clone(deformation.means), means)
@@ -408,9 +418,18 @@ class WarpEngine:
         self._copies.store(wp.clone(self._features), state.colours, state.foreground)
         if self._gloss is None:
             return state
-        for table, values in zip(self._gloss.tables, looks[1:], strict=True):
-            self._copies.store(wp.clone(table), values)
+        for table, host in zip(self._gloss.tables, looks[1:], strict=True):
+            self._copies.store(wp.clone(table), host)
         return state.replace(gloss=looks[1], environment=looks[2])
+
+    def _arrays_of_state(self, learnt: bool) -> list[wp.array]:
+        """Deforms Θ_{t−1}, and returns the device arrays that ``state`` reads, starting with the parameters."""
+        deformation = self._deformation
+        deformation.forward()
+        arrays = [*deformation.parameters, deformation.means, deformation.factors, deformation.turns]
+        if learnt:
+            arrays += [self._features, *([] if self._gloss is None else self._gloss.tables)]
+        return arrays
 
     def exposures(self) -> Mapping[str, Array]:
         """See ``UpdateEngine.exposures``."""

@@ -25,7 +25,7 @@ from engine_cases import (
 )
 
 from scas4d_core.engines.cpu.engine import CpuEngine
-from scas4d_core.engines.engine import KEPT_PICTURES, EngineError, Tables, UpdateEngine
+from scas4d_core.engines.engine import KEPT_PICTURES, EngineError, Probe, Tables, UpdateEngine
 from scas4d_core.engines.freedom import Freedom
 from scas4d_core.engines.plan import ColourPlan
 from scas4d_core.engines.torch.engine import TorchEngine
@@ -91,12 +91,14 @@ def test_states_and_probes_are_those_of_the_reference(effect: str, tested: str) 
     scene = case(**PLANS[effect])
     mine, true = loaded(TESTED[tested](), scene), loaded(TorchEngine(), scene)
     for moved in (False, True):
-        errors = [engine.probe(range(len(scene.probes)), moved=moved, learnt=False) for engine in (mine, true)]
+        errors = [
+            engine.probe(Probe(range(len(scene.probes)), moved=moved, learnt=False))[0] for engine in (mine, true)
+        ]
         assert errors[0] == pytest.approx(errors[1], rel=TOLERANCE)
     close(mine.state(learnt=False), true.state(learnt=False), TOLERANCE)
     for engine in (mine, true):
         engine.iterate([0], step())
-    errors = [engine.probe(range(len(scene.probes)), moved=True, learnt=True) for engine in (mine, true)]
+    errors = [engine.probe(Probe(range(len(scene.probes)), moved=True, learnt=True))[0] for engine in (mine, true)]
     assert errors[0] == pytest.approx(errors[1], rel=AFTER_A_STEP)
     close(mine.state(learnt=True), true.state(learnt=True), AFTER_A_STEP)
 
@@ -201,20 +203,36 @@ def test_tables_after_a_state_are_those_of_the_last_iteration(engine: UpdateEngi
 def test_a_probe_of_the_state_before_does_not_depend_on_the_tables(engine: UpdateEngine) -> None:
     scene = case()
     loaded(engine, scene)
-    before = engine.probe([0, 2], moved=False, learnt=False)
+    before = engine.probe(Probe([0, 2], moved=False, learnt=False))[0]
     engine.set_tables(random_tables(scene, 0.05, seed=9))
-    assert_repeated(engine.probe([0, 2], moved=False, learnt=False), before)
-    assert_repeated(engine.probe([2], moved=False, learnt=False), before[1:])
-    assert engine.probe([0, 2], moved=True, learnt=False) != before
+    assert_repeated(engine.probe(Probe([0, 2], moved=False, learnt=False))[0], before)
+    assert_repeated(engine.probe(Probe([2], moved=False, learnt=False))[0], before[1:])
+    assert engine.probe(Probe([0, 2], moved=True, learnt=False))[0] != before
+
+
+def test_probes_together_have_the_errors_of_each_alone(engine: UpdateEngine) -> None:
+    loaded(engine, case())
+    engine.iterate([0], step())
+    probes = [Probe([0, 2], moved=False, learnt=False), Probe([1], moved=True, learnt=False)]
+    probes += [Probe(range(5), moved=True, learnt=True), Probe([0], moved=False, learnt=False)]
+    alone = [engine.probe(probe)[0] for probe in probes]
+    together = engine.probe(*probes, state_next=True)
+    assert [len(each) for each in together] == [2, 1, 5, 1]
+    for one, all_at_once in zip(alone, together, strict=True):
+        assert_repeated(all_at_once, one)
+    state = engine.state(learnt=True)
+    again = engine.state(learnt=True)
+    np.testing.assert_array_equal(state.means, again.means)
+    np.testing.assert_array_equal(state.colours, again.colours)
 
 
 def test_iterations_lower_the_error_of_the_probes(engine: UpdateEngine) -> None:
     scene = case(**EFFECTS["moving colours"])
     loaded(engine, scene, Tables.identity(scene.structure.hierarchy), layers=((0.01, 0.005, 0.002),) * 2)
-    before = np.mean(engine.probe(range(5), moved=True, learnt=True))
+    before = np.mean(engine.probe(Probe(range(5), moved=True, learnt=True))[0])
     for iteration in range(20):
         engine.iterate([iteration % 5], step(sample=iteration % 2, layers=(1.0, 0.3), own=0.0))
-    assert np.mean(engine.probe(range(5), moved=True, learnt=True)) < 0.9 * before
+    assert np.mean(engine.probe(Probe(range(5), moved=True, learnt=True))[0]) < 0.9 * before
 
 
 def test_what_has_no_rate_or_no_factor_stays(engine: UpdateEngine) -> None:
@@ -253,7 +271,7 @@ def test_the_log_has_every_rendering_and_the_last_pictures(engine: UpdateEngine,
     for iteration in range(4):
         engine.iterate([iteration, 4], step(keep_pictures=iteration >= 2))
     if probed:
-        engine.probe([0], moved=True, learnt=True)  # an engine may read the log with it
+        engine.probe(Probe([0], moved=True, learnt=True))  # an engine may read the log with it
     log = engine.log()
     assert len(log.losses) == 4
     assert [row.view for row in log.rendered] == [0, 4, 1, 4, 2, 4, 3, 4]

@@ -57,7 +57,7 @@ def error(state: Gaussians, frame: Frame) -> float:
     probes = ProbeViews(FACTORY, engine, views(frame))
     engine.load_views(views(frame), probes.views)
     engine.load_state(state)
-    found = probes.errors(moved=False, learnt=False)
+    (found,) = probes.start_errors(warm=False)
     return mean_error(found, list(found))
 
 

@@ -46,7 +46,10 @@ class Probes:
         self.whole, self._small, self._whole = are_whole, small, whole
         self.asked = 0
 
-    def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
+    def start_errors(self, warm: bool) -> list[dict[str, float]]:
+        return [self._found(self._small, moved) for moved in (False, True)[: 1 + warm]]
+
+    def errors(self, *, moved: bool, learnt: bool, state_next: bool = False) -> dict[str, float]:
         return self._found(self._small, moved)
 
     def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:

@@ -61,7 +61,7 @@ def probed(state: Gaussians) -> float:
     found = ProbeViews(FACTORY, engine, views())
     engine.load_views(views(), found.views)
     engine.load_state(state)
-    return mean(found.errors(moved=False, learnt=False))
+    return mean(found.start_errors(warm=False)[0])
 
 
 def mean(errors: dict[str, float]) -> float:

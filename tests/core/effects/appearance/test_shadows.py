@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from box_scene import make_box, make_rig, take_frame
+from numpy.typing import NDArray
 
 from scas4d_core.effects.appearance.shadows import NAME
 from scas4d_core.effects.switches import first_switches
-from scas4d_core.engines.views import SIDE
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.views import SIDE, CameraArrays
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
@@ -69,6 +72,21 @@ def test_it_goes_off_where_nothing_changes_and_on_again() -> None:
     assert not scene._prepared.carried.switches[NAME].on
     scene.step(take_frame(9, 9 / 30, shaded(0.3), RIG))
     assert scene._prepared.carried.switches[NAME].on
+
+
+def test_the_blocks_that_moving_gaussians_reach_are_found_once_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, found, reached = shaded(0.3), list[int](), CpuRenderer.reached
+
+    def counted(self: CpuRenderer, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
+        found.append(len(cameras))
+        return reached(self, state, cameras)
+
+    scene = followed("on", truth, frames=1)
+    colours = scene.history.newest.colours
+    monkeypatch.setattr(CpuRenderer, "reached", counted)
+    scene.step(take_frame(2, 2 / 30, truth, RIG))
+    assert (scene.history.newest.colours != colours).any()  # the update looked, and the evidence did, too
+    assert sum(found) == len(RIG.cameras)
 
 
 def test_what_moves_keeps_its_own_colours() -> None:

@@ -11,10 +11,10 @@ pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install wa
 
 import warp as wp
 from engine_cases import CLUSTERS, EFFECTS, TOGETHER, Case, apart, assert_repeated, case, loaded, rig, step
-from warp_cases import DEVICE
+from warp_cases import DEVICE, Waits
 
 from scas4d_core.engines.cpu.engine import CpuEngine
-from scas4d_core.engines.engine import StepScalars, Tables
+from scas4d_core.engines.engine import Probe, StepScalars, Tables
 from scas4d_core.engines.warp import engine as module
 from scas4d_core.engines.warp.engine import WarpEngine
 from scas4d_core.engines.warp.graphs import Graphs
@@ -103,7 +103,8 @@ def test_memory_that_is_full_for_a_while_leaves_no_trace(monkeypatch: pytest.Mon
         each.begin(scene.start(layers=RATES))
         for views, scalars in STEPS:
             each.iterate(views, scalars)
-        records.append(each.log().losses + each.probe(range(len(scene.probes)), moved=True, learnt=True))
+        (errors,) = each.probe(Probe(range(len(scene.probes)), moved=True, learnt=True))
+        records.append(each.log().losses + errors)
     assert records[0] == pytest.approx(records[1], rel=1e-5)
 
 
@@ -186,10 +187,39 @@ def test_an_attempt_with_too_little_room_is_repeated(effect: str) -> None:
 def test_a_probe_with_too_little_room_is_repeated() -> None:
     scene = case()
     engine = loaded(WarpEngine(DEVICE), scene)
-    errors = engine.probe(range(5), moved=True, learnt=True)
+    errors = engine.probe(Probe(range(5), moved=True, learnt=True))[0]
     engine._pictures._rasterizer.capacity = 100
     engine._pictures._rasterizer.resize(48, 40)
-    assert_repeated(engine.probe(range(5), moved=True, learnt=True), errors)
+    assert_repeated(engine.probe(Probe(range(5), moved=True, learnt=True))[0], errors)
+
+
+def test_a_state_that_is_announced_is_downloaded_with_the_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = case(**TOGETHER)
+    engine, waits = loaded(WarpEngine(DEVICE), scene), Waits(monkeypatch)
+    engine.iterate([0], step())
+    engine.probe(Probe(range(5), moved=True, learnt=True), state_next=True)
+    state, tables = engine.state(learnt=True), engine.tables()
+    assert waits.count == 1
+    engine.iterate([1], step())  # what was downloaded is no longer the state
+    after = engine.state(learnt=True)
+    assert not np.array_equal(after.means, state.means)
+    engine.set_tables(tables)
+    np.testing.assert_array_equal(engine.state(learnt=True).means, state.means)
+
+
+def test_a_state_that_is_announced_is_right_if_a_probe_had_too_little_room() -> None:
+    scene = case(**TOGETHER)
+    states = []
+    for room in (None, 100):
+        engine = loaded(WarpEngine(DEVICE), scene)
+        engine.iterate([0], step())
+        if room is not None:
+            engine._pictures._rasterizer.capacity = room
+            engine._pictures._rasterizer.resize(48, 40)
+        engine.probe(Probe(range(5), moved=True, learnt=True), state_next=True)
+        states.append(engine.state(learnt=True))
+    np.testing.assert_array_equal(states[0].colours, states[1].colours)
+    np.testing.assert_array_equal(states[0].means, states[1].means)
 
 
 def test_a_long_attempt_is_logged_whole(monkeypatch) -> None:
@@ -223,7 +253,7 @@ def test_captured_graphs_give_the_bits_of_plain_launches(rooms: str, monkeypatch
                     engine._pictures._rasterizer.capacity = 100
                     engine._pictures._rasterizer.resize(48, 40)
                     engine._pictures.generation += 1
-                engine.probe(range(5), moved=True, learnt=True)
+                engine.probe(Probe(range(5), moved=True, learnt=True))
             results.append([engine.log().losses, engine.tables().deltas, engine.gains(), engine.state(True).colours])
             if attempt == 0:
                 engine.load_state(scene.previous)
