@@ -70,6 +70,7 @@ KERNELS = (
         "kernels.appearance.direction.shade_rows_backward f2 f2 f2 f2 f2 f1 f2 f2 f3",
         "kernels.image_loss.target_moments f3 f4 f3 f3",
         "kernels.feature_gradients.blend_features f2 i1 s1 s1 w1 y1 i1 i1 i*2 f1 f3 f2",
+        "kernels.front_transmittance.front_transmittance d2 d2 d3 d1 d2 d3 d1 d1 d2 d1 i1 d d1 d1",
         "kernels.pairs.count_pairs f2 i1 s1 w1 i1 i1 i*2 f1 f2",
         "kernels.appearance.direction.shade_rows f2 f2 f2 f2 f2 f1 f2",
         "kernels.tiles.cover_tiles f2 s2 s1 i i w1 y1 i1 i1 i1 s1 i1 s2 w1 s2",

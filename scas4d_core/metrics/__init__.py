@@ -12,6 +12,7 @@ from scas4d_core.metrics.image import Score, flip, lpips, psnr, ssim
 from scas4d_core.metrics.parts import adjusted_rand_index
 from scas4d_core.metrics.tracks import (
     TrackError,
+    calibration_error,
     error_by_confidence,
     lost_parts,
     median_trajectory_error,
@@ -26,6 +27,7 @@ __all__ = [
     "TrackError",
     "adjusted_rand_index",
     "benchmark_scores",
+    "calibration_error",
     "error_by_confidence",
     "flip",
     "lost_parts",

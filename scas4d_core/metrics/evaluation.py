@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 from scas4d_core import metrics
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import Capture
+from scas4d_core.gaussians import moving_extent
+from scas4d_core.query.tracks import RIGHT
 
 if TYPE_CHECKING:
     from scas4d_core.query.committed import CommittedScene
@@ -103,6 +105,10 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
     tracks = reconstruction.tracks_of_points(points[0], indices[0], list(indices))
     error = metrics.track_error_3d(tracks.positions, points, moving, extent)
     sorted_errors = metrics.error_by_confidence(tracks.positions, points, tracks.confidence, moving, extent)
+    distances_3d = np.linalg.norm(tracks.positions - points, axis=-1)
+    own_extent = moving_extent(reconstruction.history.gaussians(indices[0])) / reconstruction.world.metres_per_unit
+    right = distances_3d[1:, moving] <= RIGHT * own_extent
+    calibration = metrics.calibration_error(tracks.confidence[1:, moving], right)
     at_last = metrics.track_error_3d(tracks.positions[[0, -1]], points[[0, -1]], moving, extent)
 
     centroids = reconstruction.world.to_user(reconstruction.history.stacked("means", list(indices)))
@@ -129,7 +135,7 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
             scores |= _benchmark("tapvid", distances, measured_tracks.visibility[camera.name], counted, thresholds)
         by_camera.append(scores)
     asked = moving & visible_anywhere[0]
-    distances = np.linalg.norm(tracks.positions - points, axis=-1)[:, asked]
+    distances = distances_3d[:, asked]
     seen, visible = seen_anywhere[:, asked], visible_anywhere[:, asked]
     return {
         "track_3d_median": _finite(error.median),
@@ -138,6 +144,7 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
         "track_points": float(moving.sum()),
         "parts_lost": float(len(metrics.lost_parts(tracks.positions, points, truth.part_id, moving, extent))),
         **{f"track_3d_confidence_{k}": _finite(error) for k, error in enumerate(sorted_errors, 1)},
+        "track_3d_calibration": _finite(calibration),
         **_benchmark("mvtracker", distances, seen, visible, metrics.scaled_thresholds(extent)),
         "mvtracker_mte": _finite(100 / extent * metrics.mean_trajectory_error(distances, visible)),
         "survival": _finite(metrics.survival(distances, extent)),

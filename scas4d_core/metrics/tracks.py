@@ -238,6 +238,29 @@ def error_by_confidence(
     return [float(np.median(distances[order[k * size : (k + 1) * size]])) if size else math.nan for k in range(groups)]
 
 
+def calibration_error(confidence: NDArray[Any], right: NDArray[np.bool_], bins: int = 10) -> float:
+    """Returns the expected calibration error (ECE, Naeini et al. 2015) in [0, 1], NaN without positions.
+
+    Positions are divided into bins of equal width by confidence. The error is the difference between the mean
+    confidence of a bin and its fraction of right positions, averaged over positions.
+
+    Args:
+        confidence: confidence of each position, in [0, 1].
+        right: whether each position is right, in the same shape.
+        bins: number of bins.
+
+    >>> calibration_error(np.array([0.8, 0.8, 0.8, 0.8]), np.array([True, True, True, False]))
+    0.050000000000000044
+    """
+    if confidence.shape != right.shape:
+        raise ValueError(f"confidence and right must have the same shape; got {confidence.shape} and {right.shape}")
+    if not right.size:
+        return math.nan
+    bin_of = np.minimum((bins * confidence).astype(int), bins - 1).ravel()
+    excess = np.bincount(bin_of, weights=(confidence - right).ravel(), minlength=bins)
+    return float(np.abs(excess).sum() / right.size)
+
+
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
     """Returns the fraction of correct visibility predictions in [0, 1], called occlusion accuracy in TAP-Vid.
 

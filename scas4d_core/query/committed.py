@@ -39,7 +39,7 @@ class CommittedScene:
     >>> view.colour[8, 8].round(1), view.depth[8, 8]
     (array([0.9, 0. , 0.1], dtype=float32), np.float32(2.0))
     >>> committed.tracks_of_points(np.array([[0, 0, 2]]), 0, [0]).confidence.round(2)
-    array([[0.9]])
+    array([[0.98]])
     """
 
     def __init__(self, history: History, world: WorldFrame, limits: Limits = DEFAULT, device: Device = "cpu") -> None:
@@ -106,8 +106,7 @@ class CommittedScene:
 
     def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
         """Returns a copy of tracks queried at frame ``index``, with their visibility in another camera added."""
-        tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
-        return tracks.with_visibility(camera, self._depth, tolerance)
+        return tracks.with_visibility(self.history, self.world, camera, index, self._limits)
 
     def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
         """Returns the part label of each Gaussian [N] (largest part first, −1 if static); see ``parts.parts``.

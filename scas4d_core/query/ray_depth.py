@@ -26,6 +26,8 @@ RAYS_AT_ONCE = 64
 """Number of rays processed at once, to limit working memory to a few megabytes."""
 DEEPEST = 96
 """Maximum number of Gaussians per ray: those that absorb the most light. All others have no visible effect."""
+RAY_SOFTENING = 0.003
+"""Usual ``softening`` of a surface, as a fraction of the extent."""
 BISECTIONS = 26
 """Number of bisection steps, which reduce a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
@@ -61,12 +63,10 @@ def ray_depths(
     """
     uv = np.asarray(uv, dtype=np.float64)
     depth, covered = np.full(len(uv), np.nan), np.zeros(len(uv))
-    splats = _Splats(gaussians, camera, limits, softening)
-    tiles = np.floor(uv / TILE_PX).astype(np.int64)
-    order = np.lexsort((tiles[:, 0], tiles[:, 1]))
+    splats = RaySplats(gaussians, camera, uv, limits, softening)
+    order, cuts = tile_groups(uv)
     if not len(order) or not len(splats.z):
         return depth, covered
-    cuts = np.flatnonzero(np.any(np.diff(tiles[order], axis=0) != 0, axis=1)) + 1
     for group in np.split(order, cuts):
         low, high = uv[group].min(axis=0), uv[group].max(axis=0)
         near = np.flatnonzero(
@@ -79,37 +79,81 @@ def ray_depths(
     return depth, covered
 
 
-class _Splats:
-    """The Gaussians in front of a camera, sorted by depth and prepared for ray queries."""
+def tile_groups(uv: Float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Returns an order [Q] of pixel positions [Q, 2] that groups them by tile, and the starts of all groups but the
+    first.
+    """
+    tiles = np.floor(uv / TILE_PX).astype(np.int64)
+    order = np.lexsort((tiles[:, 0], tiles[:, 1]))
+    return order, np.flatnonzero(np.any(np.diff(tiles[order], axis=0) != 0, axis=1)) + 1
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, limits: Limits, softening: float) -> None:
+
+def _meets(uv: Float, low: Float, high: Float) -> NDArray[np.bool_]:
+    """Returns the mask [N] of boxes that overlap a tile with at least one pixel position.
+
+    Args:
+        uv: [Q, 2] pixel positions.
+        low, high: [N, 2] corners of the boxes, in pixels.
+    """
+    if not len(uv):
+        return np.zeros(len(low), np.bool_)
+    tiles = np.floor(uv / TILE_PX).astype(np.int64)
+    first = tiles.min(axis=0)
+    counts = np.zeros(tiles.max(axis=0) - first + 2, np.int64)  # summed over all tiles up to each corner
+    np.add.at(counts, tuple((tiles - first + 1).T), 1)
+    counts = counts.cumsum(axis=0).cumsum(axis=1)
+    last = np.array(counts.shape) - 1
+    (left, top), (right, bottom) = (
+        np.clip(np.floor(corner / TILE_PX) - first + one, 0, last).astype(np.int64).T
+        for corner, one in ((low, 0), (high, 1))
+    )
+    inside: NDArray[np.int64] = counts[right, bottom] - counts[left, bottom] - counts[right, top] + counts[left, top]
+    return inside > 0
+
+
+class RaySplats:
+    """The Gaussians that rays may hit, sorted by depth and prepared for ray queries.
+
+    Args:
+        gaussians, camera, uv, limits, softening: see ``ray_depths``.
+
+    Attributes:
+        limits: rasterizer constants.
+        lens: focal lengths [2] and principal point [2], in pixels.
+        peak: [N] opacities.
+        means, z: [N, 3] means in the camera's axes and [N] their depths, in metres.
+        centre, half: [N, 2] projected means, and half sizes of the bounding boxes, in pixels.
+        conic: [N, 2, 2] inverses of the projected covariances.
+        precision: [N, 3, 3] inverses of the softened covariances in the camera's axes.
+        spread: [N] standard deviations along z, in metres.
+    """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, uv: Float, limits: Limits, softening: float) -> None:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         means = gaussians.means.astype(np.float64) @ turn.T + shift
         peak = gaussians.opacities.astype(np.float64)
         rows = np.flatnonzero((means[:, 2] > limits.near) & (peak >= limits.alpha_floor))
-        rows = rows[np.argsort(means[rows, 2], kind="stable")]
-        self.limits, self.peak, self.means = limits, peak[rows], means[rows]
-        self.lens = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        means, z, peak = means[rows], means[rows, 2:], peak[rows]
+        focal, principal = self.lens = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         factors = turn @ gaussians.factors[rows].astype(np.float64)
-        covariance = factors @ factors.transpose(0, 2, 1)
-        self.z = self.means[:, 2]
-        focal, principal = self.lens
         margin = limits.tangent_margin * np.array([camera.width, camera.height]) / (2 * focal)
         tangents = np.clip(
-            self.means[:, :2] / self.z[:, None],
+            means[:, :2] / z,
             -principal / focal - margin,
             (np.array([camera.width, camera.height]) - principal) / focal + margin,
         )
         # The projected covariance of the rasterizer, including its low-pass filter.
-        rows_of = (
-            focal[:, None] / self.z[:, None, None] * (factors[:, :2] - tangents[:, :, None] * factors[:, 2:3])
-        )  # [n, 2, 3]
+        rows_of = focal[:, None] / z[:, :, None] * (factors[:, :2] - tangents[:, :, None] * factors[:, 2:3])
         flat = rows_of @ rows_of.transpose(0, 2, 1) + limits.low_pass * np.eye(2)
-        self.conic = np.linalg.inv(flat)
-        self.centre = focal * self.means[:, :2] / self.z[:, None] + principal
-        reach = 2 * np.log(self.peak / limits.alpha_floor)
-        self.half = np.sqrt(np.maximum(reach[:, None] * np.einsum("nii->ni", flat), 0))
-        softened = covariance + (softening**2 + 1e-12) * np.eye(3)
+        centre = focal * means[:, :2] / z + principal
+        reach = 2 * np.log(peak / limits.alpha_floor)
+        half = np.sqrt(np.maximum(reach[:, None] * np.einsum("nii->ni", flat), 0))
+
+        rows = np.flatnonzero(_meets(uv, centre - half, centre + half))
+        rows = rows[np.argsort(z[rows, 0], kind="stable")]
+        self.limits, self.peak, self.means, self.z = limits, peak[rows], means[rows], z[rows, 0]
+        self.centre, self.half, self.conic = centre[rows], half[rows], np.linalg.inv(flat[rows])
+        softened = factors[rows] @ factors[rows].transpose(0, 2, 1) + (softening**2 + 1e-12) * np.eye(3)
         self.precision = np.linalg.inv(softened)
         self.spread = np.sqrt(softened[:, 2, 2])
 

@@ -14,14 +14,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, maximum_filter
+from scipy.ndimage import distance_transform_edt
 
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import moving_extent, quaternions_to_matrices
 from scas4d_core.query.carriers import carriers, drop_absent, geometric_median
-from scas4d_core.query.ray_depth import ray_depths
+from scas4d_core.query.ray_depth import RAY_SOFTENING, ray_depths
+from scas4d_core.query.visibility import find_visibility
 from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
@@ -37,13 +38,15 @@ SOFTENING = 0.01
 """Length added in quadrature to a Gaussian's axes when computing its distance to a point, as a fraction of the extent.
 Gaussians are thinner than the uncertainty of the surface, and more carriers average out more noise. Compared with
 0.001, the median 3D error decreases by 2% (cloth) to 18% (stage)."""
-RAY_SOFTENING = 0.003
-"""Equivalent of ``SOFTENING`` for the position of a Gaussian along the ray of a pixel query."""
-AGREEMENT = 0.01
-"""Mean deviation of the carriers from the track that halves the confidence, as a fraction of the extent."""
-DEPTH_TOLERANCE = 0.0075
-"""Distance behind the rendered surface up to which a point counts as visible, as a fraction of the extent. The value is
-approximately the error of the rendered depth."""
+RIGHT = 0.01
+"""Maximum error of a right position, as a fraction of the extent. The confidence is the probability of a right one."""
+COVERED = 0.3
+"""Opacity of the carriers at a point from which it lies on a reconstructed surface."""
+ODDS, NOISE, DISAGREEMENT = 1.3, 0.1, 1.4
+"""Odds of a wrong position at a disagreement of ``RIGHT``, ten frames from the query; the noise of agreeing carriers,
+as a fraction of ``RIGHT``; and the exponent of the disagreement. Fitted with ``AGEING``; see docs/tracks.md."""
+AGEING, START, SPAN = 0.7, 3.0, 10.0
+"""Exponent of the number of frames from the query, and the numbers of frames that are added to it and divide it."""
 PIXEL_REACH = 2.0
 """Maximum distance, in pixels, from a query without a surface to the covered pixel whose depth is used instead."""
 
@@ -55,13 +58,11 @@ class Tracks:
     Attributes:
         positions: [T, Q, 3] float64 positions in the user's world and units. NaN for a pixel query without a surface,
             and in frames in which too few of the carriers are present (not yet added, or retired).
-        confidence: [T, Q] float64 in [0, 1]: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²). The numerator is the opacity
-            of the carriers at the query point, where m is the Mahalanobis distance. The disagreement s in that frame is
-            the weighted mean distance of the carriers' positions from the track, and a is ``AGREEMENT`` times the
-            extent. The confidence is 0 for a query without a surface, and if the position is NaN.
+        confidence: [T, Q] float64 in [0, 1], estimated probability that the position is right; see
+            ``confidence_of``. It is 0 for a query without a surface, and if the position is NaN.
         ids: [Q] int64 id of the Gaussian with the largest weight; −1 for a pixel query without a surface.
         indices: [T] int64 frame indices.
-        visibility: maps the name of each queried camera to the visibility [T, Q] bool; see ``find_visibility``.
+        visibility: maps the name of each queried camera to the visibility [T, Q] bool; see ``visibility``.
     """
 
     positions: Float
@@ -74,9 +75,11 @@ class Tracks:
         """Returns the pixels [T, Q, 2] of the tracks in a camera in the user's world, NaN behind the camera."""
         return camera.project(self.positions)[0]
 
-    def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
+    def with_visibility(
+        self, history: History, world: WorldFrame, camera: Camera, index: int, limits: Limits = DEFAULT
+    ) -> Tracks:
         """Returns a copy with the visibility in another camera added; see ``find_visibility`` for the arguments."""
-        visible = find_visibility(self.positions, self.indices, camera, render_depth, tolerance)
+        visible = find_visibility(history, world, self.positions, self.indices, camera, index, limits)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
 
@@ -135,9 +138,28 @@ def tracks_of_points(
         answers, shares, there = drop_absent(means + turned, weights, history.present(frame)[rows])
         result[t] = geometric_median(answers, shares)
         apart = np.einsum("qk,qk->q", shares, np.linalg.norm(answers - result[t][:, None], axis=-1))
-        confidence[t] = covered / (1 + np.square(apart / max(AGREEMENT * extent, 1e-12)))
+        confidence[t] = confidence_of(covered, apart / max(extent, 1e-12), abs(frame - index))
         result[t][~there], confidence[t][~there] = np.nan, 0
     return Tracks(world.to_user(result), confidence, theta.ids[rows[:, 0]], np.asarray(indices, dtype=np.int64))
+
+
+def confidence_of(covered: Float, disagreement: Float, frames: int) -> Float:
+    """Returns the probability that a position is within ``RIGHT`` of the true one.
+
+    The formula is a logistic regression on captures with known tracks. It does not reveal that a whole surface moves
+    incorrectly.
+
+    Args:
+        covered: [Q] opacity of the carriers at each queried point.
+        disagreement: [Q] weighted mean distance of the carriers' positions from the track, as a fraction of the extent.
+        frames: number of frames from the query.
+
+    >>> confidence_of(np.array([0.9, 0.9, 0.1]), np.array([0.0, 0.01, 0.0]), frames=7).round(2)
+    array([0.95, 0.4 , 0.32])
+    """
+    odds = ODDS * (disagreement / RIGHT + NOISE) ** DISAGREEMENT * ((frames + START) / SPAN) ** AGEING
+    confidence: Float = np.minimum(1, covered / COVERED) / (1 + odds)
+    return confidence
 
 
 def tracks_of_pixels(
@@ -209,7 +231,7 @@ def tracks_of_pixels(
     )
     tracks.positions[:, met], tracks.confidence[:, met] = point_tracks.positions, point_tracks.confidence
     tracks.ids[met] = point_tracks.ids
-    return tracks.with_visibility(camera, render_depth, depth_tolerance(history, world, index))
+    return tracks.with_visibility(history, world, camera, index, limits)
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
@@ -233,40 +255,6 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
     there = np.stack([history.present(index)[rows] for index in indices])
     positions[~there] = np.nan
     return Tracks(positions, there.astype(np.float64), wanted, np.asarray(indices, dtype=np.int64))
-
-
-def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
-    """Returns the tolerance for ``find_visibility`` in user units: ``DEPTH_TOLERANCE`` × extent of moving Gaussians."""
-    return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
-
-
-def find_visibility(
-    positions: Float, indices: Sequence[int] | NDArray[Any], camera: Camera, render_depth: RenderDepth, tolerance: float
-) -> NDArray[np.bool_]:
-    """Returns whether points are visible in a camera, [T, Q] bool: in its image, in front of it and not occluded.
-
-    A point is occluded if it is more than ``tolerance`` behind the farthest rendered depth in the 3×3 pixels around it.
-    The neighbourhood allows for tracks that are off by a pixel near an edge, and improves the accuracy even for exact
-    positions. Pixels that are less than half covered do not occlude points.
-
-    Args:
-        positions: [T, Q, 3] positions in the user's world. Points with NaN coordinates are not visible.
-        indices: [T] committed frames.
-        camera: camera in the user's world.
-        render_depth: function that returns rendered depth and alpha.
-        tolerance: depth tolerance in user units.
-    """
-    uv, z = camera.project(positions)
-    inside = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
-    visible = np.zeros(inside.shape, dtype=np.bool_)
-    for t, index in enumerate(indices):
-        depth, alpha = render_depth(camera, int(index))
-        column, row = uv[t][inside[t]].astype(np.intp).T
-        surface = np.where(alpha >= ALPHA_OF_A_SURFACE, depth, -np.inf)
-        front = maximum_filter(surface, size=3, mode="nearest")[row, column]
-        front[front == -np.inf] = np.inf
-        visible[t, inside[t]] = ~(z[t][inside[t]] > front + tolerance)
-    return visible
 
 
 def _covered_near(

@@ -155,7 +155,7 @@ def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
 def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
     if isinstance(camera, str):
         return scene.camera(camera)
-    # Visibility is computed from a rendered depth map, so the pixel limit of views applies.
+    # A pixel without a surface takes the depth of a rendered map, so the pixel limit of views applies.
     if camera.width * camera.height > MOST_PIXELS:
         size = f"{camera.width}x{camera.height}"
         raise Problem(

@@ -214,6 +214,12 @@ class FakeReconstruction:
         return False  # it needs none
 
 
+def inside_the_image(history, world, positions, indices, camera, index, limits=None):
+    """Visibility without kernels: nothing hides anything."""
+    uv, z = camera.project(positions)
+    return (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
+
+
 class FakeCommitted:
     def __init__(self, history, world, limits, device="cpu"):
         from scas4d_core.query import tracks  # in the readers alone: it loads SciPy
@@ -221,6 +227,7 @@ class FakeCommitted:
         self.history = history
         self.world = world
         self.find = tracks
+        tracks.find_visibility = inside_the_image
 
     def render(self, camera, index, *, background, labels=None):
         self.history.gaussians(index)
@@ -252,7 +259,7 @@ class FakeCommitted:
         return self.find.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, found, camera, index):
-        return found.with_visibility(camera, self._depth, 0.01)
+        return found.with_visibility(self.history, self.world, camera, index)
 
     def parts(self, count, previous=None):
         return np.arange(len(self.history.gaussians(0))) % (count or 2)

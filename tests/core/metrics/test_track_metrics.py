@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.metrics import (
+    calibration_error,
     error_by_confidence,
     lost_parts,
     median_trajectory_error,
@@ -128,3 +129,19 @@ def test_a_part_is_lost_by_its_own_moving_points_in_the_last_frame() -> None:
     assert lost_parts(tracks, truth, parts, moving, 10.0) == []  # found again
     tracks[2, 0:2] = np.nan
     assert lost_parts(tracks, truth, parts, moving, 10.0) == [1]
+
+
+def test_calibration_error_is_that_of_its_definition():
+    rng = np.random.default_rng(1)
+    confidence = rng.random((5, 200))
+    right = rng.random((5, 200)) < confidence**2
+    expected = 0.0
+    for low in np.arange(10) / 10:
+        inside = (confidence >= low) & (confidence < low + 0.1)
+        expected += inside.mean() * abs(confidence[inside].mean() - right[inside].mean())
+    assert calibration_error(confidence, right) == pytest.approx(expected)
+    assert calibration_error(confidence, rng.random((5, 200)) < confidence) < 0.5 * expected
+    assert calibration_error(np.ones(4), np.ones(4, bool)) == 0  # 1 belongs to the last bin
+    assert np.isnan(calibration_error(np.empty(0), np.empty(0, bool)))
+    with pytest.raises(ValueError, match="same shape"):
+        calibration_error(confidence, right[0])

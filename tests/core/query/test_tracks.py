@@ -6,7 +6,7 @@ from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.tracks import (
     carriers,
-    find_visibility,
+    confidence_of,
     geometric_median,
     tracks_of_ids,
     tracks_of_pixels,
@@ -89,12 +89,25 @@ def test_a_stray_carrier_does_not_take_the_point_with_it():
     assert np.all(np.diff(several.confidence[:, torn], axis=0) < 0)  # and ever less from then on
 
 
-def test_confidence_is_coverage_where_carriers_agree():
+def test_confidence_falls_with_disagreement_frames_and_missing_coverage():
+    well = confidence_of(np.ones(5), np.array([0, 0.002, 0.005, 0.01, 0.05]), 10)
+    assert np.all(np.diff(well) < 0)
+    assert well[0] > 0.9
+    assert well[-1] < 0.1
+    assert np.all(confidence_of(np.ones(5), np.full(5, 0.005), 1) > confidence_of(np.ones(5), np.full(5, 0.005), 20))
+    partly = confidence_of(np.array([0.0, 0.15, 0.3, 1.0]), np.zeros(4), 1)
+    assert partly[0] == 0
+    assert partly[1] == pytest.approx(0.5 * partly[2])
+    assert partly[2] == partly[3]
+
+
+def test_confidence_is_high_where_carriers_agree_and_0_away_from_all():
     history, rest = rigid_history()
     points = np.vstack([truth(rest)[0][7], WORLD.to_user([[4.0, 4.0, 4.0]])])
     tracks = tracks_of_points(history, WORLD, points, 0, FRAMES)
     assert tracks.confidence.shape == (6, 2)
-    assert np.all(tracks.confidence[:, 0] > 0.89)
+    assert np.all(tracks.confidence[:, 0] > 0.9)
+    assert np.all(np.diff(tracks.confidence[:, 0]) < 0)  # errors add up from frame to frame
     assert np.all(tracks.confidence[:, 1] < 1e-6)
     assert tracks.ids[0] == 7 * 3
 
@@ -130,35 +143,6 @@ def test_geometric_median_is_at_least_as_near_as_any_neighbour():
 
 
 CAMERA = Camera("front", np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), np.eye(4), 64, 48)
-
-
-def wall(camera: Camera, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """A wall at depth 10 that covers the left half; from frame 1 on also the right half."""
-    alpha = np.ones((48, 64))
-    depth = np.full((48, 64), 10.0)
-    if index == 0:
-        alpha[:, 32:], depth[:, 32:] = 0.1, np.nan
-    return depth, alpha
-
-
-def test_seen_asks_picture_depth_and_tolerance():
-    columns = CAMERA.unproject([[8.5, 8.5], [8.5, 8.5], [40.5, 8.5], [70.0, 8.5], [8.5, 8.5]], [9.0, 10.4, 12, 9, 10.6])
-    positions = np.stack([columns, columns])
-    visible = find_visibility(positions, [0, 1], CAMERA, wall, tolerance=0.5)
-    assert visible.tolist() == [[True, True, True, False, False], [True, True, False, False, False]]
-    behind = find_visibility(-positions, [0, 1], CAMERA, wall, 0.5)
-    assert not behind.any()
-    assert not find_visibility(np.full((1, 2, 3), np.nan), [0], CAMERA, wall, 0.5).any()
-
-
-def test_seen_forgives_a_pixel_at_an_edge():
-    def step(_: Camera, index: int) -> tuple[np.ndarray, np.ndarray]:
-        depth = np.full((48, 64), 20.0)
-        depth[:, :32] = 10
-        return depth, np.ones((48, 64))
-
-    at_edge, off_edge = CAMERA.unproject([[31.5, 8.5], [30.5, 8.5]], [20.0, 20.0])
-    assert find_visibility(np.stack([at_edge, off_edge])[None], [0], CAMERA, step, 0.5).tolist() == [[True, False]]
 
 
 def sheet(z: float, half: float, opacity: float, id: int) -> Gaussians:
@@ -200,7 +184,7 @@ def test_pixels_go_along_their_rays_and_report_what_met_no_surface(monkeypatch):
 
     uv = np.array([[32.3, 24.9], [5.5, 24.5], [37.5, 24.5]])  # the last misses the covered pixels by two
     tracks = tracks_of_pixels(history, WORLD, user_camera, uv, 0, FRAMES, depth)
-    assert asked == [0, *FRAMES]  # once for what the rays missed, then for the visibility
+    assert asked == [0]  # once, for what the rays missed
     assert tracks.ids.tolist() == [7, -1, 7]
     assert np.all(tracks.confidence[:, 1] == 0)
     assert np.isnan(tracks.positions[:, 1]).all()
@@ -265,8 +249,7 @@ def test_tracks_where_gaussians_are_absent():
     tracks = tracks_of_points(history, WORLD, truth(rest[:1])[0], 0, FRAMES)
     np.testing.assert_array_equal(np.isfinite(tracks.positions[:, 0, 0]), there[:, 0])
     assert (tracks.confidence[:, 0] > 0).tolist() == there[:, 0].tolist()
-    depths = np.full((48, 64), np.inf), np.zeros((48, 64))
-    visible = tracks.with_visibility(CAMERA, lambda camera, index: depths, 1.0).visibility[CAMERA.name]
+    visible = tracks.with_visibility(history, WORLD, CAMERA, 0).visibility[CAMERA.name]
     assert not visible[3:5].any()
 
     # Retired Gaussians carry nothing, wherever they were: the born take the point.

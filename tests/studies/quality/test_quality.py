@@ -16,7 +16,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import evaluation as measures
 from scas4d_core.query.parts import parts
-from scas4d_core.query.tracks import depth_tolerance, tracks_of_pixels, tracks_of_points
+from scas4d_core.query.tracks import tracks_of_pixels, tracks_of_points
 from scas4d_core.storage.history import History
 from studies.quality import quality
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
@@ -157,7 +157,7 @@ class Perfect:
         return tracks_of_pixels(self.history, self.world, camera, uv, index, indices, self._depth)
 
     def with_visibility(self, tracks, camera, index):
-        return tracks.with_visibility(camera, self._depth, depth_tolerance(self.history, self.world, index))
+        return tracks.with_visibility(self.history, self.world, camera, index)
 
     def _depth(self, seen_by, at):
         view = self.render(seen_by, at)
