@@ -7,7 +7,6 @@ import typer
 from studies.cluster.commands import cluster, head
 from studies.compact.commands import compact, opening
 from studies.devices.commands import devices
-from studies.effort.commands import effort
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
@@ -17,7 +16,6 @@ from studies.live.commands import live, soak, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
-    processors,
     quality,
     refit,
     switches,
@@ -26,15 +24,15 @@ from studies.quality.commands import (
 )
 from studies.rigs.commands import calibration, drift, rigs
 from studies.scale.commands import scale
-from studies.service.commands import crossing, faults, ingest, memory, sleeping, views
+from studies.service.commands import faults, ingest, memory, sleeping, views
 from studies.simulation.commands import simulate
 from studies.variants.commands import gaps, variants
 
 STUDIES = {
-    "Quality": (quality, refit, effects, switches, targets, table, processors),
+    "Quality": (quality, refit, effects, switches, targets, table),
     "Rigs": (rigs, calibration, drift),
     "Quality of the output": (compact, opening, exports),
-    "Accuracy against time": (frontier, effort, paper, variants, gaps),
+    "Accuracy against time": (frontier, paper, variants, gaps),
     "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
     "Hard cases": (stability, timing, alarms),
     "The running service": (
@@ -46,7 +44,6 @@ STUDIES = {
         views,
         memory,
         sleeping,
-        crossing,
         cluster,
         head,
         simulate,

@@ -13,7 +13,7 @@ Echo = Callable[[str], None]
 QUALITY = Path("out/quality")
 """Default folder of the quality study. Other studies read its results."""
 FRONTIER = Path("out/frontier")
-"""Default folder of the study of accuracy against time, shared with the paper and effort studies."""
+"""Default folder of the study of accuracy against time, shared with the paper study."""
 
 Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")]
 Repeated = Annotated[

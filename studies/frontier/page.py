@@ -7,7 +7,6 @@ from math import log2
 from pathlib import Path
 
 from client.cli.scores import Store
-from studies.effort.page import effort_text
 from studies.frontier import plots
 from studies.frontier.convergence import read_convergence
 from studies.frontier.frontier import AXES, DEFAULT, METHODS, UPDATES, Variant
@@ -233,7 +232,6 @@ than another are omitted. Cells show the lead of `scas4d` in dB and both PSNR va
 
 {images["captures"]}
 
-{effort_text(out, captures)}
 ## Iterations
 
 {score_table(iterations, default)}

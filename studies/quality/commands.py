@@ -210,21 +210,3 @@ def table(
         print(f"{others} rows of the study are not used, because their settings differ or they have fewer frames.")
     if out is not None:
         write_page(out, page(rows))
-
-
-def processors(
-    captures: Captures,
-    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/processors"),
-    frames: Annotated[int, typer.Option(min=1, help="Updates per run.")] = 5,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for the updates on this processor.")] = 4,
-    changes: Changes = None,
-) -> None:
-    """Compares results on this processor with those on less capable ones, and with the spread over seeds.
-
-    The kernels, NumPy and BLAS compute as if on a processor with only AVX2, and as if on an x86-64 processor from 2008.
-    The exit code is 1 if the states are not bit-identical.
-    """
-    from studies.quality import processors as study
-
-    if not study.run(captures, out, frames=frames, seeds=seeds, changes=changes or ()):
-        raise typer.Exit(1)

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench faults`, `ingest`, `views`, `memory`, `sleeping` and `crossing`."""
+"""The commands `scripts/bench faults`, `ingest`, `views`, `memory` and `sleeping`."""
 
 from __future__ import annotations
 
@@ -163,23 +163,6 @@ def views(
     text = of_views.page(rows, capture.name, width, updates, turns)
     typer.echo(text)
     write_page(out, text)
-
-
-def crossing(
-    sample: Annotated[
-        Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with points and test cameras.")
-    ] = Path("samples/robot"),
-) -> None:
-    """Lists the source files that run for a frame, from PUT to commit, and those that run for a render.
-
-    Fails if there are too many files.
-    """
-    from client.cli.extras import need_server
-    from studies.service.crossing import run
-
-    need_server()
-    if not run(sample, typer.echo):
-        raise typer.Exit(1)
 
 
 def memory(

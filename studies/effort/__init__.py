@@ -1,1 +1,0 @@
-"""Studies of time budgets, and of iterations saved on unchanged frames."""
