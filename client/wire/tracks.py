@@ -50,7 +50,7 @@ class TracksModel(Model):
     ids: list[int] = Field(description="[Q] id of the Gaussian that carries the point; −1 if the query hit nothing.")
     confidence: list[list[float]] = Field(
         description=(
-            "[Q][T] how well the Gaussians that carry the point agree in that frame, in [0, 1] "
+            "[Q][T] estimated probability, in [0, 1], that the position is within 1% of the extent of the true one "
             "(docs/tracks.md); 0 if there is no position."
         )
     )

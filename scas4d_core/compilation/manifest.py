@@ -18,7 +18,7 @@ class KernelGroup(StrEnum):
     """Groups of kernels, one for each stage that needs them."""
 
     FIRST_FRAME = "first frame"
-    """Needed for frame 0 and to render any view."""
+    """Needed for frame 0, to render any view, and for the visibility of tracks."""
     UPDATE = "update"
     """Needed for updates with any combination of effects."""
     ENTANGLED = "update, entangled covariance"
@@ -70,7 +70,7 @@ KERNELS = (
         "kernels.appearance.direction.shade_rows_backward f2 f2 f2 f2 f2 f1 f2 f2 f3",
         "kernels.image_loss.target_moments f3 f4 f3 f3",
         "kernels.feature_gradients.blend_features f2 i1 s1 s1 w1 y1 i1 i1 i*2 f1 f3 f2",
-        "kernels.front_transmittance.front_transmittance d2 d2 d3 d1 d2 d3 d1 d1 d2 d1 i1 d d1 d1",
+        "kernels.front_transmittance.front_transmittance d2 d2 d3 d1 d2 d3 d1 d1 d2 d1 i1 d d d d d1",
         "kernels.pairs.count_pairs f2 i1 s1 w1 i1 i1 i*2 f1 f2",
         "kernels.appearance.direction.shade_rows f2 f2 f2 f2 f2 f1 f2",
         "kernels.tiles.cover_tiles f2 s2 s1 i i w1 y1 i1 i1 i1 s1 i1 s2 w1 s2",

@@ -289,7 +289,8 @@ class UpdateEngine(Protocol):
         """Returns the image losses of each probe, one per view. A GPU engine waits once for all probes.
 
         Args:
-            probes: the states to render, and the probe views to compare them with.
+            probes: one or more states to render, and the probe views to compare them with. In total, at most two
+                renderings per loaded probe view.
             state_next: whether ``state(learnt=True)`` will be called next. A GPU engine then downloads the state with
                 the losses.
         """

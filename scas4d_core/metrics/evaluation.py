@@ -29,7 +29,7 @@ from scas4d_core import metrics
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import Capture
 from scas4d_core.gaussians import moving_extent
-from scas4d_core.query.tracks import RIGHT
+from scas4d_core.query.tracks import CORRECT_WITHIN
 
 if TYPE_CHECKING:
     from scas4d_core.query.committed import CommittedScene
@@ -107,8 +107,8 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
     sorted_errors = metrics.error_by_confidence(tracks.positions, points, tracks.confidence, moving, extent)
     distances_3d = np.linalg.norm(tracks.positions - points, axis=-1)
     own_extent = moving_extent(reconstruction.history.gaussians(indices[0])) / reconstruction.world.metres_per_unit
-    right = distances_3d[1:, moving] <= RIGHT * own_extent
-    calibration = metrics.calibration_error(tracks.confidence[1:, moving], right)
+    correct = distances_3d[1:, moving] <= CORRECT_WITHIN * own_extent
+    calibration = metrics.calibration_error(tracks.confidence[1:, moving], correct)
     at_last = metrics.track_error_3d(tracks.positions[[0, -1]], points[[0, -1]], moving, extent)
 
     centroids = reconstruction.world.to_user(reconstruction.history.stacked("means", list(indices)))

@@ -238,27 +238,30 @@ def error_by_confidence(
     return [float(np.median(distances[order[k * size : (k + 1) * size]])) if size else math.nan for k in range(groups)]
 
 
-def calibration_error(confidence: NDArray[Any], right: NDArray[np.bool_], bins: int = 10) -> float:
+def calibration_error(confidence: NDArray[Any], correct: NDArray[np.bool_], bins: int = 10) -> float:
     """Returns the expected calibration error (ECE, Naeini et al. 2015) in [0, 1], NaN without positions.
 
     Positions are divided into bins of equal width by confidence. The error is the difference between the mean
-    confidence of a bin and its fraction of right positions, averaged over positions.
+    confidence of a bin and its fraction of correct positions, averaged over positions.
 
     Args:
         confidence: confidence of each position, in [0, 1].
-        right: whether each position is right, in the same shape.
+        correct: whether each position is correct, in the same shape.
         bins: number of bins.
 
-    >>> calibration_error(np.array([0.8, 0.8, 0.8, 0.8]), np.array([True, True, True, False]))
-    0.050000000000000044
+    Raises:
+        ValueError: if the shapes differ.
+
+    >>> round(calibration_error(np.array([0.8, 0.8, 0.8, 0.8]), np.array([True, True, True, False])), 3)
+    0.05
     """
-    if confidence.shape != right.shape:
-        raise ValueError(f"confidence and right must have the same shape; got {confidence.shape} and {right.shape}")
-    if not right.size:
+    if confidence.shape != correct.shape:
+        raise ValueError(f"confidence and correct must have the same shape; got {confidence.shape}, {correct.shape}")
+    if not correct.size:
         return math.nan
     bin_of = np.minimum((bins * confidence).astype(int), bins - 1).ravel()
-    excess = np.bincount(bin_of, weights=(confidence - right).ravel(), minlength=bins)
-    return float(np.abs(excess).sum() / right.size)
+    excess = np.bincount(bin_of, weights=(confidence - correct).ravel(), minlength=bins)
+    return float(np.abs(excess).sum() / correct.size)
 
 
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:

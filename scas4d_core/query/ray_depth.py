@@ -80,39 +80,18 @@ def ray_depths(
 
 
 def tile_groups(uv: Float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Returns an order [Q] of pixel positions [Q, 2] that groups them by tile, and the starts of all groups but the
-    first.
+    """Groups pixel positions [Q, 2] by tile.
+
+    Returns:
+        The order [Q] in which the groups follow each other, and the start of every group but the first.
     """
     tiles = np.floor(uv / TILE_PX).astype(np.int64)
     order = np.lexsort((tiles[:, 0], tiles[:, 1]))
     return order, np.flatnonzero(np.any(np.diff(tiles[order], axis=0) != 0, axis=1)) + 1
 
 
-def _meets(uv: Float, low: Float, high: Float) -> NDArray[np.bool_]:
-    """Returns the mask [N] of boxes that overlap a tile with at least one pixel position.
-
-    Args:
-        uv: [Q, 2] pixel positions.
-        low, high: [N, 2] corners of the boxes, in pixels.
-    """
-    if not len(uv):
-        return np.zeros(len(low), np.bool_)
-    tiles = np.floor(uv / TILE_PX).astype(np.int64)
-    first = tiles.min(axis=0)
-    counts = np.zeros(tiles.max(axis=0) - first + 2, np.int64)  # summed over all tiles up to each corner
-    np.add.at(counts, tuple((tiles - first + 1).T), 1)
-    counts = counts.cumsum(axis=0).cumsum(axis=1)
-    last = np.array(counts.shape) - 1
-    (left, top), (right, bottom) = (
-        np.clip(np.floor(corner / TILE_PX) - first + one, 0, last).astype(np.int64).T
-        for corner, one in ((low, 0), (high, 1))
-    )
-    inside: NDArray[np.int64] = counts[right, bottom] - counts[left, bottom] - counts[right, top] + counts[left, top]
-    return inside > 0
-
-
 class RaySplats:
-    """The Gaussians that rays may hit, sorted by depth and prepared for ray queries.
+    """The Gaussians around the rays in the image, sorted by depth and prepared for ray queries.
 
     Args:
         gaussians, camera, uv, limits, softening: see ``ray_depths``.
@@ -149,7 +128,8 @@ class RaySplats:
         reach = 2 * np.log(peak / limits.alpha_floor)
         half = np.sqrt(np.maximum(reach[:, None] * np.einsum("nii->ni", flat), 0))
 
-        rows = np.flatnonzero(_meets(uv, centre - half, centre + half))
+        low, high = (uv.min(axis=0), uv.max(axis=0)) if len(uv) else (np.inf, -np.inf)
+        rows = np.flatnonzero(((centre + half >= low) & (centre - half <= high)).all(axis=1))
         rows = rows[np.argsort(z[rows, 0], kind="stable")]
         self.limits, self.peak, self.means, self.z = limits, peak[rows], means[rows], z[rows, 0]
         self.centre, self.half, self.conic = centre[rows], half[rows], np.linalg.inv(flat[rows])

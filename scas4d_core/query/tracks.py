@@ -38,15 +38,17 @@ SOFTENING = 0.01
 """Length added in quadrature to a Gaussian's axes when computing its distance to a point, as a fraction of the extent.
 Gaussians are thinner than the uncertainty of the surface, and more carriers average out more noise. Compared with
 0.001, the median 3D error decreases by 2% (cloth) to 18% (stage)."""
-RIGHT = 0.01
-"""Maximum error of a right position, as a fraction of the extent. The confidence is the probability of a right one."""
+CORRECT_WITHIN = 0.01
+"""Maximum error of a correct position, as a fraction of the extent. The confidence is the probability that a position
+is correct."""
 COVERED = 0.3
 """Opacity of the carriers at a point from which it lies on a reconstructed surface."""
-ODDS, NOISE, DISAGREEMENT = 1.3, 0.1, 1.4
-"""Odds of a wrong position at a disagreement of ``RIGHT``, ten frames from the query; the noise of agreeing carriers,
-as a fraction of ``RIGHT``; and the exponent of the disagreement. Fitted with ``AGEING``; see docs/tracks.md."""
-AGEING, START, SPAN = 0.7, 3.0, 10.0
-"""Exponent of the number of frames from the query, and the numbers of frames that are added to it and divide it."""
+ODDS = 0.26
+"""Factor of the odds of a wrong position; see ``confidence_of``. It was fitted with the four constants below."""
+NOISE, DISAGREEMENT = 0.1, 1.4
+"""Disagreement of correct carriers, as a fraction of ``CORRECT_WITHIN``, and exponent of the disagreement."""
+FRAME_OFFSET, AGEING = 3.0, 0.7
+"""Number added to the number of frames from the query, and its exponent."""
 PIXEL_REACH = 2.0
 """Maximum distance, in pixels, from a query without a surface to the covered pixel whose depth is used instead."""
 
@@ -58,11 +60,11 @@ class Tracks:
     Attributes:
         positions: [T, Q, 3] float64 positions in the user's world and units. NaN for a pixel query without a surface,
             and in frames in which too few of the carriers are present (not yet added, or retired).
-        confidence: [T, Q] float64 in [0, 1], estimated probability that the position is right; see
+        confidence: [T, Q] float64 in [0, 1], estimated probability that the position is correct; see
             ``confidence_of``. It is 0 for a query without a surface, and if the position is NaN.
         ids: [Q] int64 id of the Gaussian with the largest weight; −1 for a pixel query without a surface.
         indices: [T] int64 frame indices.
-        visibility: maps the name of each queried camera to the visibility [T, Q] bool; see ``visibility``.
+        visibility: maps the name of each queried camera to the visibility [T, Q] bool; see ``find_visibility``.
     """
 
     positions: Float
@@ -144,7 +146,7 @@ def tracks_of_points(
 
 
 def confidence_of(covered: Float, disagreement: Float, frames: int) -> Float:
-    """Returns the probability that a position is within ``RIGHT`` of the true one.
+    """Returns the probability that a position is within ``CORRECT_WITHIN`` of the true one.
 
     The formula is a logistic regression on captures with known tracks. It does not reveal that a whole surface moves
     incorrectly.
@@ -157,7 +159,7 @@ def confidence_of(covered: Float, disagreement: Float, frames: int) -> Float:
     >>> confidence_of(np.array([0.9, 0.9, 0.1]), np.array([0.0, 0.01, 0.0]), frames=7).round(2)
     array([0.95, 0.4 , 0.32])
     """
-    odds = ODDS * (disagreement / RIGHT + NOISE) ** DISAGREEMENT * ((frames + START) / SPAN) ** AGEING
+    odds = ODDS * (disagreement / CORRECT_WITHIN + NOISE) ** DISAGREEMENT * (frames + FRAME_OFFSET) ** AGEING
     confidence: Float = np.minimum(1, covered / COVERED) / (1 + odds)
     return confidence
 

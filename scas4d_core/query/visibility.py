@@ -1,4 +1,4 @@
-"""Visibility of points: how much light the Gaussians in front of a point absorb along its ray."""
+"""Visibility of points, from the transmittance of the Gaussians in front of them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ Float = NDArray[np.float64]
 
 OWN_SURFACE = 0.015
 """Distance in front of a point within which Gaussians belong to its own surface, as a fraction of the extent. With
-0.01, rigid objects gain 1% of the positions, and a cloth, whose Gaussians are thicker than the cloth, loses 3%."""
-LEAST_LIGHT = 0.3
-"""Minimum share of the light that must pass the Gaussians in front of a visible point."""
+0.01, the fraction of correct answers rises by 0.01 for rigid objects, but falls by 0.03 for a cloth, whose Gaussians
+are thicker than the cloth."""
+MIN_TRANSMITTANCE = 0.3
+"""Minimum transmittance of the Gaussians in front of a visible point."""
 
 
 def find_visibility(
@@ -34,8 +35,8 @@ def find_visibility(
 ) -> NDArray[np.bool_]:
     """Returns whether points are visible in a camera, [T, Q] bool: in its image, in front of it and not occluded.
 
-    A point is occluded if less than ``LEAST_LIGHT`` of the light on its ray passes the Gaussians in front of it.
-    Gaussians at most ``OWN_SURFACE`` in front of the point do not count.
+    A point is occluded if the transmittance of the Gaussians in front of it is below ``MIN_TRANSMITTANCE``. Gaussians
+    at most ``OWN_SURFACE`` in front of the point do not count.
 
     Args:
         history: history of committed states.
@@ -63,17 +64,18 @@ def find_visibility(
     inside = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
     visible = np.zeros(inside.shape, dtype=np.bool_)
     extent, posed = moving_extent(history.gaussians(index)), world.camera_to_inside(camera)
-    rule = np.array([limits.alpha_cap, limits.alpha_floor, REACH])
     for t, frame in enumerate(indices):
         rows = np.flatnonzero(inside[t])
+        if not len(rows):
+            continue
         order, cuts = tile_groups(uv[t, rows])
         rows = rows[order]
         splats = RaySplats(history.gaussians(int(frame)), posed, uv[t, rows], limits, RAY_SOFTENING * extent)
         front = z[t, rows] * world.metres_per_unit - OWN_SURFACE * extent
-        light = np.empty(len(rows))
+        starts, transmittance = np.concatenate([[0], cuts, [len(rows)]]), np.empty(len(rows))
         shapes = splats.centre, splats.half, splats.conic, splats.peak, splats.means, splats.precision, splats.spread
         arrays = [np.ascontiguousarray(array) for array in (*shapes, np.concatenate(splats.lens), uv[t, rows], front)]
-        starts = np.concatenate([[0], cuts, [len(rows)]]) if len(rows) else np.zeros(1, np.int64)
-        front_transmittance(*arrays, starts, LEAST_LIGHT, rule, light)
-        visible[t, rows] = light >= LEAST_LIGHT
+        constants = limits.alpha_cap, limits.alpha_floor, REACH, MIN_TRANSMITTANCE
+        front_transmittance(*arrays, starts, *constants, transmittance)
+        visible[t, rows] = transmittance >= MIN_TRANSMITTANCE
     return visible

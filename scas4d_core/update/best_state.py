@@ -109,8 +109,8 @@ class ProbeViews:
         if self.whole:
             losses = self._engine.probe(*probes)
         else:
-            *losses, (whole,) = self._engine.probe(*probes, Probe(self._whole[:1], moved=False, learnt=False))
-            if losses[0][0] > ALIASED * whole:
+            *losses, (full_size_loss,) = self._engine.probe(*probes, Probe(self._whole[:1], moved=False, learnt=False))
+            if losses[0][0] > ALIASED * full_size_loss:
                 self._compared, self.whole = self._whole, True
                 losses = self._engine.probe(*[probe._replace(views=self._whole) for probe in probes])
         return [dict(zip(self._names, each, strict=True)) for each in losses]

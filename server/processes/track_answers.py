@@ -33,11 +33,8 @@ PIECE_QUERIES = 2048
 """Maximum number of points per piece; associating them with 25,000 Gaussians takes about 0.3 s."""
 PIECE_POINTS = 32_768
 """Maximum number of points times frames per piece, about 2 s of work."""
-PIECE_VIEWS = 64
-"""Maximum number of depth maps per piece, about 1 s of work at 256×256.
-
-Visibility needs one depth map per frame and camera.
-"""
+PIECE_VIEWS = 32
+"""Maximum number of frames times cameras with visibility per piece, about 1 s of work for 20,000 Gaussians."""
 
 
 def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:

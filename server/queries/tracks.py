@@ -26,7 +26,7 @@ At this limit, a query takes about one minute of reader time, split into pieces,
 MOST_JSON_POINTS = 100_000
 """Maximum number of points times frames in a JSON answer, at about 100 bytes each; npz answers may have more."""
 MOST_VIEWS = 4096
-"""Maximum number of cameras times frames for visibility; each needs a depth map, about one minute in total."""
+"""Maximum number of cameras times frames for visibility, one to three minutes of reader time for 20,000 Gaussians."""
 LARGEST_ID = 2**63 - 1
 """Largest possible id of a Gaussian."""
 FARTHEST = 1e15

@@ -227,7 +227,6 @@ class FakeCommitted:
         self.history = history
         self.world = world
         self.find = tracks
-        tracks.find_visibility = inside_the_image
 
     def render(self, camera, index, *, background, labels=None):
         self.history.gaussians(index)
@@ -314,6 +313,7 @@ def install(**others):
     of_core = {
         "scas4d_core.reconstruction": {"Reconstruction": FakeReconstruction},
         "scas4d_core.query.committed": {"CommittedScene": FakeCommitted},
+        "scas4d_core.query.visibility": {"find_visibility": inside_the_image},
         "scas4d_core.recompute": {"recompute": recompute},
         "scas4d_core.replay": {"replay": replay},
         "scas4d_core.warm_up": {

@@ -1,4 +1,4 @@
-"""Gaussians that rays meet: plain sheets, and a random cloud."""
+"""Gaussians for ray tests: flat sheets and a random cloud."""
 
 from __future__ import annotations
 

@@ -44,9 +44,8 @@ MIN_STATIC = 0.05
 """Minimum share of static Gaussians; with fewer, there is no background to receive shadows."""
 
 
-_hidden_cache: WeakKeyDictionary[Gaussians, dict[str, tuple[CameraArrays, Mask]]] = WeakKeyDictionary()
-"""Camera and mask of each view of a state, keyed by camera name; see ``_hidden``. The update and the evidence use
-them."""
+_reached_masks: WeakKeyDictionary[Gaussians, dict[str, tuple[CameraArrays, Mask]]] = WeakKeyDictionary()
+"""For each state, the camera and mask of each view, keyed by camera name. The update and the evidence share them."""
 
 
 class ShadowsPart(UpdatePart):
@@ -68,7 +67,7 @@ class ShadowsPart(UpdatePart):
         if sum((squares & static).sum() for squares, static in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
         followed = follow_pictures(state, known, attempt.renderer, self._static)
-        _hidden_cache[followed] = _hidden_cache[state]  # only colours have changed
+        _reached_masks[followed] = _reached_masks[state]  # only colours have changed
         return followed
 
 
@@ -146,13 +145,13 @@ def _compared(
 
 def _hidden(views: Sequence[TrainingView], state: Gaussians, renderer: Renderer) -> list[Mask]:
     """Returns the [h, w] mask of each view's blocks that moving Gaussians reach."""
-    known, each = _hidden_cache.setdefault(state, {}), SIDE // BLOCK  # blocks per side of a square
-    missing = [view for view in views if view.name not in known or known[view.name][0] is not view.camera]
+    cached, each = _reached_masks.setdefault(state, {}), SIDE // BLOCK  # blocks per side of a square
+    missing = [view for view in views if view.name not in cached or cached[view.name][0] is not view.camera]
     for view, blocks in zip(missing, renderer.reached(state, [view.camera for view in missing]), strict=True):
         height, width = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE
         grid = blocks[: height * each, : width * each].reshape(height, each, width, each)
-        known[view.name] = view.camera, np.asarray(grid.any(axis=(1, 3)))
-    return [known[view.name][1] for view in views]
+        cached[view.name] = view.camera, np.asarray(grid.any(axis=(1, 3)))
+    return [cached[view.name][1] for view in views]
 
 
 EFFECT = Shadows(

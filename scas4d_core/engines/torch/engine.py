@@ -218,9 +218,8 @@ class TorchEngine:
     def _losses(self, probe: Probe) -> list[float]:
         """Returns the image loss on each view of a probe."""
         scene, previous = self._scene, self._scene.previous
-        now = Moved(scene.means, scene.factors, no_turns(len(scene.rows)))
-        if probe.moved:
-            now = scene.moved(self._parameters)
+        still = Moved(scene.means, scene.factors, no_turns(len(scene.rows)))
+        now = scene.moved(self._parameters) if probe.moved else still
         colours, looks = scene.colours, self._parameters.gloss
         gloss = None if previous.gloss is None else leaf(previous.gloss)
         environment = None if previous.environment is None else leaf(previous.environment)

@@ -356,6 +356,8 @@ class WarpEngine:
     def probe(self, *probes: Probe, state_next: bool = False) -> list[list[float]]:
         """See ``UpdateEngine.probe``."""
         ends = np.cumsum([len(probe.views) for probe in probes])
+        if LOG_ROWS + ends[-1] > len(self._pictures.log):
+            raise ValueError(f"cannot render {ends[-1]} probe views at once; use {STATES_AT_ONCE} states at most")
         losses = None
         while losses is None:
             for probe, end in zip(probes, ends, strict=True):
@@ -386,7 +388,9 @@ class WarpEngine:
         """See ``UpdateEngine.tables``. The host does not wait if the tables were read with the state."""
         if self._tables is None:
             self._settle()
-            self._tables = self._deformation.tables_of(self.downloads.read(*self._deformation.parameters))
+            self._tables = self._deformation.tables_of(
+                self._state or self.downloads.read(*self._deformation.parameters)
+            )
         return self._tables
 
     def log(self) -> IterationLog:

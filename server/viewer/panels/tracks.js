@@ -6,7 +6,7 @@ import { $, node, note, page } from "../page.js";
 const MOST_TRACKS = 12;
 const PICK_PX = 320;
 
-/** Camera of the same view with a smaller picture, since visibility is computed from depth maps of this size. */
+/** Camera of the same view with a smaller picture. A pixel without a surface needs a depth map of this size. */
 function smaller(camera) {
   const ratio = Math.min(1, PICK_PX / Math.max(camera.width, camera.height));
   const [width, height] = [Math.round(camera.width * ratio), Math.round(camera.height * ratio)];

@@ -69,7 +69,7 @@ def test_a_hidden_point_beside_an_edge_is_hidden_and_a_visible_one_is_visible() 
 
 
 @pytest.mark.parametrize(("opacity", "visible"), [(0.3, True), (0.9, False)])
-def test_what_lets_most_light_through_hides_nothing(opacity: float, visible: bool) -> None:
+def test_visibility_depends_on_the_opacity_in_front(opacity: float, visible: bool) -> None:
     thin = gaussians([[0, 0, 2]], [np.diag([0.5, 0.5, 0.01])], [opacity])
     everywhere = stacked(thin, moved(sheet((0, 0, 1), 2.0), (0, 0, 8)))  # gives the extent
     points = at([[32.0, 24.0]], [3.0])
@@ -94,7 +94,7 @@ def test_the_light_is_that_of_a_plain_loop(monkeypatch: pytest.MonkeyPatch) -> N
     extent = moving_extent(cloud)
     light = np.array([plain_light(cloud, extent, *each) for each in zip(uv, depth, strict=True)])
     for least in (0.1, 0.3, 0.6, 0.9):
-        monkeypatch.setattr(visibility, "LEAST_LIGHT", least)
+        monkeypatch.setattr(visibility, "MIN_TRANSMITTANCE", least)
         seen = find_visibility(history_of(cloud), WORLD, points, [0], CAMERA, 0)[0]
         assert 20 < seen.sum() < 180
         np.testing.assert_array_equal(seen, light >= least)

@@ -74,19 +74,19 @@ def test_it_goes_off_where_nothing_changes_and_on_again() -> None:
     assert scene._prepared.carried.switches[NAME].on
 
 
-def test_the_blocks_that_moving_gaussians_reach_are_found_once_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    truth, found, reached = shaded(0.3), list[int](), CpuRenderer.reached
+def test_the_blocks_that_moving_gaussians_reach_are_camera_counts_once_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, camera_counts, reached = shaded(0.3), list[int](), CpuRenderer.reached
 
     def counted(self: CpuRenderer, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
-        found.append(len(cameras))
+        camera_counts.append(len(cameras))
         return reached(self, state, cameras)
 
     scene = followed("on", truth, frames=1)
     colours = scene.history.newest.colours
     monkeypatch.setattr(CpuRenderer, "reached", counted)
     scene.step(take_frame(2, 2 / 30, truth, RIG))
-    assert (scene.history.newest.colours != colours).any()  # the update looked, and the evidence did, too
-    assert sum(found) == len(RIG.cameras)
+    assert (scene.history.newest.colours != colours).any()  # both the update and the evidence used the masks
+    assert sum(camera_counts) == len(RIG.cameras)
 
 
 def test_what_moves_keeps_its_own_colours() -> None:

@@ -193,7 +193,7 @@ def test_a_probe_with_too_little_room_is_repeated() -> None:
     assert_repeated(engine.probe(Probe(range(5), moved=True, learnt=True))[0], errors)
 
 
-def test_a_state_that_is_announced_is_downloaded_with_the_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_state_next_downloads_the_state_with_the_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = case(**TOGETHER)
     engine, waits = loaded(WarpEngine(DEVICE), scene), Waits(monkeypatch)
     engine.iterate([0], step())
@@ -207,19 +207,27 @@ def test_a_state_that_is_announced_is_downloaded_with_the_errors(monkeypatch: py
     np.testing.assert_array_equal(engine.state(learnt=True).means, state.means)
 
 
-def test_a_state_that_is_announced_is_right_if_a_probe_had_too_little_room() -> None:
-    scene = case(**TOGETHER)
-    states = []
-    for room in (None, 100):
+@pytest.mark.parametrize("overflow", ["iteration", "probe"])
+def test_state_next_is_correct_after_an_overflow(overflow: str) -> None:
+    scene, states = case(**TOGETHER), []
+    for cramped in ("nothing", overflow):
         engine = loaded(WarpEngine(DEVICE), scene)
-        engine.iterate([0], step())
-        if room is not None:
-            engine._pictures._rasterizer.capacity = room
-            engine._pictures._rasterizer.resize(48, 40)
+        for place in ("iteration", "probe"):
+            if cramped == place:
+                engine._pictures._rasterizer.capacity = 100
+                engine._pictures._rasterizer.resize(48, 40)
+            if place == "iteration":
+                engine.iterate([0], step())
         engine.probe(Probe(range(5), moved=True, learnt=True), state_next=True)
         states.append(engine.state(learnt=True))
     np.testing.assert_array_equal(states[0].colours, states[1].colours)
     np.testing.assert_array_equal(states[0].means, states[1].means)
+
+
+def test_more_probes_than_the_log_has_rows_are_refused() -> None:
+    engine = loaded(WarpEngine(DEVICE), case())
+    with pytest.raises(ValueError, match="cannot render 15 probe views at once"):
+        engine.probe(*[Probe(range(5), moved=True, learnt=True)] * 3)
 
 
 def test_a_long_attempt_is_logged_whole(monkeypatch) -> None:
