@@ -15,6 +15,7 @@ from studies.kernels.commands import gpu_kernels, kernels, moving, startup
 from studies.live.commands import live, soak, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
+    confidence,
     effects,
     quality,
     refit,
@@ -29,7 +30,7 @@ from studies.simulation.commands import simulate
 from studies.variants.commands import gaps, variants
 
 STUDIES = {
-    "Quality": (quality, refit, effects, switches, targets, table),
+    "Quality": (quality, refit, effects, switches, targets, table, confidence),
     "Rigs": (rigs, calibration, drift),
     "Quality of the output": (compact, opening, exports),
     "Accuracy against time": (frontier, paper, variants, gaps),

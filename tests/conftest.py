@@ -43,13 +43,8 @@ SERVICE_STARTERS = {"Running", "Service", "serving", "serving_with", "stub"}
 """A test that has one of those fixtures, or whose file imports one of those helpers, gets the mark `service`."""
 SLOW = "tests/studies/"
 BROWSER = "tests/browser/"
-SECOND_PROCESSOR = (
-    "tests/core/kernels/", "tests/core/properties/", "tests/core/engines/",
-    "tests/studies/hard_cases/",
-)  # fmt: skip
-"""The same folders are named in .ci/run."""
-SAME_ON_ALL = ("tests/core/engines/warp/",)
-"""Of these, tests whose kernels do not depend on Numba's processor: Warp compiles its own."""
+SECOND_PROCESSOR = ("tests/core/kernels/", "tests/core/properties/")
+"""The same folders are named in .ci/run. Engines run these kernels; `test_reproducible` covers a whole scene."""
 
 
 def path_of(item: pytest.Item) -> str:
@@ -64,7 +59,7 @@ def add_marks(item: pytest.Item) -> None:
         item.add_marker("slow")
     if path.startswith(BROWSER):
         item.add_marker("browser")
-    if path.startswith(SECOND_PROCESSOR) and not path.startswith((*WITHOUT_KERNELS, *SAME_ON_ALL)):
+    if path.startswith(SECOND_PROCESSOR):
         item.add_marker("second_processor")
     if SERVICE_FIXTURES & set(item.fixturenames) or SERVICE_STARTERS & vars(item.module).keys():
         item.add_marker("service")

@@ -7,8 +7,9 @@ from pathlib import Path
 from studies.hard_frames.footage import SyntheticFootage
 from studies.service import hard_frames as stability
 
-SIZES = {"all black": 3, "swapped": 2, "drop out": 2, "jumps": 1}
-"""Part of the name of each case, and the number of its sizes."""
+SIZES = {"all black": 3, "jumps": 1}
+"""Part of the name of each case, and the number of its sizes: one whose frames are rejected, and one that is searched.
+`tests/studies/hard_frames` runs all cases without the service."""
 
 
 def test_cases_through_the_service(tmp_path: Path) -> None:
