@@ -44,7 +44,8 @@ is correct."""
 COVERED = 0.3
 """Opacity of the carriers at a point from which it lies on a reconstructed surface."""
 ODDS = 0.26
-"""Factor of the odds of a wrong position; see ``confidence_of``. It was fitted with the four constants below."""
+"""Factor of the odds of a wrong position; see ``confidence_of``. It is fitted together with ``DISAGREEMENT`` and
+``AGEING``, for given ``NOISE`` and ``FRAME_OFFSET`` (`scripts/bench confidence`)."""
 NOISE, DISAGREEMENT = 0.1, 1.4
 """Disagreement of correct carriers, as a fraction of ``CORRECT_WITHIN``, and exponent of the disagreement."""
 FRAME_OFFSET, AGEING = 3.0, 0.7

@@ -43,7 +43,7 @@ def run(captures: Sequence[Path], out: Path, scale: float) -> str:
     runs: dict[str, list[Float]] = {}
     for capture in captures:
         for seed, variant in enumerate(PLAYED):
-            file = out / f"{capture.name}-{variant.replace(' ', '-')}.npy"
+            file = out / f"{capture.name}-{variant.replace(' ', '-')}-{scale:g}.npy"
             if not file.exists():
                 opened = open_capture(capture, image_scale=scale)
                 rows = measure(opened if seed == 0 else VARIANTS[variant].made(opened), seed)
