@@ -15,7 +15,6 @@ from studies.kernels.commands import gpu_kernels, kernels, moving, startup
 from studies.live.commands import live, soak, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
-    confidence,
     effects,
     quality,
     refit,
@@ -27,7 +26,7 @@ from studies.rigs.commands import calibration, drift, rigs
 from studies.scale.commands import scale
 from studies.service.commands import faults, ingest, memory, sleeping, views
 from studies.simulation.commands import simulate
-from studies.variants.commands import gaps, variants
+from studies.variants.commands import confidence, gaps, variants
 
 STUDIES = {
     "Quality": (quality, refit, effects, switches, targets, table, confidence),

@@ -9,7 +9,7 @@ import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import QUALITY, Again, Captures, Changes, Page, write_page
+from studies.options import QUALITY, Again, Captures, Changes, write_page
 
 Study = Annotated[
     Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
@@ -210,24 +210,3 @@ def table(
         print(f"{others} rows of the study are not used, because their settings differ or they have fewer frames.")
     if out is not None:
         write_page(out, page(rows))
-
-
-def confidence(
-    captures: Captures,
-    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/confidence"),
-    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Scale of the images.")] = 0.5,
-    page: Page = None,
-) -> None:
-    """Fits the confidence of tracks on captures with known tracks, and reports its calibration on the one left out.
-
-    Each capture is reconstructed as it is and backwards.
-
-    Example: scripts/bench confidence captures/robot captures/wheel captures/cloth
-    """
-    from studies.quality.confidence import run
-
-    if len(captures) < 2:
-        raise typer.BadParameter("pass at least two captures, because one is left out", param_hint="CAPTURE...")
-    text = run(captures, out, scale)
-    typer.echo(text)
-    write_page(page, text)

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench variants` and `gaps`."""
+"""The commands `scripts/bench variants`, `gaps` and `confidence`."""
 
 from __future__ import annotations
 
@@ -92,5 +92,26 @@ def gaps(
     scale = settings.scene.image_scale
     jobs = [(options.open(path), open_measured(path, options, image_scale=scale), settings) for path in captures]
     text = run(jobs, frames, step, queue, typer.echo)
+    typer.echo(text)
+    write_page(page, text)
+
+
+def confidence(
+    captures: Captures,
+    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/confidence"),
+    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Scale of the images.")] = 0.5,
+    page: Page = None,
+) -> None:
+    """Fits the confidence of tracks on captures with known tracks, and reports its calibration on the one left out.
+
+    Each capture is reconstructed as it is and backwards.
+
+    Example: scripts/bench confidence captures/robot captures/wheel captures/cloth
+    """
+    from studies.variants.confidence import run
+
+    if len(captures) < 2:
+        raise typer.BadParameter("pass at least two captures, because one is left out", param_hint="CAPTURE...")
+    text = run(captures, out, scale)
     typer.echo(text)
     write_page(page, text)

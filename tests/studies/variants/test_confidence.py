@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.query.tracks import AGEING, DISAGREEMENT, ODDS, confidence_of
-from studies.quality import confidence as study
+from studies.variants import confidence as study
 
 CONSTANTS = np.array([np.log(ODDS), DISAGREEMENT, AGEING])
 
