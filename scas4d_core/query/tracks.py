@@ -146,7 +146,12 @@ def tracks_of_points(
     return Tracks(world.to_user(result), confidence, theta.ids[rows[:, 0]], np.asarray(indices, dtype=np.int64))
 
 
-def confidence_of(covered: Float, disagreement: Float, frames: int) -> Float:
+def confidence_of(
+    covered: Float,
+    disagreement: Float,
+    frames: int | Float,
+    constants: tuple[float, float, float] = (ODDS, DISAGREEMENT, AGEING),
+) -> Float:
     """Returns the probability that a position is within ``CORRECT_WITHIN`` of the true one.
 
     The formula is a logistic regression on captures with known tracks. It does not reveal that a whole surface moves
@@ -156,11 +161,13 @@ def confidence_of(covered: Float, disagreement: Float, frames: int) -> Float:
         covered: [Q] opacity of the carriers at each queried point.
         disagreement: [Q] weighted mean distance of the carriers' positions from the track, as a fraction of the extent.
         frames: number of frames from the query.
+        constants: ``ODDS``, ``DISAGREEMENT`` and ``AGEING``, which a fit varies.
 
     >>> confidence_of(np.array([0.9, 0.9, 0.1]), np.array([0.0, 0.01, 0.0]), frames=7).round(2)
     array([0.95, 0.4 , 0.32])
     """
-    odds = ODDS * (disagreement / CORRECT_WITHIN + NOISE) ** DISAGREEMENT * (frames + FRAME_OFFSET) ** AGEING
+    factor, exponent, ageing = constants
+    odds = factor * (disagreement / CORRECT_WITHIN + NOISE) ** exponent * (frames + FRAME_OFFSET) ** ageing
     confidence: Float = np.minimum(1, covered / COVERED) / (1 + odds)
     return confidence
 

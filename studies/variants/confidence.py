@@ -19,7 +19,7 @@ from scas4d_core.gaussians import moving_extent
 from scas4d_core.metrics import calibration_error
 from scas4d_core.metrics.evaluation import moving_points
 from scas4d_core.query import tracks as module
-from scas4d_core.query.tracks import CORRECT_WITHIN, COVERED, FRAME_OFFSET, NOISE
+from scas4d_core.query.tracks import CORRECT_WITHIN, confidence_of
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.constants import varied
@@ -59,14 +59,14 @@ def measure(capture: Capture, seed: int) -> Float:
     Returns:
         [R, 4] opacity of the carriers, disagreement, frames from the query, and 1 if the position is correct.
     """
+    truth = capture.ground_truth
+    if truth is None:
+        raise ValueError(f"{capture.name} has no known tracks; use captures with ground truth")
     settings = Settings.model_validate({"static": {"seed": seed, "seconds": None}, "update": {"seed": seed}})
     scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
     frames = range(capture.frame_count)
     for index in frames[1:]:
         scene.step(capture.frame(index))
-    truth = capture.ground_truth
-    if truth is None:
-        raise ValueError(f"{capture.name} has no known tracks; use captures with ground truth")
     points = truth.points[: len(frames)]
     extent = capture.extent or float(np.ptp(points.reshape(-1, 3), axis=0).max())
     moving = moving_points(points, extent)
@@ -107,14 +107,9 @@ def fit(runs: Sequence[Float]) -> Float:
 
 def confidence(rows: Float, constants: Float) -> Float:
     """Returns ``confidence_of`` of each row with other constants; see ``fit``."""
-    covered, disagreement, frames = rows[:, :3].T
-    log_odds = (
-        constants[0]
-        + constants[1] * np.log(disagreement / CORRECT_WITHIN + NOISE)
-        + constants[2] * np.log(frames + FRAME_OFFSET)
-    )
-    result: Float = np.minimum(1, covered / COVERED) / (1 + np.exp(log_odds))
-    return result
+    log_odds, disagreement, ageing = constants.tolist()
+    covered, apart, frames = rows[:, :3].T
+    return confidence_of(covered, apart, frames, (float(np.exp(log_odds)), disagreement, ageing))
 
 
 def report(runs: dict[str, list[Float]]) -> str:
