@@ -11,9 +11,9 @@ pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install wa
 from scas4d_core.engines.warp.compile_ahead import ARCHITECTURES, compile_ahead, kernel_modules
 
 
-def test_all_kernels_compile_for_the_oldest_gpu(tmp_path: Path) -> None:
-    """`scripts/bench gpu-kernels` compiles them for all GPUs."""
-    files = compile_ahead(ARCHITECTURES[0], tmp_path)
+@pytest.mark.parametrize("architecture", [ARCHITECTURES[0], ARCHITECTURES[-1]])
+def test_all_kernels_compile_for_the_oldest_and_the_newest_gpu(architecture: int, tmp_path: Path) -> None:
+    files = compile_ahead(architecture, tmp_path)
     assert len(files) == len(kernel_modules()) > 10
     assert all(file.read_bytes().startswith(b"\x7fELF") for file in files)
 
