@@ -36,6 +36,9 @@ class LazyPictures(Mapping[str, NDArray[np.uint8]]):
             raise KeyError(camera)
         return self._decode(camera)
 
+    def __contains__(self, camera: object) -> bool:  # the inherited method would decode the image
+        return camera in self._cameras
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._cameras)
 
