@@ -20,6 +20,7 @@ from scas4d_core.engines.fit import (
     FitScalars,
 )  # fmt: skip
 from scas4d_core.engines.limits import scene_limits
+from scas4d_core.engines.renderer import pair_counts
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule
 from scas4d_core.first_frame.points.surroundings import Stage
@@ -50,6 +51,12 @@ DENSIFY_GRADIENT = 1e-6
 limits the number of densified Gaussians. Gaussians with the largest gradients are densified first."""
 PRUNE_OPACITY = 0.01
 """Opacity below which densification removes a Gaussian."""
+DEEP, DEEP_SHRINK = 40.0, 0.89
+"""Mean number of Gaussians blended into a pixel above which a scene is deep, and the factor on the scales of
+its Gaussians in each densification step. Where few cameras constrain a scene, large and faint Gaussians
+would otherwise form deep stacks, which take most of the time of an update. Where large Gaussians are
+needed, they grow again. The rooms at hand have 23 to 34 Gaussians per pixel; shrinking those makes their
+tracks worse (docs/tried.md)."""
 MIN_VIEWS = 2
 """Number of training cameras that must see a Gaussian. A Gaussian that fewer cameras see is removed."""
 SEEN_PIXELS = 0.05
@@ -101,7 +108,7 @@ class StaticTrainer:
         renderer = renderer_of(device, scene.background_rgb, scene_limits(scene.near, self.radius))
         engine = fit_engine_of(renderer, WEIGHT_MASK)
         self.fit = GaussianFit(engine, views, parameters, exposures=self.exposures, statistics=True)
-        self._last = float(settings.iterations)
+        self._last, self._deep = float(settings.iterations), False
         self.cameras: dict[str, CameraFit] = {}
         self._start, self._until = len(parameters), int(DENSIFY_UNTIL * settings.iterations)
         self.schedule = FitSchedule(settings.iterations, limit or TimeLimit(None), self._expected)
@@ -196,13 +203,18 @@ class StaticTrainer:
         """Removes nearly transparent Gaussians, and densifies Gaussians with large gradients.
 
         Gaussians with the largest screen-space gradients come first. Of these, larger Gaussians are
-        split and smaller Gaussians are cloned.
+        split and smaller Gaussians are cloned. In a deep scene, all Gaussians also shrink.
 
         Args:
             target: target number of Gaussians.
         """
+        if not self._deep:
+            cameras = [view.camera for view in self.views]
+            self._deep = pair_counts(self.fit.renderer, self.gaussians(), cameras).mean > DEEP
         parameters, statistics = self.fit.table.parameters, self.fit.table.statistics
         assert statistics is not None
+        if self._deep:
+            parameters[:, SCALE] += np.float32(np.log(DEEP_SHRINK))
         opacity = 1 / (1 + np.exp(-parameters[:, OPACITY.start]))
         score = statistics.screen_gradients / np.maximum(statistics.rendered, 1)
         keep = opacity >= min(PRUNE_OPACITY, float(np.median(opacity)))  # never more than half at once

@@ -9,7 +9,11 @@ import pytest
 from box_scene import held_out_camera, make_box, make_rig, photograph, take_frame
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.choose import renderer_of
 from scas4d_core.engines.fit import OPACITY
+from scas4d_core.engines.limits import scene_limits
+from scas4d_core.engines.renderer import pair_counts
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame import static_scene
 from scas4d_core.first_frame.fit_first_frame import fit_static_scene
 from scas4d_core.first_frame.fit_schedule import FitProgress
@@ -184,6 +188,23 @@ def test_progress_counts_every_iteration() -> None:
     result = fit_static_scene(factory, views, *cloud(), None, SceneSettings(), short, seen.append)
     assert [(now.done, now.loss) for now in seen] == list(enumerate(result.losses, start=1))
     assert {now.planned for now in seen} == {5}
+
+
+def test_gaussians_shrink_only_in_deep_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = SETTINGS.model_copy(update={"iterations": 400})
+    cameras = [CameraArrays.of(camera) for camera in RIG.cameras]
+    renderer = renderer_of("cpu", (0, 0, 0), scene_limits("auto", RIG.radius))
+    monkeypatch.setattr(static_scene, "DEEP", 1000.0)
+    shallow = fit(settings)
+    monkeypatch.setattr(static_scene, "DEEP", 0.0)
+    deep = fit(settings)
+    before, after = (pair_counts(renderer, result.gaussians, cameras).mean for result in (shallow, deep))
+    assert 0 < after < 0.8 * before
+    assert psnr(deep.gaussians) > psnr(shallow.gaussians) - 1
+    monkeypatch.setattr(static_scene, "DEEP", 0.9 * before)  # below the number without shrinking
+    assert fit(settings).losses != shallow.losses
+    monkeypatch.setattr(static_scene, "DEEP_SHRINK", 1.0)
+    np.testing.assert_array_equal(fit(settings).losses, shallow.losses)
 
 
 def test_frame_0_ends_early_once_nothing_is_gained(monkeypatch: pytest.MonkeyPatch) -> None:
