@@ -1,6 +1,7 @@
 """Tests get their marks; kernels are compiled once for all processes; the longest come first; failures are named."""
 
 import os
+import sys
 
 import pytest
 
@@ -36,6 +37,19 @@ def kernels(request: pytest.FixtureRequest) -> None:
         from scas4d_core.warm_up import compile_in_processes
 
         compile_in_processes()
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """If several processes run tests, each uses one thread.
+
+    Threads that wait for each other on busy cores would take half as long again. Processes that tests start, and tests
+    of the number of threads, use more.
+    """
+    if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
+        for name in ("numba", "torch"):
+            if name in sys.modules:
+                sys.modules[name].set_num_threads(1)
 
 
 SERVICE_FIXTURES = {"service", "app"}
