@@ -3,10 +3,10 @@
 import os
 
 # OpenMP reads this variable once, when the first library that uses OpenMP (torch, scikit-learn, Numba) is loaded.
-# Waiting threads must sleep, because spinning threads cause severalfold slowdowns when another process needs their
-# core.
+# Threads that spin while they wait cause severalfold slowdowns when another process needs their core, so they sleep.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# Waking a sleeping thread takes about 50 µs on virtual machines. With GNU's runtime, threads therefore first spin for
-# a few microseconds, which catches the next parallel region of an iteration. On two idle cores, updates become 4%
-# faster (2026-11-30); 5000 instead of 1000 turns make them 10% faster, but 20% slower beside a busy process.
+# Waking a sleeping thread takes about 50 µs on a virtual machine. With GNU's runtime, threads therefore spin for some
+# microseconds before they sleep, because the next parallel region of an iteration often follows so soon. On two cores,
+# updates of robot become 4% faster, and 0 to 3% slower beside a busy process; with 5000 instead of 1000 spins, 10%
+# faster, and 20% slower (AMD EPYC, 2026-11-30).
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")

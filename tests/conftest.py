@@ -39,12 +39,12 @@ def kernels(request: pytest.FixtureRequest) -> None:
         compile_in_processes()
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> None:
-    """If several processes run tests, each uses one thread.
+@pytest.hookimpl(tryfirst=True)  # before fixtures run kernels
+def pytest_runtest_setup() -> None:
+    """If several processes run tests, the main thread of each runs kernels and torch on one thread.
 
-    Threads that wait for each other on busy cores would take half as long again. Processes that tests start, and tests
-    of the number of threads, use more.
+    Threads that wait for each other on busy cores take longer: 1.4 times on two cores (2026-11-30). Processes that
+    tests start, and tests of the number of threads, use more.
     """
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         for name in ("numba", "torch"):

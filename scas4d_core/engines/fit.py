@@ -155,7 +155,10 @@ class FitEngine(Protocol):
         """
 
     def table(self) -> FitTable:
-        """Returns the current parameter table."""
+        """Returns the current parameter table.
+
+        Until the next iteration, every call returns the same arrays. They may be edited and then loaded again.
+        """
 
     def state(self) -> Gaussians:
         """Returns the fitted Gaussians, without the fixed ones. Their labels are values between 0 and 1."""

@@ -51,12 +51,12 @@ DENSIFY_GRADIENT = 1e-6
 limits the number of densified Gaussians. Gaussians with the largest gradients are densified first."""
 PRUNE_OPACITY = 0.01
 """Opacity below which densification removes a Gaussian."""
-DEEP, DEEP_SHRINK = 40.0, 0.89
-"""Mean number of Gaussians blended into a pixel above which a scene is deep, and the factor on the scales of
-its Gaussians in each densification step. Where few cameras constrain a scene, large and faint Gaussians
-would otherwise form deep stacks, which take most of the time of an update. Where large Gaussians are
-needed, they grow again. The rooms at hand have 23 to 34 Gaussians per pixel; shrinking those makes their
-tracks worse (docs/tried.md)."""
+DEEP, DEEP_SHRINK = 52.0, 0.89
+"""Mean number of Gaussians blended into a pixel (see ``pair_counts``) above which a scene is deep, and the
+factor on all scales in a densification step. Once a step finds a scene deep, this and all later steps shrink
+its Gaussians. Where few cameras constrain a scene, large and faint Gaussians would otherwise form deep stacks
+and slow down updates (docs/real-captures.md). Rooms with 25 to 40 Gaussians per pixel and a capture with 48
+would lose accuracy (docs/tried.md)."""
 MIN_VIEWS = 2
 """Number of training cameras that must see a Gaussian. A Gaussian that fewer cameras see is removed."""
 SEEN_PIXELS = 0.05
@@ -214,7 +214,8 @@ class StaticTrainer:
         parameters, statistics = self.fit.table.parameters, self.fit.table.statistics
         assert statistics is not None
         if self._deep:
-            parameters[:, SCALE] += np.float32(np.log(DEEP_SHRINK))
+            # A shortened fit has fewer iterations between two steps, in which the scales could grow again.
+            parameters[:, SCALE] += np.float32(np.log(DEEP_SHRINK) / self.schedule.stride)
         opacity = 1 / (1 + np.exp(-parameters[:, OPACITY.start]))
         score = statistics.screen_gradients / np.maximum(statistics.rendered, 1)
         keep = opacity >= min(PRUNE_OPACITY, float(np.median(opacity)))  # never more than half at once

@@ -141,6 +141,8 @@ def test_pictures_are_decoded_when_looked_at(folder):
     (folder / "ims/1/000001.png").write_bytes(b"damaged")
     frame = capture.frame(1)
     assert frame.images["0"].shape == (6, 8, 3)
+    assert "1" in frame.images
+    assert "7" not in frame.images
     with pytest.raises(ImageError, match=r"000001\.png: not a JPEG"):
         frame.images["1"]
 

@@ -10,9 +10,9 @@ from box_scene import held_out_camera, make_box, make_rig, photograph, take_fram
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.engines.choose import renderer_of
-from scas4d_core.engines.fit import OPACITY
+from scas4d_core.engines.fit import OPACITY, SCALE
 from scas4d_core.engines.limits import scene_limits
-from scas4d_core.engines.renderer import pair_counts
+from scas4d_core.engines.renderer import PairCounts, pair_counts
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame import static_scene
 from scas4d_core.first_frame.fit_first_frame import fit_static_scene
@@ -205,6 +205,23 @@ def test_gaussians_shrink_only_in_deep_scenes(monkeypatch: pytest.MonkeyPatch) -
     assert fit(settings).losses != shallow.losses
     monkeypatch.setattr(static_scene, "DEEP_SHRINK", 1.0)
     np.testing.assert_array_equal(fit(settings).losses, shallow.losses)
+
+
+def test_a_deep_scene_stays_deep(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = iter([PairCounts(1.0, 1), PairCounts(1000.0, 1000)])  # a third count would fail
+    monkeypatch.setattr(static_scene, "pair_counts", lambda *given: next(counts))
+    factory = ViewFactory(RIG)
+    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
+    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
+    trainer = StaticTrainer(factory, views, parameters, SceneSettings(), SETTINGS)
+    shrunk = static_scene.DEEP_SHRINK
+    for stride, factor in ((1.0, 1.0), (1.0, shrunk), (1.0, shrunk), (2.0, shrunk**0.5)):
+        trainer.schedule.stride = stride
+        before = trainer.fit.table.parameters.copy()
+        trainer.control_density(0)  # no room: nothing is added
+        after = trainer.fit.table.parameters
+        np.testing.assert_allclose(after[:, SCALE], before[:, SCALE] + np.log(factor), rtol=1e-5)
+        np.testing.assert_array_equal(np.delete(after, np.r_[SCALE], 1), np.delete(before, np.r_[SCALE], 1))
 
 
 def test_frame_0_ends_early_once_nothing_is_gained(monkeypatch: pytest.MonkeyPatch) -> None:
