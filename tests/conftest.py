@@ -5,8 +5,7 @@ import sys
 
 import pytest
 
-# Before torch loads OpenMP, which reads it once: threads that spin while they wait cost multiples on busy cores.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+import scas4d_core  # noqa: F401  # sets how OpenMP threads wait, before torch loads OpenMP
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/docker", "tests/server/connections",

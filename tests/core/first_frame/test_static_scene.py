@@ -62,6 +62,13 @@ def fit(settings: StaticSettings = SETTINGS, frame: Frame | None = None, masks: 
     return fit_static_scene(factory, factory.views(frame, {}), *cloud(), None, SceneSettings(), settings)
 
 
+def new_trainer(settings: StaticSettings = SETTINGS) -> StaticTrainer:
+    factory = ViewFactory(RIG)
+    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
+    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
+    return StaticTrainer(factory, views, parameters, SceneSettings(), settings)
+
+
 def psnr(gaussians: Gaussians) -> float:
     """dB of the camera that no fit has seen."""
     camera = held_out_camera()
@@ -128,10 +135,7 @@ def test_the_budget_is_kept_also_where_the_cloud_exceeds_it(limit: int) -> None:
 
 
 def test_faint_gaussians_are_removed_but_never_all() -> None:
-    factory = ViewFactory(RIG)
-    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
-    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
-    trainer = StaticTrainer(factory, views, parameters, SceneSettings(), SETTINGS)
+    trainer = new_trainer()
     trainer.fit.run([0], trainer.scalars)
     count = len(trainer.fit)
     trainer.fit.table.parameters[5:25, OPACITY] = logit(np.array(0.5 * static_scene.PRUNE_OPACITY))
@@ -161,15 +165,12 @@ def test_exposures_of_the_cameras_are_recovered(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize(("spread", "kept"), [(0.5 * SPREAD, False), (2.0 * SPREAD, True)])
 def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept: bool) -> None:
-    views = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG), {})
-    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
-    settings = SETTINGS.model_copy(update={"exposure": "auto"})
-    trainer = StaticTrainer(ViewFactory(RIG), views, parameters, SceneSettings(), settings)
-    for view, side in zip(views, (-1, 1, -1, 1, -1, 1), strict=True):
+    trainer = new_trainer(SETTINGS.model_copy(update={"exposure": "auto"}))
+    for view, side in zip(trainer.views, (-1, 1, -1, 1, -1, 1), strict=True):
         view.exposure[:3] = (1 + side * spread, 0.02 * side)
     trainer.exposures.assess()
     assert trainer.exposures.on == kept
-    assert all((view.exposure == (1, 0)).all() for view in views) != kept
+    assert all((view.exposure == (1, 0)).all() for view in trainer.views) != kept
 
 
 def test_an_empty_cloud_is_refused() -> None:
@@ -210,10 +211,7 @@ def test_gaussians_shrink_only_in_deep_scenes(monkeypatch: pytest.MonkeyPatch) -
 def test_a_deep_scene_stays_deep(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = iter([PairCounts(1.0, 1), PairCounts(1000.0, 1000)])  # a third count would fail
     monkeypatch.setattr(static_scene, "pair_counts", lambda *given: next(counts))
-    factory = ViewFactory(RIG)
-    views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
-    parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
-    trainer = StaticTrainer(factory, views, parameters, SceneSettings(), SETTINGS)
+    trainer = new_trainer()
     shrunk = static_scene.DEEP_SHRINK
     for stride, factor in ((1.0, 1.0), (1.0, shrunk), (1.0, shrunk), (2.0, shrunk**0.5)):
         trainer.schedule.stride = stride
