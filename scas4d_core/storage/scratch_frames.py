@@ -124,6 +124,9 @@ class ScratchFrame(Mapping[str, NDArray[Any]]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self._file.get(*self._places[name])
 
+    def __contains__(self, name: object) -> bool:  # the inherited method would read the array
+        return name in self._places
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._places)
 

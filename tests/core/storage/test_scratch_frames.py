@@ -157,5 +157,7 @@ def test_a_file_that_was_cut_is_an_error() -> None:
     scratch = scratch_frames.ScratchFile(None)
     aside = scratch.store({"a": np.arange(4000.0)})
     os.ftruncate(scratch._file.fileno(), 8000)
+    assert "a" in aside  # known without the file
+    assert "b" not in aside
     with pytest.raises(OSError, match="at byte 8000"):
         aside["a"]
