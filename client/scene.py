@@ -119,8 +119,8 @@ class PartPoses:
         frames: frame indices [T].
         seconds: frame times [T] in seconds.
         motions: rigid transforms [P, T, 4, 4], float64, in the user's units. A point of part p at (x, y, z) in the
-            first frame is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN in frames in which no Gaussian of the
-            part is present.
+            first frame of the part is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN in frames in which no
+            Gaussian of the part is present.
         residuals: RMS distances [P, T] between the Gaussians and the rigid motion, in the user's units.
     """
 
@@ -276,7 +276,7 @@ class Scene:
         return labels
 
     def part_poses(self, frames: str | None = None) -> PartPoses:
-        """Returns the rigid motion of each part since the first frame, fitted to its Gaussians (docs/exports.md).
+        """Returns the rigid motion of each part since its first frame, fitted to its Gaussians (docs/exports.md).
 
         Requires scipy, which the extra `server` installs.
 
@@ -288,30 +288,19 @@ class Scene:
         >>> poses.parts, poses.motions.shape, bool(np.allclose(poses.motions[:, 0], np.eye(4)))
         (array([0, 1]), (2, 3, 4, 4), True)
         """
-        from scas4d_core.exports.part_motion import PartMotion
+        from scas4d_core.query.part_motion import part_tracks
 
-        chosen, labels = self._within(frames), self.parts()
-        world = self._given.head.world
-        motion: PartMotion | None = None
-        motions = residuals = np.zeros(0)
-        for place, state in enumerate(self.states(frames)):
-            if motion is None:
-                motion = PartMotion(labels, state.gaussians, world)
-                motions = np.full((len(motion.parts), len(chosen), 4, 4), np.nan)
-                residuals = np.full(motions.shape[:2], np.nan)
-            for pose in motion.poses(state.gaussians):
-                part = motion.parts.index(pose.part)
-                motions[part, place] = np.eye(4)
-                motions[part, place, :3, :3] = pose.rotation
-                motions[part, place, :3, 3] = pose.position - pose.rotation @ motion.origins[pose.part]
-                residuals[part, place] = pose.residual
-        assert motion is not None
+        chosen = self._within(frames)
+        gaussians = (state.gaussians for state in self.states(frames))
+        tracks = [track for track in part_tracks(gaussians, self.parts(), self._given.head.world) if track.part >= 0]
+        if not tracks:
+            raise InputError("the scene has no parts in these frames", "use frames in which something moves")
         return PartPoses(
-            np.array(motion.parts, np.int64),
+            np.array([track.part for track in tracks], np.int64),
             np.array(list(chosen), np.int64),
             np.array(list(chosen.values())),
-            motions,
-            residuals,
+            np.stack([track.motions for track in tracks]),
+            np.stack([track.residuals for track in tracks]),
         )
 
     def _within(self, frames: str | None) -> dict[int, float]:

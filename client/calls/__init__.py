@@ -22,7 +22,7 @@ from client.calls.frames import (
     states,
 )
 from client.calls.gaussians import gaussians
-from client.calls.parts import parts
+from client.calls.parts import joints, parts
 from client.calls.scenes import (
     begin_again,
     create_scene,
@@ -63,6 +63,7 @@ __all__ = [
     "frames",
     "gaussians",
     "ingest_ready",
+    "joints",
     "live",
     "metrics",
     "parts",

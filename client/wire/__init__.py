@@ -36,7 +36,7 @@ from client.wire.framing import (
     parse_frame,
     parse_head,
 )
-from client.wire.parts import PartsModel, part_colour, parts_model
+from client.wire.parts import JointModel, JointsModel, PartsModel, part_colour, parts_model
 from client.wire.rigs import CameraModel, RigModel
 from client.wire.scenes import (
     EffectStatus,
@@ -106,6 +106,8 @@ __all__ = [
     "Health",
     "IngestAnswer",
     "IngestSettings",
+    "JointModel",
+    "JointsModel",
     "MissingRequest",
     "Model",
     "Node",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import colorsys
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from client.wire.base import Model
+from client.wire.base import Model, Row3
 
 GOLDEN = 0.618033988749895
 """Hue step between parts (golden ratio), which keeps the hues of any number of parts well separated."""
@@ -28,6 +29,35 @@ class PartsModel(Model):
     colours: list[tuple[int, int, int]] = Field(
         description="RGB colour (0…255) of each label from 0 to the largest. A label always has the same colour."
     )
+
+
+class JointModel(Model):
+    """A joint between two parts, in the rig's world frame and units. Null while one of the parts is absent."""
+
+    parent: int = Field(description="Label of the parent part; −1 if the child is attached to something static.")
+    child: int = Field(description="Label of the child part.")
+    kind: Literal["revolute", "prismatic", "spherical"] = Field(description="Hinge, slider or ball joint.")
+    axes: list[Row3 | None] = Field(
+        description="[T] unit vectors of the axis. The axis of a ball joint is that of the child's present rotation."
+    )
+    centres: list[Row3 | None] = Field(
+        description="[T] points on the axis where the parts meet, or centres of the ball."
+    )
+    values: list[float | None] = Field(
+        description=(
+            "[T] angles in radians by which the child has rotated about the axis, relative to the parent, since the "
+            "first frame with both; for sliders, distances along the axis."
+        )
+    )
+    error: float = Field(description="RMS distance between the child's points and their positions by the joint.")
+
+
+class JointsModel(Model):
+    """Joints between the parts of a scene over T frames."""
+
+    frames: list[int] = Field(description="[T] frame indices.")
+    times: list[float] = Field(description="[T] frame times in seconds.")
+    joints: list[JointModel] = Field(description="Joints, parents before their children.")
 
 
 def part_colour(label: int) -> tuple[int, int, int]:

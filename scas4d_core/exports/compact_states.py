@@ -12,8 +12,8 @@ from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.errors import InputError
 from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
-from scas4d_core.exports.part_motion import part_labels
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.part_motion import part_labels
 
 Colour = tuple[float, float, float]
 

@@ -13,6 +13,12 @@ of the residuals of all frames after the first. ``residual_worst`` is the larges
 residuals, and ``worst_frame`` is the index of its frame. Both residuals are in the user's units.
 The values with the suffix ``_percent`` are percentages of the extent of the moving Gaussians in the
 first frame.
+
+The extras of a node that has a joint with another node contain ``joint``: its ``kind`` (``revolute``, ``prismatic`` or
+``spherical``), the name of the ``parent`` node, and ``axis`` and ``centre`` in the parent's local coordinates. Hinges
+and sliders have ``values``: the angle in radians or the distance in metres at each of the node's keyframes, null where
+the parent is absent. ``error`` is the RMS distance between the child's points and the prediction by the joint, in the
+user's units.
 """
 
 from __future__ import annotations
@@ -30,18 +36,20 @@ from scas4d_core.exports.atomic_files import check_writable
 from scas4d_core.exports.cloud import HALF_TURN, Cloud, cloud_of
 from scas4d_core.exports.glb import Binary
 from scas4d_core.exports.gltf import EXTENSION, asset_extras, splat_primitive
-from scas4d_core.exports.part_motion import PartMotion, PartPose, quaternion_of
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.joints import find_joints
+from scas4d_core.query.part_motion import PartMotion, PartPose, PartTrack, quaternion_of, still_track
 
 Float = NDArray[np.float64]
 
 
 @dataclass
 class _Keyframes:
-    """Keyframes of one part's animation in glTF's axes and units, and residuals in the user's units."""
+    """Keyframes of one part's animation in glTF's axes and units; motions and residuals in the user's."""
 
     times: list[float] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
+    motions: list[Float] = field(default_factory=list)
     positions: list[Float] = field(default_factory=list)
     quaternions: list[Float] = field(default_factory=list)
     residuals: list[float] = field(default_factory=list)
@@ -52,6 +60,7 @@ class _Keyframes:
             quaternion = -quaternion  # interpolate along the shorter arc
         self.times.append(seconds)
         self.frames.append(index)
+        self.motions.append(pose.motion)
         self.positions.append(HALF_TURN @ pose.position * metres)
         self.quaternions.append(quaternion)
         self.residuals.append(pose.residual)
@@ -133,6 +142,7 @@ class PartAsset:
         channels: list[dict[str, Any]] = []
         times: dict[tuple[float, ...], int] = {}  # parts with the same times share an accessor
         left = self._first.present.copy()
+        joints = self._joints()
         for part, keys in self._keys.items():
             rows = self._motion.rows(part)
             left[rows] = False
@@ -141,7 +151,7 @@ class PartAsset:
                 "mesh": len(meshes),
                 "translation": keys.positions[0].tolist(),
                 "rotation": np.roll(keys.quaternions[0], -1).tolist(),
-                "extras": {"part": part, **self._residuals(keys)},
+                "extras": {"part": part, **self._residuals(keys), **joints.get(part, {})},
             }
             meshes.append({"primitives": [splat_primitive(binary, _moved(cloud.rows(rows), -keys.positions[0]))]})
             if tuple(keys.times) not in times:
@@ -171,6 +181,36 @@ class PartAsset:
     def discard(self) -> None:
         """Discards the collected frames; no file has been created yet."""
         self._first, self._motion, self._keys = None, None, {}
+
+    def _joints(self) -> dict[int, dict[str, Any]]:
+        """Returns the extras that describe the joint of each part with its parent, keyed by the part's label."""
+        assert self._motion is not None
+        assert self._first is not None
+        frames = sorted({index for keys in self._keys.values() for index in keys.frames})
+        tracks = [still_track(self._first, self._labels, self._world, len(frames))]
+        for part, keys in self._keys.items():
+            motions = np.full((len(frames), 4, 4), np.nan)
+            motions[np.searchsorted(frames, keys.frames)] = keys.motions
+            tracks.append(PartTrack(part, motions, np.zeros(len(frames)), *self._motion.points(part)))
+        extras = {}
+        for joint in find_joints([track for track in tracks if len(track.points)], self._motion.extent):
+            metres = self._world.metres_per_unit
+            parent, child = self._keys.get(joint.parent), self._keys[joint.child]
+            centre = HALF_TURN @ joint.centres[0] * metres - (0 if parent is None else parent.positions[0])
+            values = joint.values[np.searchsorted(frames, child.frames)]
+            described: dict[str, Any] = {
+                "kind": joint.kind,
+                "parent": "static" if parent is None else f"part {joint.parent}",
+                "centre": centre.tolist(),
+                "error": joint.error,
+            }
+            if joint.kind != "spherical":
+                known = np.isfinite(values).tolist()
+                values = values * (metres if joint.kind == "prismatic" else 1.0)
+                described["axis"] = (HALF_TURN @ joint.axes[0]).tolist()
+                described["values"] = [value if ok else None for value, ok in zip(values.tolist(), known, strict=True)]
+            extras[joint.child] = {"joint": described}
+        return extras
 
     def _residuals(self, keys: _Keyframes) -> dict[str, Any]:
         """Returns the extras of a part, which describe the residual of its rigid motion."""

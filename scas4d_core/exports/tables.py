@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
-from scas4d_core.exports.part_motion import PartMotion
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.part_motion import PartMotion
 from scas4d_core.query.tracks import Tracks
 
 TRACK_COLUMNS = ("frame", "time", "id", "x", "y", "z", "confidence")

@@ -29,7 +29,6 @@ from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError, exact
 from scas4d_core.exports.atomic_files import atomic_path, import_optional, translate_write_errors
 from scas4d_core.exports.cloud import Cloud, cloud_of, linear_light
-from scas4d_core.exports.part_motion import PartMotion, part_labels, quaternion_of
 from scas4d_core.exports.usd_values import (
     AnimatedValues,
     floats_of,
@@ -40,6 +39,7 @@ from scas4d_core.exports.usd_values import (
     translate_usd_errors,
 )
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.query.part_motion import PartMotion, part_labels, quaternion_of
 
 SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
 MAX_TRACKS = 500

@@ -13,9 +13,11 @@ from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.engines.choose import Device
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.query import joints as joints_of_history
 from scas4d_core.query import parts as parts_of_history
 from scas4d_core.query import ply
 from scas4d_core.query import tracks as tracks_of_history
+from scas4d_core.query.joints import Joint
 from scas4d_core.query.tracks import Tracks
 from scas4d_core.query.view import View, ViewRenderer
 from scas4d_core.storage.history import History
@@ -112,10 +114,14 @@ class CommittedScene:
         """Returns the part label of each Gaussian [N] (largest part first, −1 if static); see ``parts.parts``.
 
         Args:
-            count: number of parts, or None to choose it by silhouette score.
+            count: number of parts, or None to choose it from the motion.
             previous: [N] labels computed from fewer frames, or None. Parts that persist keep their labels.
         """
         return parts_of_history.parts(self.history, count, previous=previous)
+
+    def joints(self, labels: NDArray[Any], indices: Sequence[int]) -> list[Joint]:
+        """Returns the joints between parts with labels [N], in the given frames; see ``joints.joints``."""
+        return joints_of_history.joints(self.history, labels, self.world, indices)
 
     def write_ply(self, path: Path, index: int | None = None) -> None:
         """Writes a committed frame as a standard 3DGS .ply."""

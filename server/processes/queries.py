@@ -58,6 +58,15 @@ class PartsQuery:
 
 
 @dataclass(frozen=True)
+class JointsQuery:
+    """Query for the joints between parts over `frames`, answered as JSON; `count` is the requested number of parts."""
+
+    kind: ClassVar[str] = "joints"
+    frames: tuple[int, ...]
+    count: int | None = None
+
+
+@dataclass(frozen=True)
 class LabelsQuery:
     """Query for the part labels of all Gaussians as little-endian int16 values.
 
@@ -106,7 +115,17 @@ class StatesQuery:
     after: int | None = None
 
 
-Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | PlyQuery | CompactQuery | StatesQuery
+Query = (
+    RenderQuery
+    | TracksQuery
+    | PartsQuery
+    | JointsQuery
+    | LabelsQuery
+    | GaussiansQuery
+    | PlyQuery
+    | CompactQuery
+    | StatesQuery
+)
 
 
 def refused_field(query: Query) -> tuple[str, object]:
@@ -117,7 +136,7 @@ def refused_field(query: Query) -> tuple[str, object]:
         return "at", query.at
     if isinstance(query, CompactQuery):
         return "first", query.frames[0]
-    if isinstance(query, LabelsQuery | PartsQuery):
+    if isinstance(query, LabelsQuery | PartsQuery | JointsQuery):
         return "count", query.count if query.count is not None else "automatic"
     return "frame", query.frame
 

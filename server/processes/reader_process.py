@@ -30,6 +30,7 @@ from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFr
 from server.messages import DamageFound, SceneSpec, Stop
 from server.processes import track_answers
 from server.processes.compact_answers import compact_head, write_compact
+from server.processes.joint_answers import joints_model
 from server.processes.live_states import LiveStateEncoder
 from server.processes.part_labels import PartLabels, resize_labels
 from server.processes.placement import use_one_thread
@@ -37,6 +38,7 @@ from server.processes.queries import (
     Answer,
     CompactQuery,
     GaussiansQuery,
+    JointsQuery,
     LabelsQuery,
     NumberedQuery,
     PartsQuery,
@@ -166,7 +168,11 @@ class QueryReader:
 
         Only the frames of the query are checked.
         """
-        frames = query.frames if isinstance(query, TracksQuery | CompactQuery) else (getattr(query, "frame", None),)
+        frames = (
+            query.frames
+            if isinstance(query, TracksQuery | JointsQuery | CompactQuery)
+            else (getattr(query, "frame", None),)
+        )
         history = self._history
         if history is not None and history.files is not None:
             known = set(history.indices)
@@ -229,6 +235,10 @@ class QueryReader:
                 labels, last = self.labels(query.count), self.history.indices[-1]
                 model = parts_model(labels, self.history.gaussians(last).ids, last)
                 return Answer(number, model.model_dump_json().encode(), "application/json")
+            case JointsQuery():
+                joints = self.reader.joints(self.labels(query.count), query.frames)
+                found = joints_model(query.frames, [self.history.time(frame) for frame in query.frames], joints)
+                return Answer(number, found.model_dump_json().encode(), "application/json")
             case LabelsQuery():
                 labels = self.labels(query.count)
                 body = labels.astype("<i2").tobytes()

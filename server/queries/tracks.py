@@ -5,7 +5,6 @@ docs/tracks.md describes the answers.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 
 import numpy as np
@@ -50,18 +49,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
             value=given,
             remedy="pass exactly one of them",
         )
-    scene.committed_frame(None, "from")
-    start = scene.committed[0] if request.first is None else request.first
-    end = scene.committed[-1] if request.last is None else request.last
-    frames = tuple(scene.committed[bisect_left(scene.committed, start) : bisect_right(scene.committed, end)])
-    if not frames:
-        raise Problem(
-            422,
-            f"no committed frames from {start} to {end}",
-            field="from",
-            value=start,
-            remedy=f"request frames from {scene.committed[0]} to {scene.committed[-1]}",
-        )
+    frames = scene.committed_range(request.first, request.last, "from")
     field, queries = asked[0]
     if len(queries) * len(frames) > MOST_POINTS:
         raise Problem(

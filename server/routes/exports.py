@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
@@ -12,7 +11,6 @@ from server.http.immutable import immutable_file_response
 from server.problems import Problem
 from server.routes.access import AllExports, SceneId, TheRecord
 from server.scene.exports import MEDIA_TYPES
-from server.scene.scene import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["exports"])
 
@@ -41,7 +39,8 @@ async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, r
             value=request.ids,
             remedy="omit ids, or use format 'tracks'",
         )
-    made = exports.begin(scene, request, _frames(scene, request)).model()
+    frames = scene.committed_range(request.first, request.last, "first")
+    made = exports.begin(scene, request, frames).model()
     response.headers["Location"] = f"/v1/scenes/{scene.id}/exports/{made.id}"
     return made
 
@@ -88,25 +87,3 @@ async def file(id: SceneId, export: ExportId, exports: AllExports, request: Requ
 async def remove(id: SceneId, export: ExportId, exports: AllExports) -> None:
     """Cancels a queued or running export, or removes a finished one with its file."""
     await exports.remove(id, export)
-
-
-def _frames(scene: Scene, request: ExportRequest) -> tuple[int, ...]:
-    """Returns the committed frames in the requested range.
-
-    Raises:
-        Problem: 409 if no frame is committed; 422 if none is committed in this range.
-    """
-    scene.committed_frame(None, "first")
-    committed = scene.committed
-    first = committed[0] if request.first is None else request.first
-    last = committed[-1] if request.last is None else request.last
-    frames = tuple(committed[bisect_left(committed, first) : bisect_right(committed, last)])
-    if not frames:
-        raise Problem(
-            422,
-            f"no committed frames from {first} to {last}",
-            field="first",
-            value=first,
-            remedy=f"use a range within {committed[0]} to {committed[-1]}",
-        )
-    return frames

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import chain
 
@@ -225,6 +226,30 @@ class Scene:
         If the calibration was refined in the first frame, the camera has the refined calibration.
         """
         return camera_of(effective_rig(self.rig, self.updates.first), name)
+
+    def committed_range(self, first: int | None, last: int | None, field: str) -> tuple[int, ...]:
+        """Returns the indices of the committed frames in a range.
+
+        Args:
+            first, last: inclusive range; None for the first and the last committed frame.
+            field: name of the request's field for `first`, which a problem reports.
+
+        Raises:
+            Problem: 409 if no frame is committed; 422 if none is committed in this range.
+        """
+        self.committed_frame(None, field)
+        start = self.committed[0] if first is None else first
+        end = self.committed[-1] if last is None else last
+        frames = tuple(self.committed[bisect_left(self.committed, start) : bisect_right(self.committed, end)])
+        if not frames:
+            raise Problem(
+                422,
+                f"no committed frames from {start} to {end}",
+                field=field,
+                value=start,
+                remedy=f"use a range within {self.committed[0]} to {self.committed[-1]}",
+            )
+        return frames
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
         """Checks that a frame's state is readable and returns its index.

@@ -54,6 +54,7 @@ CALLS = [
     calls.tracks("s", ids=[0]),
     calls.tracks_arrays("s", ids=[0]),
     calls.parts("s"),
+    calls.joints("s"),
     calls.gaussians("s", [0]),
     calls.budget("s"),
     calls.cluster(),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from export_cases import corner, gltf_reader, moving
+from scipy.spatial.transform import Rotation
 
 from scas4d_core.errors import InputError
 from scas4d_core.exports.gltf_parts import PartAsset
@@ -86,6 +87,34 @@ def test_the_residual_is_told(tmp_path):
     np.testing.assert_allclose(zero["residual_rms_percent"], 100 * zero["residual_rms"] / extent)
     assert one["residual_rms"] < 1e-4
     assert one["frames"] == 3
+
+
+def test_a_joint_is_fixed_in_the_nodes_of_both_parts(tmp_path):
+    """The centre and the axis of a hinge are given in the parent's coordinates; the child's node turns about them."""
+    axis, angles = np.array([0.6, 0.0, 0.8]), 0.4 * np.arange(FRAMES)
+    first = moving.state(0)
+    rows = moving.LABELS == 1
+    hinge = np.array([0.2, -1.3, 2])  # between the nearest Gaussians of the two parts
+    states = []
+    for angle in angles:
+        turn = Rotation.from_rotvec(angle * axis)
+        means, rotations = first.means.copy(), first.rotations.copy()
+        means[rows] = turn.apply(means[rows] - hinge) + hinge
+        rotations[rows] = np.roll(turn.as_quat(), 1)
+        states.append(first.replace(means=means, rotations=rotations, foreground=np.float32(moving.LABELS >= 0)))
+    labels = np.where(moving.LABELS == 1, 1, 0)  # part 0 is at rest
+    found = written(tmp_path / "a.glb", states, labels=labels)
+    parent, child = found.nodes()
+    assert "joint" not in parent.extras
+    joint = child.extras["joint"]
+    assert (joint["kind"], joint["parent"]) == ("revolute", "part 0")
+    np.testing.assert_allclose(joint["values"], angles, atol=1e-4)
+    centre, about = np.array(joint["centre"]) + parent.translation, np.array(joint["axis"])
+    np.testing.assert_allclose(about, axis * [1, -1, -1], atol=1e-4)
+    for frame, angle in enumerate(angles):
+        translation, turn = found.pose(child, frame / moving.RATE)
+        np.testing.assert_allclose(turn.as_rotvec(), angle * about, atol=1e-4)
+        np.testing.assert_allclose(turn.apply(centre - child.translation) + translation, centre, atol=1e-5)
 
 
 def test_a_part_that_is_away_for_a_while_has_times_of_its_own(tmp_path):

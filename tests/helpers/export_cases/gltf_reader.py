@@ -55,6 +55,12 @@ class Asset:
     def animated(self, node, seconds: float) -> Found:
         """Gaussians in the world at a time of the animation."""
         here = self.splats(node)
+        shift, turn = self.pose(node, seconds)
+        matrix = turn.as_matrix()
+        return Found(here.means @ matrix.T + shift, matrix @ here.covariances @ matrix.T, here.colours, here.opacities)
+
+    def pose(self, node, seconds: float) -> tuple[np.ndarray, Rotation]:
+        """Translation and rotation of a node at a time of the animation."""
         turn, shift = Rotation.identity(), np.zeros(3)
         (animation,) = self.document.animations
         for channel in animation.channels:
@@ -66,5 +72,4 @@ class Asset:
                     turn = Slerp(times, Rotation.from_quat(values))(np.clip(seconds, times[0], times[-1]))
                 else:
                     shift = np.array([np.interp(seconds, times, column) for column in values.T])
-        matrix = turn.as_matrix()
-        return Found(here.means @ matrix.T + shift, matrix @ here.covariances @ matrix.T, here.colours, here.opacities)
+        return shift, turn

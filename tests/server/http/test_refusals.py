@@ -48,6 +48,8 @@ QUERIES = {
     "parts?cont=3": ("cont", "3", "'count'"),
     "parts?count=900": ("query.count", "900", "at most 254"),
     "parts?count=x": ("query.count", "x", "an integer"),
+    "joints?count=33": ("query.count", "33", "at most 32"),
+    "joints?from=7": ("from", "7", "0 to 0"),
     "frames?last=3": ("last", "3", "first, limit"),
     "frames/abc": ("path.n", "abc", "an integer"),
     "frames/-1": ("path.n", "-1", "at least 0"),
@@ -62,6 +64,13 @@ def test_an_address(http, here, path):
     document = problem(http.get(f"/v1/scenes/{here}/{path}"), 422)
     assert (document["field"], document["value"]) == (field, value)
     assert remedy in document["remedy"]
+
+
+def test_joints_in_too_many_frames(http, here, monkeypatch):
+    monkeypatch.setattr("server.routes.parts.MOST_JOINT_FRAMES", 0)
+    document = problem(http.get(f"/v1/scenes/{here}/joints"), 422)
+    assert (document["field"], document["value"]) == ("to", "0")
+    assert "from=0" in document["remedy"]
 
 
 DEFINITIONS = {

@@ -11,14 +11,25 @@ import numpy as np
 import pytest
 from histories import state
 from running import make_rig
+from scipy.spatial.transform import Rotation
 
+from client.wire import JointsModel
 from scas4d_core.engines.choose import WARP_DEVICE
 from scas4d_core.engines.renderer import levels
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
 from server.processes.part_labels import resize_labels
-from server.processes.queries import Answer, GaussiansQuery, NumberedQuery, PartsQuery, QueryRefused, RenderQuery
+from server.processes.queries import (
+    Answer,
+    GaussiansQuery,
+    JointsQuery,
+    NumberedQuery,
+    PartsQuery,
+    QueryRefused,
+    RenderQuery,
+)
 from server.processes.reader_process import QueryReader, view_device
 from server.storage.layout import SceneFolder
 
@@ -61,6 +72,33 @@ def test_parts_have_a_label_for_each_and_views_of_any_frame_take_them(renderer):
         for given in (labels, labels[:40]):
             query = RenderQuery(camera, frame, ("parts",), "npz", (0.0, 0.0, 0.0), parts=2, labels=given)
             assert isinstance(renderer.answer(NumberedQuery(2, query)), Answer)
+
+
+def test_joints_are_null_while_a_part_is_absent(tmp_path):
+    """A leaf that opens about the edge of a static wall is absent in one frame."""
+    rng = np.random.default_rng(0)
+    wall, leaf = rng.random((400, 3)) * [1, 1, 0.1] + [-1, 0, 2], rng.random((400, 3)) * [1, 1, 0.1] + [0, 0, 2]
+    hinge = np.array([0, 0, 2])
+    history = History(tmp_path / "states")
+    for frame in range(6):
+        turn = Rotation.from_rotvec([0, 0.1 * frame, 0])
+        means = np.concatenate([wall, turn.apply(leaf - hinge) + hinge])
+        state = Gaussians.of_points(means, radius=0.05)
+        state = state.replace(foreground=np.ones(800, np.float32))
+        state.rotations[400:] = np.roll(turn.as_quat(), 1)
+        if frame == 2:
+            state = state.retire(np.arange(400, 800))
+        history.append(frame, frame / 30, state)
+    reader = QueryReader(SceneSpec(SceneFolder(tmp_path), make_rig(), Settings()))
+    found = reader.answer(NumberedQuery(1, JointsQuery((1, 2, 3), None)))
+    assert isinstance(found, Answer), found
+    answer = JointsModel.model_validate_json(found.body)
+    assert (answer.frames, answer.times) == ([1, 2, 3], [1 / 30, 2 / 30, 3 / 30])
+    (joint,) = answer.joints
+    assert (joint.parent, joint.kind) == (-1, "revolute")
+    assert [row is None for row in joint.axes] == [row is None for row in joint.centres] == [False, True, False]
+    assert joint.values[1] is None
+    np.testing.assert_allclose([joint.values[0], joint.values[2]], [0.1, 0.3], atol=0.01)
 
 
 def test_labels_are_fitted():

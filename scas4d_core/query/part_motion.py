@@ -7,6 +7,7 @@ rotations determine the rotation.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternions_to_matrices
-from scas4d_core.query.parts import coverage
+from scas4d_core.query.parts import NO_PART, coverage
 
 Float = NDArray[np.float64]
 
@@ -25,6 +26,8 @@ ROUNDS = 20
 """Maximum number of reweighting iterations; results stop changing after about ten."""
 PRECISION = 1e-6
 """Precision of float32 positions a few metres from the origin, relative to the part's size."""
+STARTED = 0.3
+"""Share of a part's Gaussians that its first frame contains. Gaussians of one part may be born in different frames."""
 PULL = 1e-9
 """Weight of the prior rotation ``near`` relative to the points' spread; it matters only if R is ambiguous."""
 
@@ -41,12 +44,23 @@ class PartPose:
         rotation: [3, 3] rotation since the first frame.
         position: [3] position of the local origin, in the user's units.
         residual: weighted RMS distance between the rigid prediction and the means, in the user's units.
+        origin: [3] local origin in the first frame, in the user's world.
     """
 
     part: int
     rotation: Float
     position: Float
     residual: float
+
+    origin: Float
+
+    @property
+    def motion(self) -> Float:
+        """[4, 4] transform of the part's points from the first frame, in the user's world."""
+        transform = np.eye(4)
+        transform[:3, :3] = self.rotation
+        transform[:3, 3] = self.position - self.rotation @ self.origin
+        return transform
 
     @property
     def quaternion(self) -> Float:
@@ -97,6 +111,11 @@ class PartMotion:
         """Returns the rows of a part that are present in the first frame."""
         return np.flatnonzero((self._labels == part) & self._present)
 
+    def points(self, part: int) -> tuple[Float, Float]:
+        """Returns the means [M, 3] and weights [M] of a part's Gaussians in the first frame, in the user's world."""
+        rows = self.rows(part)
+        return self._start[rows], self._weights[rows]
+
     def poses(self, gaussians: Gaussians) -> list[PartPose]:
         """Returns the poses of the parts in the first or a later frame; parts without present Gaussians are omitted."""
         part_poses = []
@@ -107,7 +126,9 @@ class PartMotion:
             if rows.size:
                 before, weights = self._start[rows] - self.origins[part], self._weights[rows]
                 material = self._mean_material_rotation(gaussians, rows, weights)
-                part_poses.append(PartPose(part, *majority_motion(before, means[rows], weights, material)))
+                part_poses.append(
+                    PartPose(part, *majority_motion(before, means[rows], weights, material), self.origins[part])
+                )
         return part_poses
 
     def _mean_material_rotation(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
@@ -121,6 +142,81 @@ class PartMotion:
     def _centre(self, points: Float, rows: NDArray[np.intp]) -> Float:
         weights = self._weights[rows]
         return np.average(points[rows], axis=0, weights=weights if weights.sum() > 0 else None)
+
+
+@dataclass(frozen=True, eq=False)
+class PartTrack:
+    """Rigid motion of one part over T frames, in the user's world and units.
+
+    Attributes:
+        part: label of the part.
+        motions: [T, 4, 4] transforms of the part's points from its first frame to each frame; NaN while it is absent.
+        residuals: [T] weighted RMS distance between the rigid prediction and the means; NaN while the part is absent.
+        points: [M, 3] means of the part's Gaussians in its first frame.
+        weights: [M] weights of these Gaussians (image coverage).
+    """
+
+    part: int
+    motions: Float
+    residuals: Float
+    points: Float
+    weights: Float
+
+
+def part_tracks(states: Iterable[Gaussians], labels: NDArray[Any], world: WorldFrame) -> list[PartTrack]:
+    """Returns the rigid motion of each part over T states, ordered by label.
+
+    The first frame of a part is the first one that contains at least the share ``STARTED`` of its Gaussians. Parts
+    without such a frame are omitted. If there are Gaussians without a part, they form a track with the label −1 and the
+    identity as motion.
+
+    Args:
+        states: T states in the internal world, in the order of time. Only one is in memory at a time.
+        labels: [N] part label of each Gaussian, negative for none.
+        world: transform from the user's world to the internal world.
+
+    >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
+    >>> states = [state, state.replace(means=state.means + np.float32([0, 0, 1]))]
+    >>> (track,) = part_tracks(states, np.zeros(3, int), WorldFrame(np.zeros(3)))
+    >>> track.motions[1, :3, 3].round(6) + 0
+    array([0., 0., 1.])
+    """
+    sizes = {part: int(np.count_nonzero(labels == part)) for part in np.unique(labels[labels >= 0]).tolist()}
+    started: dict[int, PartMotion] = {}
+    poses: dict[int, dict[int, tuple[Float, float]]] = {part: {} for part in sizes}
+    first: Gaussians | None = None
+    count = 0
+    for index, state in enumerate(states):
+        count = index + 1
+        first = state if first is None else first
+        present = part_labels(labels, len(state))[state.present]
+        for part, size in sizes.items():
+            if part not in started and np.count_nonzero(present == part) >= STARTED * size:
+                started[part] = PartMotion(np.where(labels == part, part, -1), state, world)
+        for part, motion in started.items():
+            for pose in motion.poses(state):
+                poses[part][index] = pose.motion, pose.residual
+    tracks = [] if first is None else [still_track(first, labels, world, count)]
+    for part in sorted(started):
+        motions, residuals = np.full((count, 4, 4), np.nan), np.full(count, np.nan)
+        for index, (transform, residual) in poses[part].items():
+            motions[index], residuals[index] = transform, residual
+        tracks.append(PartTrack(part, motions, residuals, *started[part].points(part)))
+    return [track for track in tracks if len(track.points)]
+
+
+def still_track(first: Gaussians, labels: NDArray[Any], world: WorldFrame, frames: int) -> PartTrack:
+    """Returns the track of the Gaussians of a state that belong to no part and do not move, with the label −1.
+
+    Args:
+        first: state in the internal world.
+        labels: [N] part label of each Gaussian, negative for none.
+        world: transform from the user's world to the internal world.
+        frames: number of frames.
+    """
+    rows = np.flatnonzero(first.present & (part_labels(labels, len(first)) < 0))
+    points, weights = world.to_user(first.means[rows]), np.maximum(coverage(first.rows(rows)), 0)
+    return PartTrack(NO_PART, np.tile(np.eye(4), (frames, 1, 1)), np.zeros(frames), points, weights)
 
 
 def majority_motion(

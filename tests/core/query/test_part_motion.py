@@ -6,7 +6,7 @@ from export_cases import corner, moving
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.errors import InputError
-from scas4d_core.exports.part_motion import PartMotion, majority_motion, part_labels, rigid_motion
+from scas4d_core.query.part_motion import PartMotion, majority_motion, part_labels, rigid_motion
 
 
 def test_a_known_motion_is_found():
