@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,11 @@ from client.exports.sources import Source, frame_range, is_scene_id, opened
 from client.sdk import DEFAULT_URL, Client
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.gaussians import Gaussians, moving_extent
+
+if TYPE_CHECKING:
+    from scas4d_core.query.joints import Joint
+    from scas4d_core.query.part_motion import PartTrack
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -288,11 +292,8 @@ class Scene:
         >>> poses.parts, poses.motions.shape, bool(np.allclose(poses.motions[:, 0], np.eye(4)))
         (array([0, 1]), (2, 3, 4, 4), True)
         """
-        from scas4d_core.query.part_motion import part_tracks
-
         chosen = self._within(frames)
-        gaussians = (state.gaussians for state in self.states(frames))
-        tracks = [track for track in part_tracks(gaussians, self.parts(), self._given.head.world) if track.part >= 0]
+        tracks = [track for track in self._part_tracks(frames) if track.part >= 0]
         if not tracks:
             raise InputError("the scene has no parts in these frames", "use frames in which something moves")
         return PartPoses(
@@ -302,6 +303,29 @@ class Scene:
             np.stack([track.motions for track in tracks]),
             np.stack([track.residuals for track in tracks]),
         )
+
+    def joints(self, frames: str | None = None) -> list[Joint]:
+        """Returns the joints between parts: hinges, sliders and ball joints (docs/tracks.md), found in these frames.
+
+        Requires scipy, which the extra `server` installs.
+
+        Raises:
+            InputError: none of these frames exists.
+
+        >>> with Scene.open(scene, url=url) as given:
+        ...     given.joints()  # the sample's boxes do not touch
+        []
+        """
+        from scas4d_core.query.joints import find_joints
+
+        first = next(self.states(str(next(iter(self._within(frames))))))
+        return find_joints(self._part_tracks(frames), moving_extent(first.gaussians) / self.metres_per_unit)
+
+    def _part_tracks(self, frames: str | None) -> list[PartTrack]:
+        from scas4d_core.query.part_motion import part_tracks
+
+        self._within(frames)
+        return part_tracks((state.gaussians for state in self.states(frames)), self.parts(), self._given.head.world)
 
     def _within(self, frames: str | None) -> dict[int, float]:
         """Returns the time of each opened frame in a range, keyed by frame index."""

@@ -1,1 +1,1 @@
-"""Queries on committed states: views, tracks, parts and PLY files."""
+"""Queries on committed states: views, tracks, parts, joints and PLY files."""

@@ -39,7 +39,7 @@ errors of 0.0002 to 0.003."""
 RELATIVE_ERROR, LARGEST_RELATIVE_ERROR = 0.05, 0.1
 """RMS error beyond ``ERROR`` that a large motion may have, and below it that a small motion may have, as shares of the
 motion."""
-GAP = 0.15
+GAP = 0.2
 """Largest distance of a joint from each of its parts, in units of the extent. An axle may be inside of a part, whose
 Gaussians are on the surface."""
 BALL_COST = 0.003

@@ -263,6 +263,11 @@ class FakeCommitted:
     def parts(self, count, previous=None):
         return np.arange(len(self.history.gaussians(0))) % (count or 2)
 
+    def joints(self, labels, indices):
+        from scas4d_core.query.joints import joints
+
+        return joints(self.history, labels, self.world, indices)
+
     def write_ply(self, path, index):
         path.write_bytes(b"ply\n" + str(index).encode())
 

@@ -70,7 +70,7 @@ def test_what_is_not_there_is_told(tmp_path):
         assert tracks.present.tolist() == [[True, True, False], [False, True, False], [False, True, True]]
         assert given.rig is None
         assert (given.parts() == -1).all()
-        with pytest.raises(InputError, match="no Gaussian of the first frame belongs to a part"):
+        with pytest.raises(InputError, match="the scene has no parts in these frames"):
             given.part_poses()
 
 
@@ -88,6 +88,7 @@ def test_parts_and_their_poses(source):
         moved = poses.motions[0, place] @ [*WORLD.to_user(centre(1)), 1]
         assert moved[:3] == pytest.approx(WORLD.to_user(centre(frame)), abs=NEAR)
     assert poses.residuals.max() < NEAR
+    assert given.joints(frames="1:") == []  # the blob moves freely
 
 
 def test_faults_have_remedies(source, tmp_path):
