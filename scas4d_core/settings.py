@@ -172,6 +172,11 @@ class UpdateSettings(SettingsModel):
         description="Once all layers have started, an update stops early if ten iterations reduce its error on the "
         "probe views by less than this fraction. 0 disables early stopping.",
     )
+    match_patches: bool = Field(
+        True,
+        description="Whether updates start from matches of image patches if the extrapolated motion does not fit. This "
+        "finds faster motion.",
+    )
     skip_tolerance: float = Field(
         0.0,
         ge=-1,

@@ -193,6 +193,7 @@ class BestState:
         self.seconds = seconds
         self.errors: dict[Candidate, dict[str, float]] = {}
         self._warm: tuple[float, Tables] | None = None
+        self._matched: Tables | None = None
 
     @property
     def whole(self) -> bool:
@@ -227,6 +228,37 @@ class BestState:
         if mean_error(errors, list(errors)) <= self._mean(Candidate.WARM):
             self.seconds, self.errors[Candidate.WARM] = whole, errors
             tables = self._set(motion)
+        return tables
+
+    def is_far(self, reference_errors: Mapping[str, float] | None, ratio: float) -> bool:
+        """Returns whether the start's error exceeds the usual error of updates by a factor, or no error is usual yet.
+
+        Args:
+            reference_errors: errors at the end of previous updates, named as by ``label_by_size``.
+            ratio: the factor.
+        """
+        if not self.errors:
+            return False
+        started = min(self.errors.values(), key=lambda errors: _nan_to_inf(mean_error(errors, list(errors))))
+        named = label_by_size(started, self.whole)
+        names = sorted(named.keys() & (reference_errors or {}).keys())
+        return not names or mean_error(named, names) > ratio * mean_error(reference_errors or {}, names)
+
+    def start_from(self, tables: Tables, matched: Tables | None, gain: float) -> Tables:
+        """Sets the engine to another start if its error is lower by at least the share ``gain``.
+
+        Returns the deformation from which the update starts, which is ``tables`` if the other does not fit better.
+        """
+        if matched is None:
+            return tables
+        self._engine.set_tables(matched)
+        errors = self._probes.errors(moved=True, learnt=False)
+        now = min(self._mean(Candidate.PREVIOUS), self._mean(Candidate.WARM))
+        if mean_error(errors, list(errors)) <= (1 - gain) * now:
+            self._matched = matched
+            self._record(Candidate.WARM, errors)
+            return matched
+        self._engine.set_tables(tables)
         return tables
 
     def can_skip(self, skip_below: Mapping[str, float] | None, confirm_skip: Callable[[], bool] | None = None) -> bool:
@@ -306,7 +338,10 @@ class BestState:
 
     def _set_candidate(self, candidate: Candidate) -> None:
         """Sets the engine's tables to the start of a candidate."""
-        self._set(self._motion if candidate is Candidate.WARM else None)
+        if candidate is Candidate.WARM and self._matched is not None:
+            self._engine.set_tables(self._matched)
+        else:
+            self._set(self._motion if candidate is Candidate.WARM else None)
 
     def _set(self, motion: Motion | None) -> Tables:
         if motion is None:

@@ -20,6 +20,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.best_state import BestState, ProbeViews
+from scas4d_core.update.matched_start import FAR, GAIN, matched_start
 from scas4d_core.update.parts import NOTHING, Arrays, Attempt, PlanBuilder
 from scas4d_core.update.rates import Rates, step_factors
 from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, Gate, Stopwatch, UpdateResult, UpdateTrace
@@ -91,6 +92,10 @@ class FrameUpdate:
         engine.load_state(previous)
         best = BestState(probes, engine, self.hierarchy, motion, seconds, settings.momentum)
         tables = best.start(options.step)
+        if settings.match_patches and best.is_far(options.reference_errors, FAR):
+            expected = engine.state(learnt=False)
+            matched = matched_start(tables, expected, self.hierarchy, views, self._factory, engine.renderer)
+            tables = best.start_from(tables, matched, GAIN)
         rates = self._rates_of(options, motion, best)
         attempt = Attempt(engine, engine.renderer, previous, views, rates, tables, dict(carried))
         for part in self._parts:
