@@ -154,6 +154,8 @@ class FrameSolver:
             again = self._search(given, result, attempts)
             if again is not None:
                 result, outcome, reason = again, FrameOutcome.RELOCATED, f"{why}; {attempts[-1]}"
+            elif self._misfit_is_confirmed(given, result):
+                reason = f"{why}; accepted, because several cameras show the same new content"
             elif lost.rejected < settings.max_rejected_frames:
                 outcome = FrameOutcome.REJECTED_MISFIT
                 return self._rejected(given, outcome, result.trace, lost, attempts, why, exposure)
@@ -292,6 +294,21 @@ class FrameSolver:
             return None
         with self._time_checks():
             return outliers.misfit_reason(given.past, result.trace.met, len(result.trace.losses))
+
+    def _misfit_is_confirmed(self, given: UpdateInput, result: UpdateResult) -> bool:
+        """Returns whether a state fits its frame as usual without the errors that other cameras confirm.
+
+        An object that the state does not contain yet causes such errors. A damaged image has errors everywhere, which
+        are not confirmed, because they do not stand out.
+        """
+        if self._budget_is_spent(given, len(given.views)):
+            return False
+        with self._time_checks():
+            views = [view for view in result.views or given.views if view.name not in result.trace.left_out]
+            names = [view.name for view in views]
+            credits = credited_decibels(names, views, self._factory, self._renderer, result.gaussians)
+            credited = {name: value + credits.get(name, 0.0) for name, value in result.trace.met.items()}
+            return outliers.misfit_reason(given.past, credited, len(result.trace.losses)) is None
 
     def _lag_reason(self, given: UpdateInput, result: UpdateResult) -> str | None:
         if not self._settings.reject_outliers or self._budget_is_spent(given):

@@ -1,7 +1,7 @@
 """Start of an update from matches between a rendering of the extrapolated state and the images.
 
-Gradients of the image loss only reach as far as the structures in an image. If a part is farther than that from where it
-was expected, an update may converge to a wrong motion. Patches of small images are therefore matched over larger
+Gradients of the image loss reach only as far as the structures in an image. If a part is farther than that from where
+it was expected, an update may converge to a wrong motion. Patches of small images are therefore matched over larger
 distances, and the coarsest clusters start from the rigid motions that agree with the matches of several cameras.
 """
 
@@ -25,7 +25,7 @@ from scas4d_core.update.warm_start import rotate, rotate_by
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
-VIEWS = 8
+VIEWS = 6
 """Number of cameras, spread over the rig, in whose images patches are matched."""
 FAR = 1.3
 """Ratio between the error of the extrapolated state and the usual error of updates from which patches are matched."""

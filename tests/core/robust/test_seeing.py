@@ -34,7 +34,7 @@ FOOTAGE = SyntheticFootage()
 BEFORE = first_state(resting_may_move=False)
 FACTORY = ViewFactory(rig_inside(FOOTAGE.rig.world_frame(1.0), FOOTAGE.rig.cameras))
 RENDERER = CpuRenderer((0.0, 0.0, 0.0))
-SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12))
+SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12), match_patches=False)
 
 
 def updater(settings: UpdateSettings = SETTINGS, engine: CpuEngine | None = None) -> FrameUpdate:

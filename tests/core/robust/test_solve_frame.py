@@ -325,6 +325,20 @@ def test_a_held_frame_is_told_as_it_is() -> None:
     assert (outcome.outcome, outcome.trace.kept) == (FrameOutcome.REJECTED_MISFIT, "previous")
 
 
+@pytest.mark.parametrize(("credit", "accepted"), [(16.0, True), (4.0, False)])
+def test_a_frame_with_new_content_that_cameras_confirm_is_accepted(
+    credit: float, accepted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "scas4d_core.robust.solve_frame.credited_decibels", lambda names, *rest: dict.fromkeys(names, credit)
+    )
+    outcome, after = solve(Fake(met(LEVEL - 20)), given(replace(PAST, updates=5)))
+    assert outcome.outcome is (FrameOutcome.UPDATED if accepted else FrameOutcome.REJECTED_MISFIT)
+    assert ("several cameras show the same new content" in outcome.reason) == accepted
+    assert any("search" in attempt for attempt in outcome.attempts)  # a jump is searched for first
+    assert after.rejected == (0 if accepted else 1)
+
+
 def test_what_is_sought_is_told_with_the_errors_of_the_frame_before(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Fake(met(LEVEL - 20), met(LEVEL))
     told = iter(
