@@ -324,7 +324,6 @@ class Scene:
     def _part_tracks(self, frames: str | None) -> list[PartTrack]:
         from scas4d_core.query.part_motion import part_tracks
 
-        self._within(frames)
         return part_tracks((state.gaussians for state in self.states(frames)), self.parts(), self._given.head.world)
 
     def _within(self, frames: str | None) -> dict[int, float]:

@@ -50,7 +50,8 @@ class FrameOutcome(StrEnum):
     RELOCATED = "relocated"
     """Committed after a longer search, because the regular update did not match the frame."""
     ACCEPTED = "accepted"
-    """Committed although it does not match the images, as the last of `max_rejected_frames` misfits in a row."""
+    """Committed although it does not match the images: as the last of `max_rejected_frames` misfits in a row, or
+    because several cameras show the same new content."""
     REJECTED_UNUSABLE = "rejected_unusable"
     """Θ_{t−1} is kept: the images are too dark or too bright to learn from."""
     REJECTED_IMPLAUSIBLE = "rejected_implausible"

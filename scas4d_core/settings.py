@@ -175,7 +175,8 @@ class UpdateSettings(SettingsModel):
     match_patches: bool = Field(
         True,
         description="Whether updates start from matches of image patches if the extrapolated motion does not fit. This "
-        "finds faster motion.",
+        "finds faster motion. Without `reject_outliers` and `stop_gain`, states are not compared, and nothing is "
+        "matched.",
     )
     skip_tolerance: float = Field(
         0.0,

@@ -97,6 +97,8 @@ KERNELS = (
         KernelGroup.UPDATE,
         "kernels.box_loss.box_loss i f3 f3 w1 i i*4 f3 f3 f3 f2 f3 f3 f3 f1 i f4 y2 f3 f3 d1",
         "kernels.neighbour_terms.neighbour_terms f2 i1 s2 f2 f2 f1 f3 f2",
+        "kernels.patch_matches.match_patches f1 f1 f1 i1 i2 d2 d1 d d2 d3 d2 d1",
+        "kernels.patch_matches.fit_clusters d2 d3 d2 d1 i1 d d d2 d2 d2",
         "kernels.deform.block_sums f4 f2 f3",
         "kernels.soft_colour.soft_colour f2 f2 i1 f2 f f2",
         "kernels.tiles.mark_blocks f2 s2 y1 i w1",

@@ -207,8 +207,7 @@ def fit_clusters(
         points: [N, 3] positions of the points in the rendered state.
         normal, right, weight: normal equations and weights of ``match_patches``.
         starts: [K + 1] int64 boundaries of the clusters in the points.
-        damping: weight of the prior that a cluster stays where it is, relative to matches of all of its points in one
-            camera.
+        damping: Levenberg–Marquardt damping of each round, relative to matches of all points in one camera.
         smallest: RMS motion, in pixels, below which a cluster stays where it is.
         turns: [K, 3] resulting rotations, as axis · tan(angle/2).
         before, after: [K, 3] mean of the points before and after the motion.

@@ -68,7 +68,8 @@ class Joint:
         axes: [T, 3] unit vectors of the axis. The axis of a ball joint changes with the child's rotation.
         centres: [T, 3] points of the axis where the parts meet, or centres of the ball.
         values: [T] angles in radians by which the child has rotated about the axis, relative to the parent, since the
-            first common frame; for sliders, distances along the axis. Angles of hinges are continuous.
+            first common frame; for sliders, distances along the axis. Angles of hinges are continuous, and the first is
+            between −π and π.
         error: RMS distance between the child's points and the prediction by the joint.
     """
 
@@ -83,16 +84,16 @@ class Joint:
     def rows(self, rows: Sequence[int]) -> Joint:
         """Returns the joint in some of the frames."""
         values = self.values[rows]
-        if self.kind == "revolute":  # turns between the chosen frames are at most half a turn
-            known = np.isfinite(values)
-            values[known] = np.unwrap(values[known])
+        if self.kind == "revolute":
+            values = _continuous(values)
         return replace(self, axes=self.axes[rows], centres=self.centres[rows], values=values)
 
 
 def joints(history: History, labels: NDArray[Any], world: WorldFrame, frames: Sequence[int]) -> list[Joint]:
     """Returns the joints between the parts of a scene, in some of its committed frames; see ``find_joints``.
 
-    The joints are fitted to at most ``FRAMES`` evenly spaced frames of the whole history, and to the given frames.
+    The joints are fitted to at most ``FRAMES`` evenly spaced frames of the whole history, so they do not depend on the
+    given frames.
 
     Args:
         history: committed states.
@@ -108,17 +109,18 @@ def joints(history: History, labels: NDArray[Any], world: WorldFrame, frames: Se
     chosen = sorted({*fitted, *frames})
     tracks = part_tracks((history.gaussians(index) for index in chosen), labels, world)
     extent = moving_extent(history.gaussians(indices[0])) / world.metres_per_unit
-    rows = [chosen.index(frame) for frame in frames]
-    return [joint.rows(rows) for joint in find_joints(tracks, extent)]
+    fitted_rows, rows = ([chosen.index(frame) for frame in some] for some in (fitted, frames))
+    return [joint.rows(rows) for joint in find_joints(tracks, extent, fitted_rows)]
 
 
-def find_joints(tracks: Sequence[PartTrack], extent: float) -> list[Joint]:
+def find_joints(tracks: Sequence[PartTrack], extent: float, rows: Sequence[int] | None = None) -> list[Joint]:
     """Returns the joints between parts, parents before their children.
 
     Args:
         tracks: motions of the parts over the same T frames. If there is one with the label −1, it contains what is
             static, and is the root of its tree. Otherwise, the root is the largest part of the tree.
         extent: extent of the moving Gaussians, in the user's units.
+        rows: frames, as indices in T, to which joints are fitted; None for at most ``FRAMES`` evenly spaced ones.
 
     >>> leaf = np.random.default_rng(0).random((50, 3)) * [1, 2, 0.1]
     >>> opened = np.tile(np.eye(4), (5, 1, 1))
@@ -128,18 +130,25 @@ def find_joints(tracks: Sequence[PartTrack], extent: float) -> list[Joint]:
     >>> joint.kind, joint.axes[0].round(3) + 0, joint.values.round(2) + 0
     ('revolute', array([0., 1., 0.]), array([0.  , 0.25, 0.5 , 0.75, 1.  ]))
     """
+    tracks = [track for track in tracks if len(track.points) and np.isfinite(track.points).all()]
+    if not tracks or not extent > 0:
+        return []
+    rows = evenly_spaced(len(tracks[0].motions), FRAMES).tolist() if rows is None else rows
     trees = [cKDTree(track.points) for track in tracks]
     best: dict[tuple[int, int], _Fit] = {}
     for one, other in permutations(range(len(tracks)), 2):
-        relative = _relative_motion(tracks[one], tracks[other])
-        if relative is None:
+        few = _relative_motion(tracks[one], tracks[other], rows)
+        if few is None or len(few.frames) < LEAST_FRAMES or not _are_close(few, trees[one], trees[other], extent):
             continue
-        few = relative.rows(evenly_spaced(len(relative.frames), FRAMES))
         moved = _rms(few.errors(np.eye(3), np.zeros((1, 3)))) / extent
         if moved < MOTION:
             continue
         allowed = min(max(ERROR, RELATIVE_ERROR * moved), LARGEST_ERROR, LARGEST_RELATIVE_ERROR * moved)
-        for fit in (_prismatic(few), _revolute(few, OUTLIER * extent), _spherical(few)):
+        ball = _spherical(few)
+        fits = [_prismatic(few), ball]
+        if ball.error <= extent * allowed:  # a hinge is a special case
+            fits.append(_revolute(few, OUTLIER * extent))
+        for fit in fits:
             if fit.error > extent * allowed:
                 continue
             fit = _at_contact(fit._replace(pair=(one, other)), few, trees[one], trees[other], extent)
@@ -149,13 +158,13 @@ def find_joints(tracks: Sequence[PartTrack], extent: float) -> list[Joint]:
     joints = []
     for parent, child in _directed({pair: fit.cost for pair, fit in best.items()}, tracks):
         fit = best[min(parent, child), max(parent, child)]
-        joint = _joint(fit, tracks, extent)
+        joint = _joint(fit, tracks, rows, extent)
         joints.append(joint if fit.pair == (parent, child) else _reversed(joint))
     return joints
 
 
 class _Relative(NamedTuple):
-    """Motion of one body in the coordinates of another in F frames, since their first common frame.
+    """Motion of one body in the coordinates of another in F frames, since their first common frame among ``rows``.
 
     Attributes:
         frames: [F] common frames.
@@ -171,10 +180,6 @@ class _Relative(NamedTuple):
     mean: Float
     spread: Float
     start: Float
-
-    def rows(self, rows: NDArray[np.intp]) -> _Relative:
-        """Returns the motion in some of the frames."""
-        return self._replace(frames=self.frames[rows], turns=self.turns[rows], shifts=self.shifts[rows])
 
     @property
     def means(self) -> Float:
@@ -220,19 +225,35 @@ class _Fit(NamedTuple):
         return self.error + GAP_COST * self.gap + (BALL_COST if self.kind == "spherical" else 0.0)
 
 
-def _relative_motion(one: PartTrack, other: PartTrack) -> _Relative | None:
-    """Returns the motion of ``other`` relative to ``one``, or None if they have too few common frames."""
-    common = np.flatnonzero(np.isfinite(one.motions[:, 0, 0]) & np.isfinite(other.motions[:, 0, 0]))
-    if len(common) < LEAST_FRAMES:
+def _relative_motion(
+    one: PartTrack, other: PartTrack, rows: Sequence[int], frames: NDArray[np.intp] | None = None
+) -> _Relative | None:
+    """Returns the motion of ``other`` relative to ``one``, or None if they have no common frame in ``rows``.
+
+    Args:
+        one, other: the bodies.
+        rows: frames whose first common one is the reference.
+        frames: frames of the result, or None for ``rows``. Only those with both bodies are used.
+    """
+    both = np.isfinite(one.motions[:, 0, 0]) & np.isfinite(other.motions[:, 0, 0])
+    fitted = np.asarray(rows, np.intp)[both[rows]]
+    if not len(fitted):
         return None
-    motions = np.linalg.inv(one.motions[common]) @ other.motions[common]
-    start = motions[0]
-    motions = motions @ np.linalg.inv(start)
+    start = np.linalg.inv(one.motions[fitted[0]]) @ other.motions[fitted[0]]
+    common = fitted if frames is None else frames[both[frames]]
+    motions = np.linalg.inv(one.motions[common]) @ other.motions[common] @ np.linalg.inv(start)
     points = _moved(start, other.points)
-    mass = other.weights / other.weights.sum()
+    weights = other.weights if other.weights.sum() > 0 else np.ones(len(points))
+    mass = weights / weights.sum()
     mean = mass @ points
     left, sizes, _ = np.linalg.svd(((points - mean) * mass[:, None]).T @ (points - mean))
     return _Relative(common, motions[:, :3, :3], motions[:, :3, 3], mean, left * np.sqrt(sizes), start)
+
+
+def _are_close(relative: _Relative, one: cKDTree, other: cKDTree, extent: float) -> bool:
+    """Returns whether two bodies are close enough for a joint within ``GAP`` of both, in the first common frame."""
+    points = _moved(relative.start, np.asarray(other.data, np.float64))
+    return bool(np.min(one.query(points, distance_upper_bound=2 * GAP * extent)[0], initial=np.inf) < np.inf)
 
 
 def _prismatic(relative: _Relative) -> _Fit:
@@ -258,7 +279,7 @@ def _revolute(relative: _Relative, outlier: float) -> _Fit:
         return np.append(errors(unknowns).ravel(), [length - 1, PULL * along])
 
     start = np.append(first, _fixed_point(relative) - relative.mean)
-    found = least_squares(with_prior, start, loss="soft_l1", f_scale=max(outlier, 1e-12)).x
+    found = least_squares(with_prior, start, loss="soft_l1", f_scale=max(outlier, 1e-12), max_nfev=100).x
     axis = found[:3] / np.linalg.norm(found[:3])
     return _Fit("revolute", axis, relative.mean + found[3:], _rms(errors(found)))
 
@@ -314,22 +335,24 @@ def _directed(costs: dict[tuple[int, int], float], tracks: Sequence[PartTrack]) 
             yield from ((int(parents[child]), int(child)) for child in order[1:])
 
 
-def _joint(fit: _Fit, tracks: Sequence[PartTrack], extent: float) -> Joint:
+def _joint(fit: _Fit, tracks: Sequence[PartTrack], rows: Sequence[int], extent: float) -> Joint:
     """Returns the joint in all frames, with the first body of the fit as parent."""
     one, other = (tracks[index] for index in fit.pair)
-    relative = _relative_motion(one, other)
+    relative = _relative_motion(one, other, rows, np.arange(len(one.motions)))
     assert relative is not None
     axes = np.broadcast_to(fit.axis, (len(relative.frames), 3))
-    if fit.kind == "prismatic":
-        values = (relative.means - relative.mean) @ fit.axis
-    elif fit.kind == "revolute":
-        values = np.unwrap(relative.angles(fit.axis, fit.centre))
-    else:
+    fitted = np.isin(relative.frames, rows)
+    if fit.kind == "spherical":
         vectors = Rotation.from_matrix(relative.turns).as_rotvec()
         values = np.linalg.norm(vectors, axis=1)
         axes = np.where(values[:, None] > 0, vectors / np.maximum(values[:, None], 1e-300), np.eye(3)[0])
-    if fit.kind != "spherical" and -values.min() > values.max():
-        axes, values = -axes, -values  # the sign of an axis is arbitrary; the largest value is positive
+    else:
+        hinge = fit.kind == "revolute"
+        values = relative.angles(fit.axis, fit.centre) if hinge else (relative.means - relative.mean) @ fit.axis
+        chosen = _continuous(values[fitted]) if hinge else values[fitted]
+        if -chosen.min() > chosen.max():  # the sign of an axis is arbitrary; the largest value is positive
+            axes, values = -axes, -values
+        values = _continuous(values) if hinge else values
     turns = one.motions[relative.frames, :3, :3]
 
     def in_all_frames(rows: Float) -> Float:
@@ -351,6 +374,16 @@ def _joint(fit: _Fit, tracks: Sequence[PartTrack], extent: float) -> Joint:
 def _reversed(joint: Joint) -> Joint:
     """Returns the same joint with parent and child exchanged. The parent then turns the other way about the axis."""
     return replace(joint, parent=joint.child, child=joint.parent, axes=-joint.axes)
+
+
+def _continuous(angles: Float) -> Float:
+    """Returns angles [T] without jumps of a whole turn between frames, skipping NaN; the first is in −π…π."""
+    result = angles.copy()
+    known = np.isfinite(result)
+    if known.any():
+        turned = np.unwrap(result[known])
+        result[known] = turned - 2 * np.pi * np.round(turned[0] / (2 * np.pi))
+    return result
 
 
 def _moved(motion: NDArray[Any], points: NDArray[Any]) -> Float:

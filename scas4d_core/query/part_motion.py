@@ -181,28 +181,30 @@ def part_tracks(states: Iterable[Gaussians], labels: NDArray[Any], world: WorldF
     >>> track.motions[1, :3, 3].round(6) + 0
     array([0., 0., 1.])
     """
-    sizes = {part: int(np.count_nonzero(labels == part)) for part in np.unique(labels[labels >= 0]).tolist()}
-    started: dict[int, PartMotion] = {}
-    poses: dict[int, dict[int, tuple[Float, float]]] = {part: {} for part in sizes}
+    waiting = {part: int(np.count_nonzero(labels == part)) for part in np.unique(labels[labels >= 0]).tolist()}
+    started: list[PartMotion] = []  # one for all parts with the same first frame
+    poses: dict[int, dict[int, PartPose]] = {part: {} for part in waiting}
     first: Gaussians | None = None
     count = 0
     for index, state in enumerate(states):
         count = index + 1
         first = state if first is None else first
         present = part_labels(labels, len(state))[state.present]
-        for part, size in sizes.items():
-            if part not in started and np.count_nonzero(present == part) >= STARTED * size:
-                started[part] = PartMotion(np.where(labels == part, part, -1), state, world)
-        for part, motion in started.items():
+        new = [part for part, size in waiting.items() if np.count_nonzero(present == part) >= STARTED * size]
+        if new:
+            waiting = {part: size for part, size in waiting.items() if part not in new}
+            started.append(PartMotion(np.where(np.isin(labels, new), labels, NO_PART), state, world))
+        for motion in started:
             for pose in motion.poses(state):
-                poses[part][index] = pose.motion, pose.residual
+                poses[pose.part][index] = pose
     tracks = [] if first is None else [still_track(first, labels, world, count)]
-    for part in sorted(started):
-        motions, residuals = np.full((count, 4, 4), np.nan), np.full(count, np.nan)
-        for index, (transform, residual) in poses[part].items():
-            motions[index], residuals[index] = transform, residual
-        tracks.append(PartTrack(part, motions, residuals, *started[part].points(part)))
-    return [track for track in tracks if len(track.points)]
+    for motion in started:
+        for part in motion.parts:
+            motions, residuals = np.full((count, 4, 4), np.nan), np.full(count, np.nan)
+            for index, pose in poses[part].items():
+                motions[index], residuals[index] = pose.motion, pose.residual
+            tracks.append(PartTrack(part, motions, residuals, *motion.points(part)))
+    return sorted((track for track in tracks if len(track.points)), key=lambda track: track.part)
 
 
 def still_track(first: Gaussians, labels: NDArray[Any], world: WorldFrame, frames: int) -> PartTrack:

@@ -34,7 +34,13 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shift_moving
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.update.best_state import committed_errors, is_slow_motion, label_by_size, mean_is_within
+from scas4d_core.update.best_state import (
+    committed_errors,
+    is_slow_motion,
+    label_by_size,
+    mean_is_within,
+    spread_cameras,
+)
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.rates import latest_start
 from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, Current, UpdateResult, UpdateTrace
@@ -55,6 +61,8 @@ of `robot` are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB 
 REFERENCES = 6
 """Approximate number of cameras whose confirmed errors count as usual."""
 
+CONFIRMING_CAMERAS = 12
+"""Number of cameras, spread over the rig, that may confirm new content. The time grows with its square."""
 LONGEST_GAP = 3
 """Largest factor on the iterations of an update after missing frames; the factor is the gap between the frames."""
 
@@ -156,6 +164,8 @@ class FrameSolver:
                 result, outcome, reason = again, FrameOutcome.RELOCATED, f"{why}; {attempts[-1]}"
             elif self._misfit_is_confirmed(given, result):
                 reason = f"{why}; accepted, because several cameras show the same new content"
+                outcome = FrameOutcome.ACCEPTED
+                given = replace(given, past=replace(given.past, level=nan, updates=0))
             elif lost.rejected < settings.max_rejected_frames:
                 outcome = FrameOutcome.REJECTED_MISFIT
                 return self._rejected(given, outcome, result.trace, lost, attempts, why, exposure)
@@ -304,10 +314,11 @@ class FrameSolver:
         if self._budget_is_spent(given, len(given.views)):
             return False
         with self._time_checks():
-            views = [view for view in result.views or given.views if view.name not in result.trace.left_out]
-            names = [view.name for view in views]
+            views = [view for view in result.views or given.views if view.name in result.trace.met]
+            names = spread_cameras(self._rig, [view.name for view in views], CONFIRMING_CAMERAS)
+            views = [view for view in views if view.name in names]
             credits = credited_decibels(names, views, self._factory, self._renderer, result.gaussians)
-            credited = {name: value + credits.get(name, 0.0) for name, value in result.trace.met.items()}
+            credited = {name: result.trace.met[name] + credit for name, credit in credits.items()}
             return outliers.misfit_reason(given.past, credited, len(result.trace.losses)) is None
 
     def _lag_reason(self, given: UpdateInput, result: UpdateResult) -> str | None:

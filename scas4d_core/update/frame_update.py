@@ -55,8 +55,10 @@ class FrameUpdate:
     def __init__(self, engine: UpdateEngine, built: PlanBuilder, neighbours: Neighbours | None) -> None:
         self.settings, self.hierarchy = built.update, built.hierarchy
         self._engine, self.plan, self._parts, self._factory = engine, built.plan, built.parts, built.factory
+        freedom = self.plan.freedom
+        self._matches = self.settings.match_patches and freedom.cluster_rotation and freedom.cluster_translation
         rates = Rates.of(self.settings, len(self.hierarchy.sizes), self._factory.rig.reach)
-        self._rates = rates.restricted_to(self.plan.freedom)
+        self._rates = rates.restricted_to(freedom)
         engine.bind(self.plan, structure_of(self.hierarchy, neighbours, built.first))
 
     def run(
@@ -92,9 +94,9 @@ class FrameUpdate:
         engine.load_state(previous)
         best = BestState(probes, engine, self.hierarchy, motion, seconds, settings.momentum)
         tables = best.start(options.step)
-        if settings.match_patches and best.is_far(options.reference_errors, FAR):
+        if self._matches and best.is_far(options.reference_errors, FAR):
             expected = engine.state(learnt=False)
-            matched = matched_start(tables, expected, self.hierarchy, views, self._factory, engine.renderer)
+            matched = matched_start(tables, previous, expected, self.hierarchy, views, self._factory, engine.renderer)
             tables = best.start_from(tables, matched, GAIN)
         rates = self._rates_of(options, motion, best)
         attempt = Attempt(engine, engine.renderer, previous, views, rates, tables, dict(carried))

@@ -32,7 +32,7 @@ FAR = 1.3
 GAIN = 0.05
 """Smallest relative decrease of the error on the probe views with which an update starts from matches."""
 DAMPING = 0.02
-"""Weight of the prior that a cluster stays where it is expected, relative to matches of all its points in a camera."""
+"""Levenberg–Marquardt damping of a cluster's motion, relative to the matches of all its points in one camera."""
 SMALLEST_PX = 1.0
 """RMS motion of a cluster, in pixels of the small images, below which it starts where it is expected."""
 POINTS = 24
@@ -49,6 +49,7 @@ COVERED = 0.5
 
 def matched_start(
     tables: Tables,
+    previous: Gaussians,
     state: Gaussians,
     hierarchy: Hierarchy,
     views: Sequence[TrainingView],
@@ -59,6 +60,7 @@ def matched_start(
 
     Args:
         tables: deformation from which the update would start.
+        previous: previous state Θ_{t−1}.
         state: previous state, deformed by ``tables``.
         hierarchy: hierarchy of the moving Gaussians.
         views: views of the frame.
@@ -89,27 +91,27 @@ def matched_start(
     fit_clusters(points, normal, right, weight, starts, DAMPING, SMALLEST_PX, turns, before, after)
     if not (before != after).any():
         return None
-    return _followed_by(tables, state, hierarchy, turns, before, after)
+    return _followed_by(tables, previous, hierarchy, turns, before, after)
 
 
 def _followed_by(
-    tables: Tables, state: Gaussians, hierarchy: Hierarchy, turns: Float, before: Float, after: Float
+    tables: Tables, previous: Gaussians, hierarchy: Hierarchy, turns: Float, before: Float, after: Float
 ) -> Tables:
     """Returns a deformation followed by a rigid motion of each cluster of the coarsest layer.
 
     Args:
-        tables: the deformation.
-        state: previous state, deformed by ``tables``.
+        tables: the deformation of ``previous``.
+        previous: previous state Θ_{t−1}.
         hierarchy: hierarchy of the moving Gaussians.
         turns: [K, 3] rotations Q, as axis · tan(angle/2).
         before, after: [K, 3] points such that a position x moves to Q (x − before) + after.
     """
     result = tables.copy()
     first = hierarchy.starts[0]
-    expected = state.means[hierarchy.rows].astype(np.float64)
-    centres = np.add.reduceat(expected, first[:-1]) / np.diff(first)[:, None]
     coarsest = result.clusters[0]
-    coarsest[:, 3:6] += rotate(turns, centres - before) + after - centres
+    means = previous.means[hierarchy.rows].astype(np.float64)
+    pivots = np.add.reduceat(means, first[:-1]) / np.diff(first)[:, None] + coarsest[:, 3:6]
+    coarsest[:, 3:6] += rotate(turns, pivots - before) + after - pivots
     coarsest[:, :3] = _composed(turns, coarsest[:, :3].astype(np.float64))
     # Finer layers, and the Gaussians' own motion, rotate with their coarsest cluster.
     for table, starts in zip(result.clusters[1:], hierarchy.starts[1:], strict=True):
@@ -141,9 +143,10 @@ def _composed(turns: Float, first: Float) -> Float:
 def _small(factory: ViewFactory, view: TrainingView) -> TrainingView:
     """Returns the view at a size whose shorter side has ``SIDE`` to twice as many pixels, or a small view unchanged."""
     scale = 1.0
-    while 0.5 * scale * min(view.camera.width, view.camera.height) >= SIDE:
+    while min(view.camera.width, view.camera.height) >= 2 * SIDE:  # halving is fast
         scale *= 0.5
-    return view if scale == 1 else factory.coarser(view, scale)
+        view = factory.coarser(view, scale)
+    return view
 
 
 def _pyramid(colours: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:

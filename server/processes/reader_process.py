@@ -189,7 +189,9 @@ class QueryReader:
                 return self._answer(ask.number, ask.query)
             except DamagedFrameError as error:
                 log.warning("scene %s: %s failed: %s", self.spec.folder.name, asked, error)
-                if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # computed from the remaining states
+                if more and isinstance(
+                    ask.query, PartsQuery | LabelsQuery | JointsQuery
+                ):  # computed from the remaining states
                     continue
                 return QueryRefused(
                     ask.number,

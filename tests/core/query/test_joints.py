@@ -1,5 +1,7 @@
 """Joints between parts, on bodies whose joints are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -145,7 +147,10 @@ def test_a_wheel_turns_on_and_on():
         [still(box([0, 0, 0], [0.2, 1.4, 0.2])), track(0, turned(angles[:, None] * [0, 0, 1]), wheel)], 1
     )
     np.testing.assert_allclose(joint.values, angles, atol=1e-6)
-    np.testing.assert_allclose(joint.rows([10, 12, 14]).values, angles[[10, 12, 14]] - 0, atol=1e-6)
+    found = joint.rows([10, 12, 14]).values  # from 4.7 radians on
+    np.testing.assert_allclose(found, angles[[10, 12, 14]] - 2 * np.pi, atol=1e-6)
+    far_apart = joint.rows([0, 9, 18]).values  # turns of 4.3 radians look like turns of −2
+    np.testing.assert_allclose(far_apart, [0, 9 * 9 / 19 - 2 * np.pi, 2 * (9 * 9 / 19 - 2 * np.pi)], atol=1e-6)
 
 
 def test_frames_in_which_a_part_is_absent_are_nan():
@@ -179,6 +184,19 @@ def test_joints_of_a_history_are_in_the_users_world_and_frames():
     offset = joint.centres[0] - world.to_user(HINGE)
     np.testing.assert_allclose(np.cross(offset, AXIS), 0, atol=1e-3)
     assert joint.error < 1e-3
+    (whole,) = joints(history, labels, world, history.indices)
+    assert (joint.error, joint.kind, joint.parent) == (whole.error, whole.kind, whole.parent)  # whatever is asked for
+    for name in ("values", "axes", "centres"):
+        np.testing.assert_array_equal(getattr(joint, name), getattr(whole, name)[[2, 3, 10]])
+
+
+def test_a_scene_without_size_weights_or_finite_points_has_no_joints_or_the_usual_ones():
+    opened = track(0, turned(TIME[:, None] * AXIS, HINGE), FORE)
+    assert find_joints([still(ARM), opened], 0.0) == []
+    assert find_joints([still(ARM), replace(opened, points=np.full_like(FORE, np.nan))], EXTENT) == []
+    (usual,) = find_joints([still(ARM), opened], EXTENT)
+    (unweighted,) = find_joints([still(ARM), replace(opened, weights=np.zeros(len(FORE)))], EXTENT)
+    np.testing.assert_array_equal(usual.axes, unweighted.axes)
 
 
 def test_the_motion_before_a_part_is_born_is_no_evidence():

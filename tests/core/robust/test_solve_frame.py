@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from box_scene import take_frame
 
 from scas4d_core.cameras import Rig
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -333,10 +334,37 @@ def test_a_frame_with_new_content_that_cameras_confirm_is_accepted(
         "scas4d_core.robust.solve_frame.credited_decibels", lambda names, *rest: dict.fromkeys(names, credit)
     )
     outcome, after = solve(Fake(met(LEVEL - 20)), given(replace(PAST, updates=5)))
-    assert outcome.outcome is (FrameOutcome.UPDATED if accepted else FrameOutcome.REJECTED_MISFIT)
+    assert outcome.outcome is (FrameOutcome.ACCEPTED if accepted else FrameOutcome.REJECTED_MISFIT)
+    assert outcome.outcome.degraded
     assert ("several cameras show the same new content" in outcome.reason) == accepted
     assert any("search" in attempt for attempt in outcome.attempts)  # a jump is searched for first
     assert after.rejected == (0 if accepted else 1)
+
+
+def psnr_of(state: Gaussians, views: list[TrainingView]) -> float:
+    return float(np.mean([one.psnr for one in RENDERER.compare(state, views)]))
+
+
+def test_a_new_object_is_confirmed_and_noise_is_not() -> None:
+    """The state lacks a third ball, which all cameras show. Another frame shows noise of the same error."""
+    moving = np.flatnonzero(BEFORE.foreground > 0.5)
+    means = 0.6 * (BEFORE.means[moving] - BEFORE.means[moving].mean(axis=0)) + np.float32([-0.15, -0.12, 0.3])
+    ball = BEFORE.rows(moving).replace(
+        means=means, factors=0.6 * BEFORE.factors[moving], ids=np.arange(1000, 1000 + len(moving))
+    )
+    shows_ball = FACTORY.views(take_frame(1, 1.0, BEFORE.concatenate(ball), RIG, masks=False), {})
+    plain = take_frame(1, 1.0, BEFORE, RIG, masks=False)
+    error = np.sqrt(np.mean([np.square(view.target[:3] - old.target[:3]).mean()
+                             for view, old in zip(shows_ball, FACTORY.views(plain, {}), strict=True)]))  # fmt: skip
+    rng = np.random.default_rng(0)
+    noisy = {name: (image + rng.normal(0, 255 * error * 1.4, image.shape)).clip(0, 255).astype(np.uint8)
+             for name, image in plain.images.items()}  # fmt: skip
+    shows_noise = FACTORY.views(replace(plain, images=noisy), {})
+    for views, outcome in ((shows_ball, FrameOutcome.ACCEPTED), (shows_noise, FrameOutcome.REJECTED_MISFIT)):
+        level = psnr_of(BEFORE, views)
+        assert level < LEVEL - 8
+        found, _ = solve(Fake(met(level, BEFORE)), given(replace(PAST, updates=5), views=views))
+        assert found.outcome is outcome, (level, found.attempts)
 
 
 def test_what_is_sought_is_told_with_the_errors_of_the_frame_before(monkeypatch: pytest.MonkeyPatch) -> None:

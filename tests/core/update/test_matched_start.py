@@ -74,7 +74,7 @@ def start_of(truth: Gaussians, tables: Tables, rig: Rig = RIG) -> tuple[Gaussian
     engine = engine_of(BOX, views)
     engine.set_tables(tables)
     expected = engine.state(learnt=False)
-    found = matched_start(tables, expected, HIERARCHY, views, ViewFactory(rig), engine.renderer)
+    found = matched_start(tables, BOX, expected, HIERARCHY, views, ViewFactory(rig), engine.renderer)
     if found is not None:
         engine.set_tables(found)
     return engine.state(learnt=False), found
@@ -92,7 +92,7 @@ def test_what_is_expected_is_continued_in_its_own_axes() -> None:
     tables = Tables.identity(HIERARCHY)
     for table in tables.clusters:
         table[:, :3] = rng.normal(0, 0.02, (len(table), 3))
-        table[:, 3:6] = rng.normal(0, 0.002, (len(table), 3))
+        table[:, 3:6] = rng.normal(0, 0.002, (len(table), 3)) + np.array([0.01, 0, 0.01])
     tables.deltas[:, :3] = rng.normal(0, 0.002, (len(tables.deltas), 3))
     engine = engine_of(BOX, views_of(BOX))
     engine.set_tables(tables)
