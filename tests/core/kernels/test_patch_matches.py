@@ -72,8 +72,10 @@ def test_a_shifted_image_is_found_to_a_tenth_of_a_pixel() -> None:
     np.testing.assert_allclose(moved, np.tile(SHIFT, (len(PIXELS), 1)), atol=0.1)
 
 
-def by_scipy(source: NDArray[np.float32], target: NDArray[np.float32], u: float, v: float) -> tuple[Float, Float]:
-    """The flow [2] and the information matrix [2, 2] of one point, without depths."""
+def by_scipy(
+    source: NDArray[np.float32], target: NDArray[np.float32], depth: NDArray[np.float32], u: float, v: float
+) -> tuple[Float, Float]:
+    """The flow [2] and the information matrix [2, 2] of one point at a depth of 2."""
     flow = np.zeros(2)
     half = module.HALF_PATCH
     offsets = np.arange(module.SIDE) - half + 0.5
@@ -90,29 +92,39 @@ def by_scipy(source: NDArray[np.float32], target: NDArray[np.float32], u: float,
                 (read(before, 0, 1) - read(before, 0, -1)) / 2,
             ]
         ).reshape(2, -1)
-        patch, structure = read(before, 0, 0), gradient @ gradient.T
-        damped = structure + module.NOISE * patch.size * np.eye(2)
+        x, y = ((at * 0.5**level + offsets) / 0.5**level for at in (u, v))  # in pixels of the finest level
+        columns, rows = (at.astype(int).clip(0, side - 1) for at, side in ((x, WIDTH), (y, HEIGHT)))
+        weights = np.where(np.abs(depth[np.ix_(rows, columns)] - 2.0) <= 0.05, 1.0, module.BEHIND)
+        patch, total = read(before, 0, 0), weights.sum()
+        structure = (gradient * weights.ravel()) @ gradient.T
+        damped = structure + module.NOISE * total * np.eye(2)
         flow = 2 * flow
         start = flow
         for _ in range(module.STEPS):
             found = read(after, *flow)
-            error = (found - found.mean()) - (patch - patch.mean())
-            step = -np.linalg.solve(damped, gradient @ error.ravel())
+            error = found - patch - (weights * (found - patch)).sum() / total
+            step = -np.linalg.solve(damped, gradient @ (weights * error).ravel())
             flow = flow + step
             if step @ step < module.CONVERGED**2:
                 break
         if (flow - start) @ (flow - start) > module.SIDE**2:
             flow = start
-    confidence = 1 / (1 + np.mean(error**2) / module.MISFIT**2)
+    confidence = 1 / (1 + (weights * error**2).sum() / total / module.MISFIT**2)
     return flow, confidence * np.linalg.inv(damped) @ structure
 
 
-def test_flow_and_information_are_those_of_scipy() -> None:
+@pytest.mark.parametrize("edge", [False, True])
+def test_flow_and_information_are_those_of_scipy(edge: bool) -> None:
+    """With an edge, every third column of the image shows a surface in front of the points' or behind it."""
     source, target = seen(np.zeros(2)), seen(SHIFT)
     points = at_pixels(PIXELS)
-    normal, right, weight = matched(source, target, points)
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    if edge:
+        depth[:, 10::3] = 2.3
+    normal, right, weight = matched(source, target, points, depth)
+    assert edge or weight.all()
     for index, (u, v) in enumerate(PIXELS):
-        flow, information = by_scipy(source, target, u, v)
+        flow, information = by_scipy(source, target, depth, u, v)
         x, y, z = points[index]
         jacobian = np.array([[LENS[0] / z, 0, -LENS[0] * x / z**2], [0, LENS[1] / z, -LENS[1] * y / z**2]])
         np.testing.assert_allclose(normal[index], jacobian.T @ information @ jacobian, rtol=1e-6, atol=1e-6)
@@ -185,6 +197,50 @@ def test_clusters_follow_their_rigid_motions_despite_outliers() -> None:
     assert np.linalg.norm(moved - targets[:30], axis=1)[inliers].max() < 0.03
     assert not turns[1].any()
     np.testing.assert_array_equal(after[1], before[1])  # the second cluster rests
+
+
+def by_numpy(points: Float, normal: Float, right: Float, weight: Float, damping: float) -> tuple[Float, Float]:
+    """The positions of one cluster's points after its motion, and the matrix [3, 3] of its rotation."""
+    places, turned, reliability = points.copy(), np.eye(3), np.ones(len(points))
+    prior = damping * np.trace(normal, axis1=1, axis2=2).sum() / weight.sum() * len(points) / 3
+    for _ in range(module.ROUNDS):
+        arms = places - places.mean(axis=0)
+        about = np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=2)
+        basis = np.concatenate([about, np.tile(np.eye(3), (len(points), 1, 1))], axis=2)
+        moments = right - np.einsum("nij,nj->ni", normal, places - points)
+        lever = np.square(arms).sum() / len(points) / 3
+        system = np.einsum("n,nai,nab,nbj->ij", reliability, basis, normal, basis)
+        system += prior * np.diag([lever] * 3 + [1] * 3)
+        unknowns = np.linalg.solve(system, np.einsum("n,nai,na->i", reliability, basis, moments))
+        turn = Rotation.from_quat(np.append(unknowns[:3] / 2, 1)).as_matrix()
+        places, turned = places.mean(axis=0) + unknowns[3:] + arms @ turn.T, turn @ turned
+        left = np.square(right - np.einsum("nij,nj->ni", normal, places - points)).sum(axis=1)
+        squared = left / (np.trace(normal, axis1=1, axis2=2) * weight)
+        reliability = 1 / (1 + squared / module.OUTLIER_PX**2)
+    return places, turned
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_motions_are_those_of_numpy_whatever_the_number_of_threads(threads: int) -> None:
+    rng = np.random.default_rng(2)
+    points = rng.normal(0, 0.1, (50, 3))
+    roots = rng.normal(0, 60, (50, 3, 3))
+    normal, weight = roots @ np.swapaxes(roots, 1, 2), rng.uniform(0.5, 3, 50)
+    shifts = Rotation.from_rotvec([0.2, -0.1, 0.3]).apply(points) - points + rng.normal(0.05, 0.03, (50, 3))
+    right = np.einsum("nij,nj->ni", normal, shifts)
+    turns, before, after = (np.empty((2, 3)) for _ in range(3))
+    used = numba.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    try:
+        fit_clusters(points, normal, right, weight, np.array([0, 20, 50]), 0.1, 0.0, turns, before, after)
+    finally:
+        numba.set_num_threads(used)
+    for cluster, rows in enumerate((slice(0, 20), slice(20, 50))):
+        places, turned = by_numpy(points[rows], normal[rows], right[rows], weight[rows], 0.1)
+        np.testing.assert_allclose(before[cluster], points[rows].mean(axis=0), atol=1e-12)
+        np.testing.assert_allclose(after[cluster], places.mean(axis=0), rtol=1e-7, atol=1e-9)
+        found = Rotation.from_quat(np.append(turns[cluster], 1)).as_matrix()
+        np.testing.assert_allclose(found, turned, rtol=1e-7, atol=1e-9)
 
 
 def test_small_motions_and_clusters_without_matches_rest() -> None:
