@@ -22,7 +22,7 @@ STEPS = 6
 """Maximum number of iterations per level."""
 CONVERGED = 0.02
 """Step, in pixels, below which the iterations of a level end."""
-NOISE = 3e-4
+NOISE = 0.0003
 """Squared image gradient, [0, 1] per pixel, that noise explains. Directions with smaller gradients count little."""
 MISFIT = 0.05
 """RMS difference between a matched patch and the image at which the match counts half."""
@@ -84,7 +84,7 @@ def match_patches(
         cx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
         cy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
         cz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        if not cz > 1e-6:
+        if not cz > 0:
             continue
         u, v = lens[0] * cx / cz + lens[2], lens[1] * cy / cz + lens[3]
         if not (u >= 1 and v >= 1 and u < width - 1 and v < height - 1):
@@ -167,7 +167,10 @@ def match_patches(
 
 @kernel
 def _solve(matrix: NDArray[Any], right: NDArray[Any]) -> None:
-    """Solves a symmetric positive definite system in place (Cholesky); ``right`` becomes the solution."""
+    """Solves a symmetric positive definite system in place (Cholesky); ``right`` becomes the solution.
+
+    The solution of a singular system is not finite.
+    """
     size = len(right)
     for i in range(size):
         for j in range(i + 1):
@@ -175,7 +178,7 @@ def _solve(matrix: NDArray[Any], right: NDArray[Any]) -> None:
             for k in range(j):
                 value -= matrix[i, k] * matrix[j, k]
             if i == j:
-                matrix[i, i] = np.sqrt(max(value, 1e-30))
+                matrix[i, i] = np.sqrt(value)
             else:
                 matrix[i, j] = value / matrix[j, j]
     for i in range(size):
@@ -260,7 +263,7 @@ def fit_clusters(
                             for b in range(3):
                                 system[i, j] += gain * basis[a, i] * normal[row, a, b] * basis[b, j]
             prior = damping * per_match * count / 3
-            lever = max(spread / count, 1e-12) / 3
+            lever = spread / count / 3
             for i in range(3):
                 system[i, i] += prior * lever
                 system[3 + i, 3 + i] += prior
@@ -290,9 +293,8 @@ def fit_clusters(
                     for b in range(3):
                         value -= normal[row, a, b] * (places[row - first, b] - points[row, b])
                     left += value * value
-                trace = normal[row, 0, 0] + normal[row, 1, 1] + normal[row, 2, 2]
-                squared = left / max(trace * weight[row], 1e-30)  # in squared pixels
-                reliability[row - first] = 1 / (1 + squared / (OUTLIER_PX * OUTLIER_PX))
+                scale = (normal[row, 0, 0] + normal[row, 1, 1] + normal[row, 2, 2]) * weight[row]
+                reliability[row - first] = scale / (scale + left / (OUTLIER_PX * OUTLIER_PX)) if scale > 0 else 0.0
         moved = 0.0
         for row in range(first, last):
             for a in range(3):
@@ -302,7 +304,7 @@ def fit_clusters(
                         * normal[row, a, b]
                         * (places[row - first, b] - points[row, b])
                     )
-        if moved > smallest * smallest * pixels and quaternion[0] > 0.1:
+        if moved > smallest * smallest * pixels and quaternion[0] > 0.1:  # false for a motion that is not finite
             for axis in range(3):
                 turns[cluster, axis] = quaternion[1 + axis] / quaternion[0]
         else:

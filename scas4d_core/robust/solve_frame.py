@@ -49,8 +49,8 @@ from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 LADDER = (
-    AttemptOptions("smaller steps", rates=0.3, cold=True),
-    AttemptOptions("rigid layers only", rates=0.3, rigid=True, freeze_colours=True, cold=True),
+    AttemptOptions("smaller steps", rates=0.3, cold=True, match_patches=False),
+    AttemptOptions("rigid layers only", rates=0.3, rigid=True, freeze_colours=True, cold=True, match_patches=False),
 )
 """Options of additional attempts, which are made in order until the resulting state is plausible."""
 
@@ -242,7 +242,12 @@ class FrameSolver:
         return template is AS_CONFIGURED and first and given.end is None and self._settings.cold_start_iterations > 1
 
     def _run_one_order(self, given: UpdateInput, seed: int, layer_rate_factor: float) -> OrderResult:
-        options = replace(self._options(given, AS_CONFIGURED), several_orders=True, layer_rate_factor=layer_rate_factor)
+        options = replace(
+            self._options(given, AS_CONFIGURED),
+            several_orders=True,
+            layer_rate_factor=layer_rate_factor,
+            match_patches=seed == given.seed,  # the orders start differently, because matches may be wrong
+        )
         result = self._run(replace(given, seed=seed), given.state, None, options)
         result, fault = self._check_plausible(given, given.state, result)
         with self._time_checks():

@@ -56,7 +56,8 @@ class FrameUpdate:
         self.settings, self.hierarchy = built.update, built.hierarchy
         self._engine, self.plan, self._parts, self._factory = engine, built.plan, built.parts, built.factory
         freedom = self.plan.freedom
-        self._matches = self.settings.match_patches and freedom.cluster_rotation and freedom.cluster_translation
+        free = freedom.cluster_rotation and freedom.cluster_translation and freedom.prediction
+        self._matches = self.settings.match_patches and free
         rates = Rates.of(self.settings, len(self.hierarchy.sizes), self._factory.rig.reach)
         self._rates = rates.restricted_to(freedom)
         engine.bind(self.plan, structure_of(self.hierarchy, neighbours, built.first))
@@ -94,7 +95,7 @@ class FrameUpdate:
         engine.load_state(previous)
         best = BestState(probes, engine, self.hierarchy, motion, seconds, settings.momentum)
         tables = best.start(options.step)
-        if self._matches and best.is_far(options.reference_errors, FAR):
+        if self._matches and options.match_patches and best.is_far(options.reference_errors, FAR):
             expected = engine.state(learnt=False)
             matched = matched_start(tables, previous, expected, self.hierarchy, views, self._factory, engine.renderer)
             tables = best.start_from(tables, matched, GAIN)

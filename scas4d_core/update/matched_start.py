@@ -39,8 +39,8 @@ POINTS = 24
 """Number of points per cluster of the coarsest layer. Finer clusters would have too few matches."""
 SIDE = 120
 """Shorter side of the small images in pixels, at least, unless images are smaller; at most twice as many."""
-SMALLEST_SIDE = 16
-"""Shorter side below which images are not matched, because the coarsest level of their pyramid has only 4 pixels."""
+SMALLEST_SIDE = 96
+"""Shorter side below which images are not matched. With 64 pixels, matches moved the result by up to −1.8 dB."""
 TOLERANCE = 0.02
 """Depth behind the rendered surface up to which a point is visible, in units of the extent."""
 COVERED = 0.5

@@ -71,6 +71,7 @@ class AttemptOptions:
         iteration_factor: factor on the number of iterations.
         several_orders: whether the attempt is one of several in different view orders, of which the best is used.
         layer_rate_factor: factor on the layers' rates without a previous motion.
+        match_patches: whether the attempt may start from patch matches, if the settings allow it.
         stopping: rule that decides the number of iterations, or None for the number in the settings.
         gate: function that selects cameras to exclude, or None to exclude no cameras. Called once all cameras have been
             rendered.
@@ -93,6 +94,7 @@ class AttemptOptions:
     iteration_factor: float = 1.0
     several_orders: bool = False
     layer_rate_factor: float = 1.0
+    match_patches: bool = True
     stopping: Stopping | None = None
     gate: Gate | None = None
     compare: bool = False

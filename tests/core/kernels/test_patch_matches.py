@@ -251,8 +251,10 @@ def test_small_motions_and_clusters_without_matches_rest() -> None:
     assert not turns.any()
     turns, before, after = followed(points, points + 4 * shift, [0, 40], INFORMATION)
     np.testing.assert_allclose(after - before, [4 * shift], atol=1e-4)
-    turns, before, after = followed(points, points + 1, [0, 40], np.zeros((3, 3)))
-    np.testing.assert_array_equal(after, before)
+    for few, information in ((points, np.zeros((3, 3))), (points[:1], INFORMATION), (points[:0], INFORMATION)):
+        turns, before, after = followed(few, few + 1, [0, len(few)], information)
+        np.testing.assert_array_equal(after, before)  # also without information, and with one point
+        assert not turns.any()
 
 
 def test_damping_holds_a_cluster_back() -> None:

@@ -120,7 +120,7 @@ def test_larger_images_are_matched_at_a_smaller_size_and_tiny_images_are_not() -
     start, found = start_of(FAR, Tables.identity(HIERARCHY), large)
     assert found is not None
     assert np.median(distance(start, FAR)) < 0.1 * np.median(distance(BOX, FAR))
-    tiny = Rig(tuple(look_at(camera.name, camera.centre, focal=16, size=12) for camera in RIG.cameras))
+    tiny = Rig(tuple(look_at(camera.name, camera.centre, focal=80, size=64) for camera in RIG.cameras))
     assert start_of(FAR, Tables.identity(HIERARCHY), tiny)[1] is None
 
 

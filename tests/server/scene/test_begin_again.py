@@ -344,6 +344,7 @@ ADDRESSES = {
     "/exports/{export}": [],  # of the reconstruction before they are gone (test_exports.py)
     "/exports/{export}/file": [],
     "/parts": ["/parts", "/parts?count=2"],
+    "/joints": ["/joints", "/joints?count=2&from=0&to=0"],
     "/render": [
         "/render",
         "/render?frame=0",

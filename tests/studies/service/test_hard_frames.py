@@ -8,7 +8,7 @@ from studies.hard_frames.footage import SyntheticFootage
 from studies.service import hard_frames as stability
 
 SIZES = {"all black": 3, "jumps": 1}
-"""Part of the name of each case, and the number of its sizes: one whose frames are rejected, and one that is searched.
+"""Part of the name of each case, and the number of its sizes: one whose frames are rejected, and one that is followed.
 `tests/studies/hard_frames` runs all cases without the service."""
 
 
@@ -19,7 +19,7 @@ def test_cases_through_the_service(tmp_path: Path) -> None:
     assert [(line.case.name, line.size, line.violations) for line in lines if line.violations] == []
     by_case = {case: stability.table([line for line in lines if case in line.case.name]) for case in SIZES}
     assert "previous state kept" in by_case["all black"]
-    assert "search" in by_case["jumps"]
+    assert "as set" in by_case["jumps"]
 
 
 def test_a_footage_turns_round_at_both_ends() -> None:

@@ -174,7 +174,7 @@ def test_a_frame_uploads_at_most_a_twentieth_beside_its_images(monkeypatch: pyte
         {
             "device": "gpu",
             "scene": {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)},
-            "update": {"iterations": 3, "stop_gain": 0, "skip_tolerance": 0},
+            "update": {"iterations": 3, "stop_gain": 0, "skip_tolerance": 0, "match_patches": False},
             "effects": {"prediction": "on"},  # uploads the motion of the previous frame
         }
     )
