@@ -193,7 +193,7 @@ class PartAsset:
             motions[np.searchsorted(frames, keys.frames)] = keys.motions
             tracks.append(PartTrack(part, motions, np.zeros(len(frames)), *self._motion.points(part)))
         extras = {}
-        for joint in find_joints([track for track in tracks if len(track.points)], self._motion.extent):
+        for joint in find_joints(tracks, self._motion.extent):
             metres = self._world.metres_per_unit
             parent, child = self._keys.get(joint.parent), self._keys[joint.child]
             centre = HALF_TURN @ joint.centres[0] * metres - (0 if parent is None else parent.positions[0])

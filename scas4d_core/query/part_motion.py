@@ -51,7 +51,6 @@ class PartPose:
     rotation: Float
     position: Float
     residual: float
-
     origin: Float
 
     @property

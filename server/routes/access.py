@@ -58,6 +58,13 @@ TheScene = Annotated[Scene, Depends(_scene)]
 TheRecord = Annotated[Scene, Depends(_record)]
 """Scene for routes that do not need its processes; it is loaded from its folder even if no slot is free."""
 FrameIndex = Annotated[int, Path(ge=0, le=1_000_000_000)]
+FirstFrame = Annotated[
+    int | None, params.Query(alias="from", ge=0, description="First frame; the first committed frame by default.")
+]
+LastFrame = Annotated[
+    int | None,
+    params.Query(alias="to", ge=0, description="Last frame, inclusive; the last committed frame by default."),
+]
 
 
 def known(route: APIRoute) -> list[str]:

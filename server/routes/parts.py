@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from client.wire import JointsModel, PartsModel
 from server.problems import Problem, count_noun
 from server.processes.queries import JointsQuery, PartsQuery
-from server.routes.access import TheScene, ask
+from server.routes.access import FirstFrame, LastFrame, TheScene, ask
 
 router = APIRouter(prefix="/v1/scenes", tags=["parts"])
 
@@ -40,12 +40,8 @@ async def joints(
     count: Annotated[
         int | None, Query(ge=1, le=32, description="Number of parts; by default chosen automatically.")
     ] = None,
-    first: Annotated[
-        int | None, Query(alias="from", ge=0, description="First frame; the first committed frame by default.")
-    ] = None,
-    last: Annotated[
-        int | None, Query(alias="to", ge=0, description="Last frame, inclusive; the last committed frame by default.")
-    ] = None,
+    first: FirstFrame = None,
+    last: LastFrame = None,
 ) -> Response:
     """Returns the joints between parts, found from their motion over all frames, with their values in some frames."""
     frames = scene.committed_range(first, last, "from")

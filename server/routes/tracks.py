@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from client.wire import TracksModel, TracksRequest
 from server.problems import Problem
 from server.queries.tracks import tracks_query
-from server.routes.access import TheScene, ask
+from server.routes.access import FirstFrame, LastFrame, TheScene, ask
 from server.scene.scene import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
@@ -40,12 +40,8 @@ async def tracks(
     at: Annotated[
         int | None, Query(ge=0, description="Frame of the pixels or points; the first committed frame by default.")
     ] = None,
-    first: Annotated[
-        int | None, Query(alias="from", ge=0, description="First frame; the first committed frame by default.")
-    ] = None,
-    last: Annotated[
-        int | None, Query(alias="to", ge=0, description="Last frame, inclusive; the last committed frame by default.")
-    ] = None,
+    first: FirstFrame = None,
+    last: LastFrame = None,
     project: Annotated[Many, Query(max_length=64, description="Cameras to project the tracks into.")] = None,
     format: Literal["json", "npz"] = "json",
 ) -> Response:
