@@ -172,7 +172,9 @@ def export(
     ],
     format: Annotated[
         str | None,
-        typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; see docs/exports.md."),
+        typer.Option(
+            help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses, tapvid-mv or s4d; see docs/exports.md."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -183,7 +185,8 @@ def export(
     ] = None,
     frames: Annotated[str | None, typer.Option(metavar="A:B", help="First and last frame, inclusive.")] = None,
     ids: Annotated[
-        list[int] | None, typer.Option("--id", help="Export only this Gaussian (tracks only). May be repeated.")
+        list[int] | None,
+        typer.Option("--id", help="Export only this Gaussian (tracks and tapvid-mv). May be repeated."),
     ] = None,
     rate: Annotated[
         float | None,

@@ -29,7 +29,7 @@ def export(
             output is named after the source and format. It is written next to the source or, for a scene, to the
             current folder.
         frames: inclusive range `A:B`, where A or B may be omitted; None for all frames.
-        ids: ids of the Gaussians to export in the `tracks` format.
+        ids: ids of the Gaussians to export, for formats that accept them.
         rate: frame rate of a source that consists of numbered files; None for the default of 30 frames per second.
         url: service URL.
         token: access token for the service.
@@ -37,14 +37,14 @@ def export(
     Raises:
         InputError: if the source, format, range or output is invalid.
     """
-    from scas4d_core.exports.formats import WITH_PARTS, check_suffix, format_of
+    from scas4d_core.exports.formats import WITH_PARTS, check_suffix, format_of, formats_with_ids
     from scas4d_core.exports.sequence import export_sequence, other_frames
 
     wanted = format_of(format)
     low, high = frame_range(frames)
-    if ids and format != "tracks":
+    if ids and not wanted.accepts_ids:
         raise InputError(
-            f"id cannot be used with format {format!r}", "omit --id; it selects Gaussians for the tracks format"
+            f"id cannot be used with format {format!r}", f"omit --id, or use {' or '.join(formats_with_ids())}"
         )
     if out is not None and not wanted.numbered:
         check_suffix(out, wanted)
@@ -72,6 +72,8 @@ def export(
         parts = given.parts() if with_parts else None
         if wanted.needs_parts and parts is None:
             raise InputError(f"{source} has no parts, but format {format!r} requires them", "use a source with parts")
+        if wanted.needs_rig and given.head.rig is None:
+            raise InputError(f"{source} has no cameras, but format {format!r} requires them", "use a source with a rig")
         paths = export_sequence(
             given.states(low, high),
             format,

@@ -2,7 +2,7 @@
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Pixel, Row3, Row4
 from client.wire.budgets import Budget, EffectiveBudget, SceneBudget
-from client.wire.exports import ExportFormat, ExportList, ExportModel, ExportRequest, ExportState
+from client.wire.exports import WITH_IDS, ExportFormat, ExportList, ExportModel, ExportRequest, ExportState
 from client.wire.frames import (
     FINISHED,
     AlarmModel,
@@ -71,6 +71,7 @@ __all__ = [
     "FRAME_MEDIA_TYPE",
     "MAX_CAMERAS",
     "MAX_PIXELS_A_SIDE",
+    "WITH_IDS",
     "AlarmModel",
     "Budget",
     "CalibrationModel",

@@ -15,7 +15,7 @@ MOST_IDS = 10_000
 LARGEST_ID = 2**63 - 1
 LAST_FRAME = 1_000_000_000
 
-ExportFormat = Literal["ply", "splat", "spz", "spz4", "glb", "glb-parts", "usd", "tracks", "poses", "s4d"]
+ExportFormat = Literal["ply", "splat", "spz", "spz4", "glb", "glb-parts", "usd", "tracks", "poses", "tapvid-mv", "s4d"]
 """Format names from `scas4d_core.exports.FORMATS`, repeated here to avoid importing it."""
 SUFFIXES: Mapping[str, str] = MappingProxyType(
     {
@@ -24,10 +24,13 @@ SUFFIXES: Mapping[str, str] = MappingProxyType(
         "usd": ".usdc",
         "tracks": ".csv",
         "poses": ".csv",
+        "tapvid-mv": ".zip",
         "s4d": ".s4d",
     }
 )
 """File suffix of each format; numbered files are packed into a single .zip."""
+WITH_IDS = ("tracks", "tapvid-mv")
+"""Formats for which Gaussians can be selected by their ids."""
 FrameNumber = Annotated[int, Field(strict=True, ge=0, le=LAST_FRAME)]
 
 
@@ -52,7 +55,7 @@ class ExportRequest(Model):
     ids: (
         Annotated[list[Annotated[int, Field(ge=0, le=LARGEST_ID)]], Field(min_length=1, max_length=MOST_IDS)] | None
     ) = Field(
-        default=None, description="Ids of the Gaussians to export in the `tracks` format; null for all moving ones."
+        default=None, description="Ids of the Gaussians to export as `tracks` or `tapvid-mv`; null for moving ones."
     )
 
 

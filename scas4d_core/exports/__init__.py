@@ -1,4 +1,4 @@
-"""Exports states to the formats of other tools: splats, glTF, USD and tables."""
+"""Exports states to the formats of other tools: splats, glTF, USD, tables and TAPVid-MV."""
 
 from scas4d_core.exports.formats import FORMATS, Format, format_of
 from scas4d_core.exports.sequence import export_sequence

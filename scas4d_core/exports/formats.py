@@ -24,7 +24,8 @@ class Format:
         name: name used to select the format.
         suffixes: file suffixes; the first is used for numbered files.
         numbered: whether a sequence is written as one numbered file per frame instead of a single file.
-        needs_parts: whether the format requires parts.
+        needs_parts, needs_rig: whether the format requires parts, or the cameras of the rig.
+        accepts_ids: whether the Gaussians to export can be selected by their ids.
         axes, unit: axes and unit of positions.
         colour: colour space and encoding.
         scale, opacity: encoding, such as linear, logarithm or logit.
@@ -46,6 +47,8 @@ class Format:
     ids: str
     lost: str
     needs_parts: bool = False
+    needs_rig: bool = False
+    accepts_ids: bool = False
     package: str = ""
 
 
@@ -145,6 +148,7 @@ _FORMATS = (
         shape="–",
         ids="column `id`",
         lost="everything except the centres of moving Gaussians",
+        accepts_ids=True,
     ),
     Format(
         name="poses",
@@ -159,6 +163,21 @@ _FORMATS = (
         ids="–",
         lost="everything except the rigid motion of the parts",
         needs_parts=True,
+    ),
+    Format(
+        name="tapvid-mv",
+        suffixes=(".zip",),
+        numbered=False,
+        axes=USER_AXES,
+        unit="metre",
+        colour="rendered images, JPEG",
+        scale="–",
+        opacity="–",
+        shape="–",
+        ids="lost",
+        lost="everything except the centres of up to 500 moving Gaussians, their visibility, images and depth",
+        needs_rig=True,
+        accepts_ids=True,
     ),
     Format(
         name="s4d",
@@ -196,6 +215,15 @@ def format_of(name: str) -> Format:
     if name not in FORMATS:
         raise InputError(f"unknown format {name!r}", f"choose from {', '.join(FORMATS)}")
     return FORMATS[name]
+
+
+def formats_with_ids() -> list[str]:
+    """Returns the names of the formats for which Gaussians can be selected by their ids.
+
+    >>> formats_with_ids()
+    ['tracks', 'tapvid-mv']
+    """
+    return [name for name, each in FORMATS.items() if each.accepts_ids]
 
 
 def check_suffix(path: Path, format: Format) -> None:

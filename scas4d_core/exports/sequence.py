@@ -79,20 +79,21 @@ def export_sequence(
         out: output path: a folder (created if missing) or ``.zip`` for numbered files, otherwise a file with the
             format's suffix.
         world: transform from the user's world to the internal world.
-        rig: rig in the user's world; used by USD and ``s4d``.
+        rig: rig in the user's world; used by USD and ``s4d``, and required for ``tapvid-mv``.
         parts: [N] part label of each Gaussian, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
-        ids: ids of the Gaussians to write for ``tracks``, or None for all moving Gaussians.
+        ids: ids of the Gaussians to write for ``tracks`` and ``tapvid-mv``. If None, ``tracks`` contains all moving
+            Gaussians, and ``tapvid-mv`` up to 500.
         frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None,
             the rate of the time codes is derived from the first two frames.
-        background: background colour, RGB in [0, 1]; stored only by ``s4d``.
+        background: background colour, RGB in [0, 1]; used by ``s4d`` and ``tapvid-mv``.
         progress: function called after each frame.
 
     Returns:
         The paths of the numbered files, or of the single file.
 
     Raises:
-        InputError: if the format is unknown, there is no frame, parts or a package are missing, the output cannot be
-            written, or Gaussians cannot be exported. Exceptions from ``states`` propagate unchanged.
+        InputError: if the format is unknown, there is no frame, parts, a rig or a package are missing, the output
+            cannot be written, or Gaussians cannot be exported. Exceptions from ``states`` propagate unchanged.
 
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
@@ -107,6 +108,8 @@ def export_sequence(
     target = Path(out)
     if wanted.needs_parts and parts is None:
         raise InputError(f"format {format!r} requires parts, but parts is None", "pass one label per Gaussian")
+    if wanted.needs_rig and rig is None:
+        raise InputError(f"format {format!r} requires cameras, but rig is None", "pass a rig")
     if frames_per_second is not None and not 0 < frames_per_second < float("inf"):
         raise InputError(f"invalid frames_per_second {frames_per_second!r}", "use a positive number or None")
     if not wanted.numbered:
@@ -172,6 +175,11 @@ def _writer(
         return CompactSequence(target, world, rig, parts, frames_per_second, background)
     if wanted.name == "tracks":
         return TrackTable(target, world, ids)
+    if wanted.name == "tapvid-mv":
+        from scas4d_core.exports.tapvid_mv import TapVidMvSequence  # deferred import: only this format renders
+
+        assert rig is not None  # checked by ``export_sequence``
+        return TapVidMvSequence(target, world, rig, ids, background)
     assert parts is not None  # required by the remaining formats
     return PartAsset(target, world, parts) if wanted.name == "glb-parts" else PoseTable(target, world, parts)
 

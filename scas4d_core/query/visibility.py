@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.gaussians import moving_extent
+from scas4d_core.gaussians import Gaussians, moving_extent
 from scas4d_core.query.ray_depth import RAY_SOFTENING, REACH, RaySplats, tile_groups
 from scas4d_core.storage.history import History
 
@@ -58,24 +58,54 @@ def find_visibility(
     >>> find_visibility(history, WorldFrame(np.zeros(3)), points, [0], camera, index=0)
     array([[ True, False,  True]])
     """
+    extent = moving_extent(history.gaussians(index))
+    visible = [
+        visible_points(history.gaussians(int(frame)), world, positions[t], camera, extent, limits)
+        for t, frame in enumerate(indices)
+    ]
+    return np.stack(visible) if visible else np.zeros(positions.shape[:2], np.bool_)
+
+
+def visible_points(
+    gaussians: Gaussians,
+    world: WorldFrame,
+    positions: Float,
+    camera: Camera,
+    extent: float,
+    limits: Limits = DEFAULT,
+) -> NDArray[np.bool_]:
+    """Returns whether points are visible in one frame, [Q] bool; see ``find_visibility``.
+
+    Args:
+        gaussians: state in the internal world.
+        world: transform from the user's world to the internal world.
+        positions: [Q, 3] positions in the user's world.
+        camera: camera in the user's world.
+        extent: extent of the moving Gaussians, in metres.
+        limits: rasterizer constants.
+
+    >>> from scas4d_core.gaussians import Gaussians
+    >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
+    >>> points = np.array([[0, 0, 1.9], [0, 0, 3]])
+    >>> visible_points(state, WorldFrame(np.zeros(3)), points, camera, extent=0.2)
+    array([ True, False])
+    """
     from scas4d_core.kernels.front_transmittance import front_transmittance  # deferred import: it loads the kernels
 
     uv, z = camera.project(positions)
-    inside = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
-    visible = np.zeros(inside.shape, dtype=np.bool_)
-    extent, posed = moving_extent(history.gaussians(index)), world.camera_to_inside(camera)
-    for t, frame in enumerate(indices):
-        rows = np.flatnonzero(inside[t])
-        if not len(rows):
-            continue
-        order, cuts = tile_groups(uv[t, rows])
-        rows = rows[order]
-        splats = RaySplats(history.gaussians(int(frame)), posed, uv[t, rows], limits, RAY_SOFTENING * extent)
-        front = z[t, rows] * world.metres_per_unit - OWN_SURFACE * extent
-        starts, transmittance = np.concatenate([[0], cuts, [len(rows)]]), np.empty(len(rows))
-        shapes = splats.centre, splats.half, splats.conic, splats.peak, splats.means, splats.precision, splats.spread
-        arrays = [np.ascontiguousarray(array) for array in (*shapes, np.concatenate(splats.lens), uv[t, rows], front)]
-        constants = limits.alpha_cap, limits.alpha_floor, REACH, MIN_TRANSMITTANCE
-        front_transmittance(*arrays, starts, *constants, transmittance)
-        visible[t, rows] = transmittance >= MIN_TRANSMITTANCE
+    visible = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
+    rows = np.flatnonzero(visible)
+    if not len(rows):
+        return visible
+    order, cuts = tile_groups(uv[rows])
+    rows = rows[order]
+    splats = RaySplats(gaussians, world.camera_to_inside(camera), uv[rows], limits, RAY_SOFTENING * extent)
+    front = z[rows] * world.metres_per_unit - OWN_SURFACE * extent
+    starts, transmittance = np.concatenate([[0], cuts, [len(rows)]]), np.empty(len(rows))
+    shapes = splats.centre, splats.half, splats.conic, splats.peak, splats.means, splats.precision, splats.spread
+    arrays = [np.ascontiguousarray(array) for array in (*shapes, np.concatenate(splats.lens), uv[rows], front)]
+    constants = limits.alpha_cap, limits.alpha_floor, REACH, MIN_TRANSMITTANCE
+    front_transmittance(*arrays, starts, *constants, transmittance)
+    visible[rows] = transmittance >= MIN_TRANSMITTANCE
     return visible

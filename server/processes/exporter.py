@@ -101,7 +101,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
         def progress(_: int, done: int) -> None:
             connection.send(ExportProgressed(done, size_of(folder)))
-            twice = size_of(folder) if spec.format == "usd" else 0  # USD is written a second time at the end
+            twice = size_of(folder) if spec.format in ("usd", "tapvid-mv") else 0  # written again at the end
             if (free := free_bytes(folder) - twice) < RESERVE_BYTES:
                 raise DiskReserveError(
                     f"{free / 1e6:.0f} MB are free, but {RESERVE_BYTES / 1e6:.0f} MB are reserved for frames"

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 
-from client.wire import ExportList, ExportModel, ExportRequest, ExportState
+from client.wire import WITH_IDS, ExportList, ExportModel, ExportRequest, ExportState
 from server.http.immutable import immutable_file_response
 from server.problems import Problem
 from server.routes.access import AllExports, SceneId, TheRecord
@@ -31,13 +31,13 @@ async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, r
     The service runs one export at a time, in a separate low-priority process, so that updates and views have priority.
     A scene can have up to 8 exports. Files are kept for one day, but not across restarts of the service.
     """
-    if request.ids is not None and request.format != "tracks":
+    if request.ids is not None and request.format not in WITH_IDS:
         raise Problem(
             422,
             f"format {request.format!r} does not support ids",
             field="ids",
             value=request.ids,
-            remedy="omit ids, or use format 'tracks'",
+            remedy=f"omit ids, or use format {' or '.join(map(repr, WITH_IDS))}",
         )
     frames = scene.committed_range(request.first, request.last, "first")
     made = exports.begin(scene, request, frames).model()

@@ -43,6 +43,11 @@ BYTES_PER_GAUSSIAN = {"ply": 68, "splat": 32, "spz": 20, "spz4": 20, "glb": 70, 
 
 Writing USD temporarily takes twice as much space.
 """
+BYTES_PER_PIXEL = {"tapvid-mv": 5}
+"""Approximate bytes per pixel, frame and camera of formats with images.
+
+Writing them temporarily takes twice as much space.
+"""
 MEDIA_TYPES = {".zip": "application/zip", ".glb": "model/gltf-binary", ".csv": "text/csv"}
 FINAL_STATES = frozenset({ExportState.DONE, ExportState.FAILED, ExportState.CANCELLED})
 
@@ -215,10 +220,12 @@ class Exports:
                 remedy=f"remove one with DELETE /v1/scenes/{id}/exports/EXPORT, such as {kept[0].id}",
             )
         parent = self._folder.parent
-        needed = (
-            BYTES_PER_GAUSSIAN.get(request.format, 0) * frames * (scene.status().gaussians or 0)
-            + exporter.RESERVE_BYTES
+        pixels = sum(camera.width * camera.height for camera in scene.rig.cameras)
+        per_frame = (
+            BYTES_PER_GAUSSIAN.get(request.format, 0) * (scene.status().gaussians or 0)
+            + BYTES_PER_PIXEL.get(request.format, 0) * pixels
         )
+        needed = per_frame * frames + exporter.RESERVE_BYTES
         if (free := free_bytes(parent)) < needed:
             raise Problem(
                 507,

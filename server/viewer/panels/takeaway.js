@@ -8,7 +8,7 @@ const SELDOM_MS = 30_000; // maximum delay after errors, each of which doubles i
 const UNDER_WAY = ["waiting", "running"];
 const NAMES = {
   ply: "3DGS .ply", splat: ".splat", spz: "SPZ", spz4: "SPZ 4", glb: "glTF", "glb-parts": "glTF, moving parts",
-  usd: "USD", tracks: "Tracks", poses: "Poses of parts", s4d: "Compact 4D file",
+  usd: "USD", tracks: "Tracks", poses: "Poses of parts", "tapvid-mv": "TAPVid-MV", s4d: "Compact 4D file",
 };
 
 /** Formats a number of bytes, such as 3.1 MB. */

@@ -35,9 +35,8 @@ def states(count=3, first=12):
 
 
 def exported(out, format, given=None, **about):
-    return export_sequence(
-        states() if given is None else given, format, out, world=corner.WORLD, parts=moving.LABELS, **about
-    )
+    about = {"world": corner.WORLD, "parts": moving.LABELS, "rig": corner.rig(), **about}
+    return export_sequence(states() if given is None else given, format, out, **about)
 
 
 def names(folder):
@@ -69,7 +68,7 @@ def test_numbered_files_in_a_zip(tmp_path, format):
 @pytest.mark.parametrize("format", WHOLE)
 def test_one_file(tmp_path, format):
     out = tmp_path / f"a{FORMATS[format].suffixes[0]}"
-    assert exported(out, format, rig=corner.rig(), frames_per_second=25) == [out]
+    assert exported(out, format, frames_per_second=25) == [out]
     assert names(tmp_path) == [out.name]
     assert out.stat().st_size > 100
 
@@ -157,6 +156,8 @@ def test_what_is_refused(tmp_path):
     for format in ("glb-parts", "poses"):
         with pytest.raises(InputError, match=f"format '{format}' requires parts, but parts is None; pass one label"):
             export_sequence(states(), format, tmp_path / "a.glb", world=corner.WORLD)
+    with pytest.raises(InputError, match=r"format 'tapvid-mv' requires cameras, but rig is None; pass a rig"):
+        exported(tmp_path / "a.zip", "tapvid-mv", rig=None)
     with pytest.raises(InputError, match=r"out '.*a\.glb' has the wrong suffix for format 'usd'; use \.usdc"):
         exported(tmp_path / "a.glb", "usd")
     with pytest.raises(InputError, match=r"invalid frames_per_second 0; use a positive number or None"):
