@@ -8,7 +8,7 @@ docs/stability.md shows the distributions.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isnan, log, nan
 from typing import NamedTuple
@@ -16,9 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome, degraded_text
 from scas4d_core.kernels.pictures import row_differences
-from scas4d_core.robust.outliers import LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
+from scas4d_core.robust.confirmed_errors import ShiftedRegion
+from scas4d_core.robust.outliers import CAMERA_FIGURES, LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
 from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
@@ -27,9 +29,20 @@ first value applies to two consecutive frames, and the second to a single frame.
 GAIN = (0.15, 0.25)
 """Same as ``TINT``, but for the common deviation of all channels. Clean captures reach 0.09, when a sheet is seen
 edge-on."""
+JUMP = 0.12
+"""Maximum change of a camera's estimated gain from one frame to the next, as a logarithm. Drifting gains change by at
+most 0.05. If gains are estimated (effect ``camera_gain``), ``TINT`` and ``GAIN`` do not see a change of the camera."""
 SPREAD = 4.0
-"""``TINT`` and ``GAIN`` are raised to at least this multiple of the median deviation over the cameras of the frame.
-If all cameras fit badly, as on small images, colours are unreliable."""
+"""``TINT``, ``GAIN`` and ``JUMP`` are raised to at least this multiple of the median deviation over the cameras of the
+frame. If all cameras fit badly, as on small images, colours are unreliable."""
+BRIGHTNESS = 0.005
+"""Minimum deviation of an image's mean brightness, [0, 1], in ``DIRT_ROW`` consecutive frames, after which the image is
+searched for dirt. Clean captures reach 0.004, and dirt that adds 20% white to a ninth of the image causes 0.005 to
+0.02."""
+DIRT_ROW = 3
+"""Number of consecutive frames in which the brightness must deviate in the same direction."""
+DIRT_SHARE = 0.03
+"""Minimum size of a region that is brighter or darker than the state, as a share of the image."""
 SHARPNESS = (0.12, 0.2)
 """Same as ``TINT``, but for the deviation of the log sharpness. Clean captures reach 0.07, and a blur of one pixel
 causes 0.42."""
@@ -54,31 +67,39 @@ class CameraFigures:
 
     Attributes:
         colours: [3] usual value of ``colours_of`` minus the median over cameras; NaN if unknown.
+        gains: [3] log gains before they jumped, minus the median over cameras; NaN if they have not jumped.
         sharp: usual value of ``sharpness_of``; NaN if unknown.
+        light: usual mean difference between the image and its rendering, minus the median over cameras; NaN if
+            unknown.
         misfit, tint, gain, blur: numbers of consecutive suspect frames.
+        dirt: number of consecutive frames in which ``light`` deviates; negative if the image is darker.
         same: number of consecutive frames in which the image was repeated.
     """
 
     colours: tuple[float, float, float] = (nan, nan, nan)
+    gains: tuple[float, float, float] = (nan, nan, nan)
     sharp: float = nan
+    light: float = nan
     misfit: int = 0
     tint: int = 0
     gain: int = 0
     blur: int = 0
+    dirt: int = 0
     same: int = 0
 
     @classmethod
     def of(cls, past: Past, name: str) -> CameraFigures:
         """Returns a camera's figures from a row created by ``row``, or the defaults if there is no row."""
         row = past.camera_figures.get(name)
-        if row is None:
+        if row is None or len(row) != CAMERA_FIGURES:  # written by an earlier version
             return cls()
-        red, green, blue, sharp, *counts = row
-        return cls((red, green, blue), sharp, *(int(count) for count in counts))
+        red, green, blue, *gains, sharp, light = row[:8]
+        return cls((red, green, blue), (gains[0], gains[1], gains[2]), sharp, light, *map(int, row[8:]))
 
     def row(self) -> tuple[float, ...]:
         """Returns the figures as a row of ``Past.camera_figures``."""
-        return (*self.colours, self.sharp, self.misfit, self.tint, self.gain, self.blur, self.same)
+        counts = self.misfit, self.tint, self.gain, self.blur, self.dirt, self.same
+        return (*self.colours, *self.gains, self.sharp, self.light, *counts)
 
 
 def alarms_of(
@@ -90,6 +111,9 @@ def alarms_of(
     exposure: float,
     offsets: Mapping[str, float],
     colours: Mapping[str, Numbers],
+    gains: tuple[Mapping[str, Numbers], Mapping[str, Numbers]],
+    lights: Mapping[str, float],
+    shifted: Callable[[str], ShiftedRegion],
     sharp: Mapping[str, float],
     same: Collection[str],
     left_out: Collection[str] = (),
@@ -103,6 +127,9 @@ def alarms_of(
         exposure: ratio of the frame's brightness to the usual brightness.
         offsets: offset of each camera above (+) or below its usual fit, in dB.
         colours: ``colours_of`` for each rendered camera.
+        gains: ``log_gains`` before and after the update.
+        lights: ``mean_differences`` for each rendered camera.
+        shifted: function that returns the ``shifted_region`` of a camera's image.
         sharp: ``sharpness_of`` for each image of the frame.
         same: names of the cameras whose image is bit-identical to the previous one.
         left_out: names of the excluded cameras, for which ``left_out_alarms`` returns the alarms.
@@ -112,6 +139,7 @@ def alarms_of(
     if outcome.rejected or not offsets:
         return found, after  # there is nothing to compare the cameras with
     watch, raised = dict(after.camera_figures), dict[AlarmKind, dict[str, Alarm]]()
+    middle = float(np.median(list(lights.values()))) if lights else 0.0
     beside, watches = _minus_median(colours), {name: CameraFigures.of(past, name) for name in sharp}
     changes = {name: value - watches[name].sharp for name, value in sharp.items()}
     common = float(np.nanmedian(list(changes.values()))) if not np.isnan(list(changes.values())).all() else 0.0
@@ -123,14 +151,16 @@ def alarms_of(
         _upper_median(shift.odd_channel for shift in shifts.values()),
         _upper_median(shift.common for shift in shifts.values()),
     )
+    jumps = _gain_jumps(watches, *map(_minus_median, gains)) if allowed(past) == 0 else {}
     for name, before in watches.items():
         now, alarms = _check_camera(
             name, before, past, offsets.get(name), shifts.get(name), sharp[name], changes[name] - common,
-            few_same and name in same, spread,
+            few_same and name in same, spread, lights[name] - middle if name in lights else None, shifted,
         )  # fmt: skip
-        watch[name] = now.row()
+        kept, jump = jumps.get(name, (now.gains, None))
+        watch[name] = replace(now, gains=kept).row()
         if name not in left_out:
-            for alarm in alarms:
+            for alarm in [*alarms, *([jump] if jump is not None else [])]:
                 raised.setdefault(alarm.kind, {})[name] = alarm
     found += [alarm for of_kind in raised.values() for alarm in unless_most(of_kind, count).values()]
     return found, replace(after, camera_figures=watch)
@@ -146,6 +176,8 @@ def _check_camera(
     sharper: float,
     same: bool,
     spread: tuple[float, float],
+    light: float | None,
+    shifted: Callable[[str], ShiftedRegion],
 ) -> tuple[CameraFigures, list[Alarm]]:
     """Returns a camera's figures for the next frame, and its alarms.
 
@@ -159,6 +191,8 @@ def _check_camera(
         sharper: change from the usual sharpness, relative to the other cameras.
         same: whether the image is unchanged while those of other cameras have changed.
         spread: median tint and gain deviations over the cameras.
+        light: mean difference between the image and its rendering, relative to the other cameras, or None if unknown.
+        shifted: function that returns the ``shifted_region`` of a camera's image.
     """
     # With one copy of the dataclass per figure, the copies would take longer than the checks.
     colours, usual_sharp, misfit, tint_frames, gain_frames, blur = (
@@ -199,6 +233,24 @@ def _check_camera(
         if not tint_frames and not gain_frames:
             red, green, blue = (shift.usual + FOLLOWS * change).tolist()
             colours = (red, green, blue)
+    usual_light, dirt = before.light, before.dirt
+    if light is not None:
+        brighter = 0.0 if isnan(usual_light) else light - usual_light
+        sign = 1 if brighter > 0 else -1
+        dirt = max(sign * dirt, 0) + 1 if abs(brighter) > BRIGHTNESS else 0
+        if dirt >= DIRT_ROW and not alarms:
+            region = shifted(name)
+            if region.share >= DIRT_SHARE and sign * region.level > 0:
+                text = (
+                    f"{100 * region.share:.0f}% of its image is {100 * abs(region.level):.0f}% of full brightness "
+                    f"{'brighter' if sign > 0 else 'darker'} than the other cameras suggest; check the lens for dirt"
+                )
+                alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
+            else:  # something else has changed, and the image becomes the usual one
+                usual_light, dirt = light, 0
+        elif not dirt:
+            usual_light = light if isnan(usual_light) else usual_light + FOLLOWS * brighter
+        dirt *= sign
     if not isnan(sharper):
         blur = before.blur + 1 if abs(sharper) > SHARPNESS[0] else 0
         if abs(sharper) > SHARPNESS[1] or blur >= ROW:
@@ -212,7 +264,43 @@ def _check_camera(
         usual_sharp = sharp
     elif not blur and not isnan(sharp):
         usual_sharp = before.sharp + FOLLOWS * (sharp - before.sharp)
-    return CameraFigures(colours, usual_sharp, misfit, tint_frames, gain_frames, blur, repeats), alarms
+    counts = misfit, tint_frames, gain_frames, blur, dirt, repeats
+    return CameraFigures(colours, before.gains, usual_sharp, usual_light, *counts), alarms
+
+
+Jump = tuple[tuple[float, float, float], Alarm | None]
+"""The gains before a jump, or NaN, and the alarm."""
+
+
+def _gain_jumps(
+    watches: Mapping[str, CameraFigures], before: Mapping[str, Numbers], after: Mapping[str, Numbers]
+) -> dict[str, Jump]:
+    """Compares each camera's gains with those of the previous frame, or with those before it jumped.
+
+    Args:
+        watches: previous figures of the cameras.
+        before, after: log gains before and after the update, minus the median over cameras.
+    """
+    usual = {
+        name: before[name] if isnan(watches[name].gains[0]) else np.array(watches[name].gains)
+        for name in watches
+        if name in before and name in after
+    }
+    changes = {name: after[name] - gains for name, gains in usual.items()}
+    largest = {name: float(np.abs(change).max()) for name, change in changes.items()}
+    limit = max(JUMP, SPREAD * _upper_median(largest.values()))
+    found: dict[str, Jump] = {}
+    for name, size in largest.items():
+        if size <= limit:
+            found[name] = (nan, nan, nan), None
+            continue
+        parts = ", ".join(
+            f"{colour} {100 * part:+.0f}%" for colour, part in zip(COLOURS, np.expm1(changes[name]), strict=True)
+        )
+        text = f"its gain has jumped relative to the other cameras ({parts}); check the exposure and the white balance"
+        red, green, blue = usual[name].tolist()
+        found[name] = (red, green, blue), Alarm(AlarmKind.CAMERA_COLOURS, name, text)
+    return found
 
 
 class ColourChange(NamedTuple):
@@ -280,6 +368,21 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
     shifts = np.array(shift, np.float64)
     rendered: Numbers = np.maximum(np.array(mean, np.float64) - shifts, DARKEST)
     return shifts / rendered
+
+
+def log_gains(views: Iterable[TrainingView]) -> dict[str, Numbers]:
+    """Returns the logarithm of the gain of each view's channels [3], which are sRGB values."""
+    return {view.name: np.log(np.maximum(view.exposure[:3, 0].astype(np.float64), DARKEST)) for view in views}
+
+
+def mean_differences(fits: Mapping[str, CameraFit]) -> dict[str, float]:
+    """Returns the mean difference between each camera's image and its rendering: that of the median channel, [-1, 1].
+
+    >>> mean_differences({"north": {"psnr": 30.0, "colour_shift": (0.1, 0.02, 0.01), "health": 1.0}})
+    {'north': 0.02}
+    """
+    shifts = {name: fit["colour_shift"] for name, fit in fits.items()}
+    return {name: sorted(shift)[1] for name, shift in shifts.items() if shift is not None}
 
 
 def colours_by_camera(fits: Mapping[str, CameraFit], means: Mapping[str, Numbers]) -> dict[str, Numbers]:

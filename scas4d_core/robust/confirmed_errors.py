@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter
+from scipy.ndimage import label, maximum_filter, uniform_filter
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.engines.renderer import Renderer
@@ -56,6 +56,10 @@ AGREE = 0.75
 MOST, PART = 0.4, 0.05
 """Minimum confirmed shares of the squared error in a connected region that confirm the whole region. The first applies
 to the cells that other cameras see at the depth of the object, and the second to all cells."""
+SHIFTED = 0.04
+"""Minimum brightness difference of an image region, in [0, 1], that points to dirt on the lens."""
+SMOOTHED = 4
+"""Size of the window, in cells, over which brightness differences are averaged."""
 
 Array = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -93,16 +97,61 @@ def credited_decibels(
     return credits
 
 
+class ShiftedRegion(NamedTuple):
+    """Region of an image that is brighter or darker than the state.
+
+    Attributes:
+        share: size of the region, as a share of the image.
+        level: mean difference between the image and the state in the region, in [-1, 1].
+    """
+
+    share: float
+    level: float
+
+
+def shifted_region(
+    name: str,
+    views: Sequence[TrainingView],
+    factory: ViewFactory,
+    renderer: Renderer,
+    state: Gaussians,
+) -> ShiftedRegion:
+    """Returns the largest connected region of a camera's image that is brighter, or darker, by more than ``SHIFTED``.
+
+    Errors that other cameras confirm do not count. Dirt on a lens scatters light and causes such a region.
+
+    Args:
+        name: name of the camera, which must have a view.
+        views, factory, renderer, state: see ``credited_decibels``.
+
+    Returns:
+        The region. Its share is 0 if there is none.
+    """
+    errors = {view.name: cell_errors(view, factory, renderer, state) for view in views}
+    own = errors.pop(name)
+    confirmed = confirmed_cells(name, own, errors, factory.posed, ray_depths(factory.posed[name], state))
+    smooth = uniform_filter(np.where(confirmed, 0, own.differences), SMOOTHED, mode="nearest")
+    best = ShiftedRegion(0.0, 0.0)
+    for sign in (1, -1):
+        regions, _ = label(sign * smooth > SHIFTED)
+        sizes = np.bincount(regions.ravel())[1:]
+        if sizes.size and (share := float(sizes.max() / regions.size)) > best.share:
+            best = ShiftedRegion(share, float(smooth[regions == 1 + sizes.argmax()].mean()))
+    return best
+
+
 class CellErrors(NamedTuple):
     """Errors of a state in the cells of an image.
 
     Attributes:
         squares: [h, w] squared error of each cell, as a mean over pixels and RGB.
+        differences: [h, w] mean difference between the image and the state in each cell.
         usual: ``USUAL_PERCENTILE`` of the squared errors of opaque cells, or 0 if there are none.
         edge: edge of a cell, in pixels of the camera.
     """
 
     squares: Array
+    differences: Array
     usual: float
     edge: float
 
@@ -115,10 +164,11 @@ def cell_errors(view: TrainingView, factory: ViewFactory, renderer: Renderer, st
         view = factory.coarser(view, scale)
     features, transmittance = renderer.render(state, view.camera)
     edge = max(SMALLEST, -(-max(transmittance.shape) // CELLS))
-    squares = _cells(np.square(view.target[:LABEL] - view.exposed(features[:LABEL])).mean(axis=0), edge)
+    difference = view.target[:LABEL] - view.exposed(features[:LABEL])
+    squares = _cells(np.square(difference).mean(axis=0), edge)
     opaque = squares[_cells(transmittance, edge) < 0.5]
     usual = float(np.percentile(opaque, USUAL_PERCENTILE)) if len(opaque) else 0.0
-    return CellErrors(squares, usual, edge * full / view.camera.width)
+    return CellErrors(squares, _cells(difference.mean(axis=0), edge), usual, edge * full / view.camera.width)
 
 
 def _cells(plane: Array, edge: int) -> Array:
@@ -165,7 +215,7 @@ def confirmed_cells(
     points = np.concatenate([camera.unproject(uv, np.full(len(uv), depth)) for depth in depths])
     agree, asked = (np.zeros(len(points), np.int64) for _ in range(2))
     least = np.tile(SIMILAR * cells[row, column], len(depths))
-    for other, (squares, _, edge) in others.items():
+    for other, (squares, _, _, edge) in others.items():
         across, down, _, inside = pixels_inside(rig[other], points)
         nearby = maximum_filter(squares, 3)  # a point projects between two cells
         at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)

@@ -20,7 +20,7 @@ from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers, timing
-from scas4d_core.robust.alarms import alarms_of, colours_by_camera
+from scas4d_core.robust.alarms import alarms_of, colours_by_camera, log_gains, mean_differences
 from scas4d_core.robust.checks import (
     EXPOSURE,
     check_plausible,
@@ -28,7 +28,7 @@ from scas4d_core.robust.checks import (
     measure_light_gain,
     with_light_gain,
 )
-from scas4d_core.robust.confirmed_errors import credited_decibels
+from scas4d_core.robust.confirmed_errors import credited_decibels, shifted_region
 from scas4d_core.robust.first_motion import OrderResult, best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shift_moving
@@ -109,10 +109,15 @@ class FrameSolver:
             past = timing.record_timing(
                 past, given.state, result, self._renderer, given.seconds, given.step, given.seed
             )
-        means = {view.name: view.mean for view in result.views or given.views}
+        views = result.views or given.views
+        means = {view.name: view.mean for view in views}
+        used = [view for view in views if view.name not in result.trace.left_out]
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
-            offsets=result.offsets, colours=colours_by_camera(result.trace.cameras, means), same=given.same,
+            offsets=result.offsets, colours=colours_by_camera(result.trace.cameras, means),
+            gains=(log_gains(given.views), log_gains(views)), lights=mean_differences(result.trace.cameras),
+            same=given.same,
+            shifted=lambda name: shifted_region(name, used, self._factory, self._renderer, result.gaussians),
             left_out={*given.left_out, *result.trace.left_out},
         )  # fmt: skip
         fits = {name: outliers.health(given.past, off) for name, off in result.offsets.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from math import isnan, nan
 from pathlib import Path
@@ -14,7 +14,20 @@ import pytest
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.robust import alarms, outliers
-from scas4d_core.robust.alarms import GAIN, SHARPNESS, TINT, CameraFigures, Numbers, alarms_of, left_out_alarms
+from scas4d_core.robust.alarms import (
+    BRIGHTNESS,
+    DIRT_ROW,
+    DIRT_SHARE,
+    GAIN,
+    SHARPNESS,
+    TINT,
+    CameraFigures,
+    Numbers,
+    alarms_of,
+    left_out_alarms,
+    mean_differences,
+)
+from scas4d_core.robust.confirmed_errors import ShiftedRegion
 from scas4d_core.robust.outliers import LAST_DB, NEAR_DB, NEW_DB, Past
 from studies.hard_frames.footage import SyntheticFootage
 
@@ -24,10 +37,14 @@ GREY = {name: np.full(3, 0.01 * k) for k, name in enumerate(NAMES)}
 NONE = dict.fromkeys(NAMES, 0.0)
 
 
+def never(name: str) -> ShiftedRegion:
+    raise AssertionError(f"the image of {name} was searched")
+
+
 def settled(past: Past, **changes: Any) -> tuple[list[Alarm], Past]:
     given: dict[str, Any] = {
         "outcome": FrameOutcome.UPDATED, "reason": "", "exposure": 1.0, "offsets": NONE, "colours": GREY,
-        "sharp": SHARP, "same": (), **changes,
+        "sharp": SHARP, "same": (), "gains": (GREY, GREY), "lights": NONE, "shifted": never, **changes,
     }  # fmt: skip
     return alarms_of(past, past, **given)
 
@@ -160,9 +177,8 @@ def test_a_camera_that_was_left_out_has_that_alarm_alone(past: Past) -> None:
 def test_what_alarms_are_told_from_goes_through_arrays(past: Past) -> None:
     _, past = settled(past, same=["c1"], offsets={**NONE, "c3": NEAR_DB - 1}, sharp={**SHARP, "c4": nan})
     back = Past.of_arrays(past.arrays())
-    assert {name: CameraFigures.of(back, name) for name in NAMES} == {
-        name: CameraFigures.of(past, name) for name in NAMES
-    }
+    for name in NAMES:
+        np.testing.assert_equal(CameraFigures.of(back, name).row(), CameraFigures.of(past, name).row())
     assert (CameraFigures.of(back, "c1").same, CameraFigures.of(back, "c3").misfit) == (1, 1)
     assert len(CameraFigures().row()) == outliers.CAMERA_FIGURES
 
@@ -198,3 +214,99 @@ def test_a_scene_raises_none_and_of_one_camera_in_another_colour_one(tmp_path: P
     report = scene.step(replace(brighter, images=images))
     assert ("light", None) in kinds_of(report.alarms)
     assert {alarm.camera for alarm in report.alarms} <= {None, "c3"}
+
+
+def region_of(*names: str, share: float = 2 * DIRT_SHARE, level: float = 0.1) -> Callable[[str], ShiftedRegion]:
+    return lambda name: ShiftedRegion(share, level) if name in names else never(name)
+
+
+def brighter(amount: float, name: str = "c3") -> dict[str, float]:
+    return {**NONE, name: amount}
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_dirt_raises_an_alarm_in_the_third_frame_and_as_long_as_it_stays(past: Past, sign: int) -> None:
+    found = in_a_row(past, 6, lights=brighter(2 * sign * BRIGHTNESS), shifted=region_of("c3", level=0.1 * sign))
+    assert found == [[]] * (DIRT_ROW - 1) + [[("camera_misfit", "c3")]] * (7 - DIRT_ROW)
+    text = [alarm.evidence for alarm in after_frames(past, DIRT_ROW, brighter(2 * sign * BRIGHTNESS), 0.1 * sign)]
+    assert text == [
+        f"6% of its image is 10% of full brightness {'brighter' if sign > 0 else 'darker'} than the other cameras "
+        "suggest; check the lens for dirt"
+    ]
+
+
+def after_frames(past: Past, frames: int, lights: Mapping[str, float], level: float) -> list[Alarm]:
+    found: list[Alarm] = []
+    for _ in range(frames):
+        found, past = settled(past, lights=lights, shifted=region_of("c3", level=level))
+    return found
+
+
+def test_an_image_is_searched_only_after_three_frames_in_the_same_direction(past: Past) -> None:
+    for amount in (2, 2, -2, 2, 2, 0, -2, -2, 2):
+        found, past = settled(past, lights=brighter(amount * BRIGHTNESS))
+        assert found == []
+    assert in_a_row(past, 6, lights=brighter(0.9 * BRIGHTNESS)) == [[]] * 6
+    assert in_a_row(past, 6, lights=dict.fromkeys(NAMES, 5 * BRIGHTNESS)) == [[]] * 6  # all cameras see it
+
+
+@pytest.mark.parametrize("region", [ShiftedRegion(0.5 * DIRT_SHARE, 0.1), ShiftedRegion(2 * DIRT_SHARE, -0.1)])
+def test_a_change_without_such_a_region_becomes_usual(past: Past, region: ShiftedRegion) -> None:
+    searched: list[str] = []
+
+    def search(name: str) -> ShiftedRegion:
+        searched.append(name)
+        return region
+
+    assert in_a_row(past, 8, lights=brighter(2 * BRIGHTNESS), shifted=search) == [[]] * 8
+    assert searched == ["c3"]
+
+
+def test_a_camera_with_another_alarm_is_not_searched(past: Past) -> None:
+    found = in_a_row(past, 4, lights=brighter(2 * BRIGHTNESS), offsets={**NONE, "c3": LAST_DB - 1})
+    assert found == [[("camera_misfit", "c3")]] * 4
+
+
+def test_figures_of_an_earlier_version_are_unknown(past: Past) -> None:
+    old = replace(past, camera_figures={"c3": past.camera_figures["c3"][:9]})
+    assert CameraFigures.of(old, "c3") == CameraFigures()
+
+
+def test_mean_differences_are_those_of_the_median_channel() -> None:
+    fits: Any = {
+        "a": {"psnr": 30.0, "colour_shift": (0.5, -0.01, 0.02), "health": 1.0},
+        "b": {"psnr": 30.0, "colour_shift": None, "health": 1.0},
+    }
+    assert mean_differences(fits) == {"a": 0.02}
+
+
+def gained(name: str, *change: float) -> dict[str, Numbers]:
+    return {**GREY, name: GREY[name] + np.array(change)}
+
+
+def test_a_gain_that_jumps_raises_an_alarm_until_it_returns(past: Past) -> None:
+    red = gained("c9", 0.22, 0, 0)
+    found, past = settled(past, gains=(GREY, red))
+    assert kinds_of(found) == [("camera_colours", "c9")]
+    assert "its gain has jumped relative to the other cameras (red +25%, green +0%, blue +0%)" in found[0].evidence
+    for _ in range(3):
+        found, past = settled(past, gains=(red, red))
+        assert kinds_of(found) == [("camera_colours", "c9")]
+    found, past = settled(past, gains=(red, GREY))
+    assert found == []
+    assert in_a_row(past, gains=(GREY, GREY)) == [[]] * 4
+
+
+def test_gains_that_drift_and_those_of_all_cameras_raise_none(past: Past) -> None:
+    for step in range(10):
+        found, past = settled(past, gains=(gained("c3", 0.05 * step, 0, 0), gained("c3", 0.05 * (step + 1), 0, 0)))
+        assert found == []
+    brighter = {name: gains + 0.3 for name, gains in GREY.items()}
+    assert settled(past, gains=(GREY, brighter))[0] == []
+    apart = {name: gains + 0.25 * (-1) ** k for k, (name, gains) in enumerate(GREY.items())}
+    assert settled(past, gains=(GREY, apart))[0] == []  # as when the effect is switched on
+
+
+def test_a_jump_in_the_first_updates_raises_none(past: Past) -> None:
+    early = replace(past, updates=1)
+    assert settled(early, gains=(GREY, gained("c3", 0.3, 0.3, 0.3)))[0] == []
