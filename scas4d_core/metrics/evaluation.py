@@ -10,8 +10,9 @@ These definitions complement those in ``scas4d_core.metrics``:
 - Scores of the benchmarks TAPVid-3D and MVTracker (``metrics.benchmarks``) are limited to moving points. TAPVid-3D
   queries pixels, and its scores are averaged over test cameras. MVTracker queries points that are visible in any test
   camera; its thresholds are scaled to the extent.
-- Parts are rendered with as many labels as the scene has foreground parts. The labels are compared at the pixels that
-  show a part in the ground truth.
+- Parts are rendered twice: with as many labels as the scene has foreground parts, and with the number that
+  ``CommittedScene.parts`` finds. The labels are compared at the pixels that show a part in the ground truth. Because
+  static things are no parts if the number is not given, static true parts then count as one.
 - *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
   evaluated frames. *Flicker* is the mean temporal standard deviation of the rendered values at these pixels, in levels.
 """
@@ -165,9 +166,11 @@ def _benchmark(
 
 
 def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Computes the part scores: the part count, and the adjusted Rand index over all frames and labelled test cameras.
+    """Computes the part scores: part counts, and adjusted Rand indices over all frames and labelled test cameras.
 
-    The scores are empty if there are fewer than two foreground parts, or if no test camera has labels.
+    ``parts_count`` and ``parts_ari`` are those with the true count, and ``parts_count_found`` and ``parts_ari_found``
+    those without a given count. The scores are empty if there are fewer than two foreground parts, or if no test camera
+    has labels.
     """
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
@@ -176,15 +179,23 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
     count = sum(part.foreground for part in truth.parts)
     if count < 2 or not cameras:
         return {}
-    labels = reconstruction.parts(count)
-    rendered, true = [], []
-    for camera in cameras:
-        for index in indices:
-            # Flattened, because image sizes differ between cameras.
-            rendered.append(render_parts(reconstruction, camera, index, labels).ravel())
-            true.append(truth.labels(camera.name, index).ravel())
-    index_of_all = metrics.adjusted_rand_index(np.concatenate(rendered), np.concatenate(true))
-    return {"parts_ari": index_of_all, "parts_count": float(count)}
+    given, found = reconstruction.parts(count), reconstruction.parts()
+    views = [(camera, index) for camera in cameras for index in indices]
+    # Flattened, because image sizes differ between cameras.
+    true = np.concatenate([truth.labels(camera.name, index).ravel() for camera, index in views])
+    static = [part.id for part in truth.parts if part.static and part.id]
+    true_without_static = np.where(np.isin(true, static), max(static, default=0), true)
+
+    def agreement(labels: NDArray[Any], expected: NDArray[Any]) -> float:
+        rendered = [render_parts(reconstruction, camera, index, labels).ravel() for camera, index in views]
+        return metrics.adjusted_rand_index(np.concatenate(rendered), expected)
+
+    return {
+        "parts_ari": agreement(given, true),
+        "parts_count": float(count),
+        "parts_ari_found": agreement(found, true_without_static),
+        "parts_count_found": float(found.max() + 1),
+    }
 
 
 def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:

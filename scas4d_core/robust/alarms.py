@@ -43,6 +43,8 @@ DIRT_ROW = 3
 """Number of consecutive frames in which the brightness must deviate in the same direction."""
 DIRT_SHARE = 0.03
 """Minimum size of a region that is brighter or darker than the state, as a share of the image."""
+DIRT_STATIC = 0.005
+"""Minimum size of its part with static content. A region of moving content alone may be an error of the update."""
 SHARPNESS = (0.12, 0.2)
 """Same as ``TINT``, but for the deviation of the log sharpness. Clean captures reach 0.07, and a blur of one pixel
 causes 0.42."""
@@ -240,7 +242,7 @@ def _check_camera(
         dirt = max(sign * dirt, 0) + 1 if abs(brighter) > BRIGHTNESS else 0
         if dirt >= DIRT_ROW and not alarms:
             region = shifted(name)
-            if region.share >= DIRT_SHARE and sign * region.level > 0:
+            if region.share >= DIRT_SHARE and region.static >= DIRT_STATIC and sign * region.level > 0:
                 text = (
                     f"{100 * region.share:.0f}% of its image is {100 * abs(region.level):.0f}% of full brightness "
                     f"{'brighter' if sign > 0 else 'darker'} than the other cameras suggest; check the lens for dirt"

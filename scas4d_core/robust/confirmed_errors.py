@@ -58,6 +58,8 @@ MOST, PART = 0.4, 0.05
 to the cells that other cameras see at the depth of the object, and the second to all cells."""
 SHIFTED = 0.04
 """Minimum brightness difference of an image region, in [0, 1], that points to dirt on the lens."""
+STATIC = 0.25
+"""Maximum label of a cell that shows static content. Moving Gaussians have label 1, and their errors move with them."""
 SMOOTHED = 4
 """Size of the window, in cells, over which brightness differences are averaged."""
 
@@ -102,10 +104,12 @@ class ShiftedRegion(NamedTuple):
 
     Attributes:
         share: size of the region, as a share of the image.
+        static: size of its part with static content, as a share of the image.
         level: mean difference between the image and the state in the region, in [-1, 1].
     """
 
     share: float
+    static: float
     level: float
 
 
@@ -131,12 +135,14 @@ def shifted_region(
     own = errors.pop(name)
     confirmed = confirmed_cells(name, own, errors, factory.posed, ray_depths(factory.posed[name], state))
     smooth = uniform_filter(np.where(confirmed, 0, own.differences), SMOOTHED, mode="nearest")
-    best = ShiftedRegion(0.0, 0.0)
+    best = ShiftedRegion(0.0, 0.0, 0.0)
     for sign in (1, -1):
         regions, _ = label(sign * smooth > SHIFTED)
         sizes = np.bincount(regions.ravel())[1:]
         if sizes.size and (share := float(sizes.max() / regions.size)) > best.share:
-            best = ShiftedRegion(share, float(smooth[regions == 1 + sizes.argmax()].mean()))
+            region = regions == 1 + sizes.argmax()
+            static = float((region & own.static).mean())
+            best = ShiftedRegion(share, static, float(smooth[region].mean()))
     return best
 
 
@@ -146,12 +152,14 @@ class CellErrors(NamedTuple):
     Attributes:
         squares: [h, w] squared error of each cell, as a mean over pixels and RGB.
         differences: [h, w] mean difference between the image and the state in each cell.
+        static: [h, w] whether each cell shows static content.
         usual: ``USUAL_PERCENTILE`` of the squared errors of opaque cells, or 0 if there are none.
         edge: edge of a cell, in pixels of the camera.
     """
 
     squares: Array
     differences: Array
+    static: Bool
     usual: float
     edge: float
 
@@ -168,7 +176,8 @@ def cell_errors(view: TrainingView, factory: ViewFactory, renderer: Renderer, st
     squares = _cells(np.square(difference).mean(axis=0), edge)
     opaque = squares[_cells(transmittance, edge) < 0.5]
     usual = float(np.percentile(opaque, USUAL_PERCENTILE)) if len(opaque) else 0.0
-    return CellErrors(squares, _cells(difference.mean(axis=0), edge), usual, edge * full / view.camera.width)
+    differences, static = _cells(difference.mean(axis=0), edge), _cells(features[LABEL], edge) < STATIC
+    return CellErrors(squares, differences, static, usual, edge * full / view.camera.width)
 
 
 def _cells(plane: Array, edge: int) -> Array:
@@ -215,7 +224,7 @@ def confirmed_cells(
     points = np.concatenate([camera.unproject(uv, np.full(len(uv), depth)) for depth in depths])
     agree, asked = (np.zeros(len(points), np.int64) for _ in range(2))
     least = np.tile(SIMILAR * cells[row, column], len(depths))
-    for other, (squares, _, _, edge) in others.items():
+    for other, (squares, _, _, _, edge) in others.items():
         across, down, _, inside = pixels_inside(rig[other], points)
         nearby = maximum_filter(squares, 3)  # a point projects between two cells
         at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)

@@ -18,6 +18,7 @@ from scas4d_core.robust.alarms import (
     BRIGHTNESS,
     DIRT_ROW,
     DIRT_SHARE,
+    DIRT_STATIC,
     GAIN,
     SHARPNESS,
     TINT,
@@ -217,7 +218,7 @@ def test_a_scene_raises_none_and_of_one_camera_in_another_colour_one(tmp_path: P
 
 
 def region_of(*names: str, share: float = 2 * DIRT_SHARE, level: float = 0.1) -> Callable[[str], ShiftedRegion]:
-    return lambda name: ShiftedRegion(share, level) if name in names else never(name)
+    return lambda name: ShiftedRegion(share, 2 * DIRT_STATIC, level) if name in names else never(name)
 
 
 def brighter(amount: float, name: str = "c3") -> dict[str, float]:
@@ -250,7 +251,14 @@ def test_an_image_is_searched_only_after_three_frames_in_the_same_direction(past
     assert in_a_row(past, 6, lights=dict.fromkeys(NAMES, 5 * BRIGHTNESS)) == [[]] * 6  # all cameras see it
 
 
-@pytest.mark.parametrize("region", [ShiftedRegion(0.5 * DIRT_SHARE, 0.1), ShiftedRegion(2 * DIRT_SHARE, -0.1)])
+@pytest.mark.parametrize(
+    "region",
+    [
+        ShiftedRegion(0.5 * DIRT_SHARE, 2 * DIRT_STATIC, 0.1),
+        ShiftedRegion(2 * DIRT_SHARE, 2 * DIRT_STATIC, -0.1),
+        ShiftedRegion(2 * DIRT_SHARE, 0.5 * DIRT_STATIC, 0.1),
+    ],
+)
 def test_a_change_without_such_a_region_becomes_usual(past: Past, region: ShiftedRegion) -> None:
     searched: list[str] = []
 

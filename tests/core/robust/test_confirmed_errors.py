@@ -115,11 +115,13 @@ def test_a_camera_that_sees_no_gaussian_confirms_nothing() -> None:
     cells = np.zeros((24, 24), np.float32)
     cells[5, 5] = 1
     quiet = {
-        name: CellErrors(np.full((24, 24), 1e-4, np.float32), np.zeros((24, 24), np.float32), 1e-4, 2.0)
+        name: CellErrors(
+            np.full((24, 24), 1e-4, np.float32), np.zeros((24, 24), np.float32), np.ones((24, 24), np.bool_), 1e-4, 2.0
+        )
         for name in RIG.names
     }
     rig = Rig((*RIG.cameras, turned))
-    own = CellErrors(cells, np.zeros_like(cells), 0.0, 2.0)
+    own = CellErrors(cells, np.zeros_like(cells), np.ones(cells.shape, np.bool_), 0.0, 2.0)
     assert not confirmed_cells("away", own, quiet, rig, ray_depths(turned, BOX)).any()
 
 
@@ -160,4 +162,4 @@ def test_an_object_that_enters_is_no_such_region() -> None:
 def test_a_small_change_of_the_whole_image_is_no_such_region() -> None:
     frame = take_frame(1, 0.1, BOX, RIG)
     brighter = (1.03 * frame.images["c2"].astype(np.float64)).clip(0, 255).round().astype(np.uint8)
-    assert region_of(replace(frame, images={**frame.images, "c2": brighter}), "c2") == ShiftedRegion(0.0, 0.0)
+    assert region_of(replace(frame, images={**frame.images, "c2": brighter}), "c2") == ShiftedRegion(0.0, 0.0, 0.0)

@@ -203,7 +203,9 @@ def test_a_perfect_reconstruction_scores_perfectly(capture_folder, tmp_path):
     assert tracks["visibility_accuracy"] > 0.99
     assert tracks["mte_2d_oracle"] < 0.01
     assert tracks["mte_2d"] < 0.1
-    assert measures.measure_parts(scene, capture, range(FRAMES)) == {"parts_ari": 1.0, "parts_count": 2.0}
+    assert measures.measure_parts(scene, capture, range(FRAMES)) == {
+        "parts_ari": 1.0, "parts_count": 2.0, "parts_ari_found": 1.0, "parts_count_found": 2.0,
+    }  # fmt: skip
 
 
 def test_half_the_motion_is_half_the_error(capture_folder):
