@@ -175,7 +175,7 @@ _FORMATS = (
         opacity="–",
         shape="–",
         ids="lost",
-        lost="everything except the centres of up to 500 moving Gaussians, their visibility, images and depth",
+        lost="everything except images, depth, and the centres of 500 moving or given Gaussians with visibility",
         needs_rig=True,
         accepts_ids=True,
     ),

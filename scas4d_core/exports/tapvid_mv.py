@@ -2,8 +2,9 @@
 
 The layout is that of a sequence of the dataset (google-deepmind/tapnet, ``tapvidmv``). The ``.zip`` contains:
 
-- ``tracks_xyz.npy``: [T, N, 3] float32 positions.
-- ``queries_xytv.npy``: [N, 4] float32 u, v, frame and view of each query; −1, −1, 0, 0 if a track is never visible.
+- ``tracks_xyz.npy``: [T, N, 3] float32 positions, NaN while a Gaussian is absent.
+- ``queries_xytv.npy``: [N, 4] float32 u, v, frame and view of each query. The frame and view are drawn from those in
+  which the track is visible; tracks that are never visible are omitted.
 - ``0/``, ``1/``, …: one folder for each camera, in the order of the rig:
 
   - ``images_jpeg_bytes.npy``: [T] JPEG files, as a pickled array of uint8 arrays.
@@ -12,7 +13,9 @@ The layout is that of a sequence of the dataset (google-deepmind/tapnet, ``tapvi
   - ``intrinsics.npy``: [4] float32 fx, fy, cx, cy in pixels.
   - ``extrinsics_w2c.npy``: [T, 4, 4] float32 transforms from the world to the camera.
 
-Positions and depths are in metres, in the axes of the user's world. Pixel centres are at +0.5.
+Positions and depths are in metres. The world has the axes of the user's world, but its origin is that of the scene's
+internal world, because float32 is not precise far away from it. As in the dataset, the centre of the first pixel is at
+(0, 0).
 """
 
 from __future__ import annotations
@@ -30,23 +33,34 @@ from PIL import Image
 
 from scas4d_core.cameras import Camera, Rig, WorldFrame
 from scas4d_core.engines.limits import rig_limits
+from scas4d_core.engines.renderer import levels
 from scas4d_core.errors import InputError
 from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
+from scas4d_core.exports.track_rows import evenly_spaced_moving_rows
 from scas4d_core.gaussians import Gaussians, moving_extent
 from scas4d_core.query.view import ViewRenderer
 from scas4d_core.query.visibility import visible_points
 
-MAX_TRACKS = 500
-"""Maximum number of tracks if no ids are given, evenly spaced over the moving rows of the first frame."""
 JPEG_QUALITY = 95
 """Quality of the images, as in the benchmark."""
 QUERY_SEED = 0
-"""Seed for the frame and view of each query. They are drawn from those in which the track is visible."""
+"""Seed for the frame and view of each query."""
+PIXEL_CENTRE = 0.5
+"""Position of the centre of the first pixel in this project; see the module's docstring for that of the dataset."""
+COMPRESSION = 1
+"""Compression level. Higher levels are slower, but hardly make depth smaller, whose last bits are noise."""
 
 
 @dataclass
 class _View:
-    """What has been written for one camera: sizes [T] of the JPEG files in bytes, and visibility [T] of [N]."""
+    """What has been written for one camera.
+
+    Attributes:
+        camera: camera in the user's world.
+        folder: temporary folder with the JPEG files and depths, each of which are concatenated in one file.
+        sizes: [T] size of each JPEG file in bytes.
+        visible: [T] visibility [N] of the tracks in each frame.
+    """
 
     camera: Camera
     folder: Path
@@ -58,14 +72,14 @@ class TapVidMvSequence:
     """Writer of a ``.zip`` in the layout of TAPVid-MV.
 
     Images and depths are written to a temporary folder next to the file, one frame at a time. The ``.zip`` is written
-    by ``finish``.
+    by ``finish``. The rasterizer's near plane is that of ``scene.near=auto``.
 
     Args:
         path: path of the file.
         world: transform from the user's world to the internal world.
         rig: cameras in the user's world.
         ids: ids of the Gaussians whose centres are the tracks, which are written in ascending order. If None, up to
-            ``MAX_TRACKS`` moving Gaussians are written.
+            500 of the Gaussians that move in the first frame are written.
         background: background colour of the images, RGB in [0, 1].
 
     Raises:
@@ -102,8 +116,6 @@ class TapVidMvSequence:
         with translate_write_errors(self.path):
             self._temporary = tempfile.TemporaryDirectory(prefix=".part-", dir=self.path.parent)
         self._views = [_View(camera, Path(self._temporary.name) / str(k)) for k, camera in enumerate(rig.cameras)]
-        for view in self._views:
-            view.folder.mkdir()
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Adds a frame, given its index, its time in seconds, and its state in the internal world.
@@ -114,35 +126,45 @@ class TapVidMvSequence:
         if not self._tracks:
             self._extent = moving_extent(gaussians)
             if self._ids is None:
-                self._ids = _evenly_spaced(gaussians)
+                self._ids = gaussians.ids[evenly_spaced_moving_rows(gaussians)]
+                if not len(self._ids):
+                    raise InputError(
+                        f"nothing moves in frame {index}, but ids is None", "start at a later frame, or pass ids"
+                    )
         assert self._ids is not None
         positions = np.full((len(self._ids), 3), np.nan)
         _, columns, rows = np.intersect1d(self._ids, gaussians.ids, return_indices=True)
-        there = gaussians.present[rows]
-        positions[columns[there]] = self._world.to_user(gaussians.means[rows[there]])
+        present = gaussians.present[rows]
+        positions[columns[present]] = gaussians.means[rows[present]]
         self._tracks.append(positions)
-        for view in self._views:
-            rendered = self._renderer.render(gaussians, view.camera, self._background)
-            levels = np.clip(255 * rendered.colour + 0.5, 0, 255).astype(np.uint8)
-            encoded = io.BytesIO()
-            Image.fromarray(levels).save(encoded, "JPEG", quality=JPEG_QUALITY)
-            depth = np.nan_to_num(rendered.depth * np.float32(self._world.metres_per_unit), nan=0.0)
-            view.sizes.append(encoded.tell())
-            view.visible.append(
-                visible_points(gaussians, self._world, positions, view.camera, self._extent, self._limits)
-            )
-            with translate_write_errors(self.path):
-                _append(view.folder / "jpeg", encoded.getvalue())
-                _append(view.folder / "depth", depth.astype("<f4").tobytes())
+        in_user_world = self._world.to_user(positions)
+        with translate_write_errors(self.path):
+            for view in self._views:
+                self._add_view(view, gaussians, in_user_world)
+
+    def _add_view(self, view: _View, gaussians: Gaussians, positions: NDArray[np.float64]) -> None:
+        rendered = self._renderer.render(gaussians, view.camera, self._background)
+        encoded = io.BytesIO()
+        Image.fromarray(levels(rendered.colour)).save(encoded, "JPEG", quality=JPEG_QUALITY)
+        depth = np.nan_to_num(rendered.depth * np.float32(self._world.metres_per_unit), nan=0.0)
+        view.sizes.append(encoded.tell())
+        view.visible.append(visible_points(gaussians, self._world, positions, view.camera, self._extent, self._limits))
+        view.folder.mkdir(exist_ok=True)
+        for name, content in (("jpeg", encoded.getvalue()), ("depth", depth.astype("<f4").tobytes())):
+            with (view.folder / name).open("ab") as file:
+                file.write(content)
 
     def finish(self) -> None:
         """Writes the ``.zip`` atomically, one camera at a time.
 
         Raises:
-            InputError: if the file cannot be written.
+            InputError: if no track is ever visible, an id is in no frame, or the file cannot be written.
         """
         try:
-            with atomic_path(self.path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED) as archive:
+            with (
+                atomic_path(self.path) as beside,
+                zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION) as archive,
+            ):
                 self._write(archive)
         finally:
             self.discard()
@@ -152,55 +174,45 @@ class TapVidMvSequence:
         self._temporary.cleanup()
 
     def _write(self, archive: zipfile.ZipFile) -> None:
-        metres, count = self._world.metres_per_unit, len(self._tracks)
-        tracks = np.stack(self._tracks)
-        visible = [np.stack(view.visible) for view in self._views]
-        _save(archive, "tracks_xyz.npy", (tracks * metres).astype(np.float32))
-        queries = _queries(tracks, visible, [view.camera for view in self._views])
-        _save(archive, "queries_xytv.npy", queries)
-        for view, seen in zip(self._views, visible, strict=True):
-            camera, inside = view.camera, view.folder.name
-            lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-            pose = camera.world_to_camera.copy()
-            pose[:3, 3] *= metres
-            _save(archive, f"{inside}/intrinsics.npy", lens)
-            _save(archive, f"{inside}/extrinsics_w2c.npy", np.repeat(pose[None].astype(np.float32), count, axis=0))
-            _save(archive, f"{inside}/visibility.npy", seen)
+        tracks, count = np.stack(self._tracks), len(self._tracks)
+        visible = np.stack([np.stack(view.visible) for view in self._views], axis=-1)  # [T, N, views]
+        assert self._ids is not None
+        unknown = self._ids[np.isnan(tracks).all(axis=(0, 2))]
+        if len(unknown):
+            raise InputError(f"ids {unknown[:5].tolist()} are in no exported frame", "use ids of present Gaussians")
+        kept = visible.any(axis=(0, 2))
+        if not kept.any():
+            raise InputError("no camera ever sees any of the tracks", "use other frames or ids")
+        tracks, visible = tracks[:, kept], visible[:, kept]
+        cameras = [self._world.camera_to_inside(view.camera) for view in self._views]
+        _save(archive, "tracks_xyz.npy", tracks.astype(np.float32))
+        _save(archive, "queries_xytv.npy", _queries(tracks, visible, cameras))
+        for k, (view, camera) in enumerate(zip(self._views, cameras, strict=True)):
+            intrinsics = np.array(
+                [camera.fx, camera.fy, camera.cx - PIXEL_CENTRE, camera.cy - PIXEL_CENTRE], np.float32
+            )
+            poses = np.repeat(camera.world_to_camera[None].astype(np.float32), count, axis=0)
             depth = np.memmap(view.folder / "depth", "<f4", "r", shape=(count, camera.height, camera.width))
-            _save(archive, f"{inside}/depth.npy", depth)
             files = np.empty(count, dtype=object)
             with (view.folder / "jpeg").open("rb") as encoded:
                 files[:] = [np.frombuffer(encoded.read(size), np.uint8) for size in view.sizes]
-            _save(archive, f"{inside}/images_jpeg_bytes.npy", files)
+            _save(archive, f"{k}/intrinsics.npy", intrinsics)
+            _save(archive, f"{k}/extrinsics_w2c.npy", poses)
+            _save(archive, f"{k}/visibility.npy", visible[..., k])
+            _save(archive, f"{k}/depth.npy", depth)
+            _save(archive, f"{k}/images_jpeg_bytes.npy", files)
 
 
-def _evenly_spaced(first: Gaussians) -> NDArray[np.int64]:
-    moving = np.flatnonzero(first.moving)
-    if not moving.size:
-        raise InputError("no Gaussian of the first frame moves", "pass the ids of the Gaussians to export")
-    even = np.linspace(0, len(moving) - 1, min(MAX_TRACKS, len(moving))).round().astype(np.intp)
-    return first.ids[moving[even]]
-
-
-def _queries(
-    tracks: NDArray[np.float64], visible: list[NDArray[np.bool_]], cameras: list[Camera]
-) -> NDArray[np.float32]:
-    """Draws the query [N, 4] of each track: u, v, frame and view."""
+def _queries(tracks: NDArray[np.float64], visible: NDArray[np.bool_], cameras: list[Camera]) -> NDArray[np.float32]:
+    """Draws the query [N, 4] of each track: u, v, frame and view. Each track must be visible in some frame and view."""
     draw = np.random.default_rng(QUERY_SEED)
-    queries = np.tile(np.array([-1, -1, 0, 0], np.float32), (tracks.shape[1], 1))
-    seen = np.stack(visible, axis=-1)  # [T, N, views]
+    queries = np.empty((tracks.shape[1], 4), np.float32)
     for n in range(tracks.shape[1]):
-        choices = np.argwhere(seen[:, n])
-        if len(choices):
-            t, view = choices[draw.integers(len(choices))]
-            uv, _ = cameras[view].project(tracks[t, n])
-            queries[n] = [*uv, t, view]
+        choices = np.argwhere(visible[:, n])
+        t, view = choices[draw.integers(len(choices))]
+        (u, v), _ = cameras[view].project(tracks[t, n])
+        queries[n] = u - PIXEL_CENTRE, v - PIXEL_CENTRE, t, view
     return queries
-
-
-def _append(path: Path, content: bytes) -> None:
-    with path.open("ab") as file:
-        file.write(content)
 
 
 def _save(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:

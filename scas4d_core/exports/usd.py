@@ -5,7 +5,7 @@ retirement. As the schema requires, scales and opacities are linear, and harmoni
 sRGB image values, which the schema cannot express; they are declared by the ``colorSpace`` of the harmonics.
 ``primvars:scas4d:id`` and ``primvars:scas4d:part`` store the ids and part labels. ``/World/Parts/part_k`` are Xforms
 with the rigid motion of each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` shows
-the centres of up to ``MAX_TRACKS`` moving Gaussians as UsdGeomPoints with purpose guide. ``/World/Cameras`` contains
+the centres of some moving Gaussians (``track_rows``) as UsdGeomPoints with purpose guide. ``/World/Cameras`` contains
 the cameras of the rig.
 
 The stage is y-up, that is, the user's world rotated by 180° about x. Its unit is the user's, given by
@@ -29,6 +29,7 @@ from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError, exact
 from scas4d_core.exports.atomic_files import atomic_path, import_optional, translate_write_errors
 from scas4d_core.exports.cloud import Cloud, cloud_of, linear_light
+from scas4d_core.exports.track_rows import evenly_spaced_moving_rows
 from scas4d_core.exports.usd_values import (
     AnimatedValues,
     floats_of,
@@ -42,8 +43,6 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.part_motion import PartMotion, part_labels, quaternion_of
 
 SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
-MAX_TRACKS = 500
-"""Maximum number of Gaussians shown as tracks, evenly spaced over the moving rows of the first frame."""
 TRACK_WIDTH = 0.005
 """Diameter of a track point, relative to the extent of the tracks."""
 REACH = 3.0
@@ -230,9 +229,7 @@ class UsdSequence:
             "harmonics": AnimatedValues(harmonics, points_of),
             "extent": AnimatedValues(gaussians.CreateExtentAttr(), points_of),
         }
-        moving = np.flatnonzero(first.moving)
-        even = np.linspace(0, len(moving) - 1, min(MAX_TRACKS, len(moving))).round().astype(np.intp)
-        self._tracked = moving[even]
+        self._tracked = evenly_spaced_moving_rows(first)
         if self._tracked.size:
             means = cloud.splats.means[self._tracked]
             self._width = max(TRACK_WIDTH * float(np.ptp(means, axis=0).max()), float(np.finfo(np.float32).tiny))

@@ -11,8 +11,8 @@ These definitions complement those in ``scas4d_core.metrics``:
   queries pixels, and its scores are averaged over test cameras. MVTracker queries points that are visible in any test
   camera; its thresholds are scaled to the extent.
 - Parts are rendered twice: with as many labels as the scene has foreground parts, and with the number that
-  ``CommittedScene.parts`` finds. The labels are compared at the pixels that show a part in the ground truth. Because
-  static things are no parts if the number is not given, static true parts then count as one.
+  ``CommittedScene.parts`` finds. The labels are compared at the pixels that show a part in the ground truth. Without
+  a given number, static objects get no label, so all static true parts count as one.
 - *Still* pixels of a test camera are not black, and their true values vary by at most 6 of 255 levels over the
   evaluated frames. *Flicker* is the mean temporal standard deviation of the rendered values at these pixels, in levels.
 """
@@ -194,7 +194,7 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
         "parts_ari": agreement(given, true),
         "parts_count": float(count),
         "parts_ari_found": agreement(found, true_without_static),
-        "parts_count_found": float(found.max() + 1),
+        "parts_count_found": float(len(np.unique(found[found >= 0]))),
     }
 
 

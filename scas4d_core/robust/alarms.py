@@ -1,9 +1,9 @@
 """Alarms, which point out conditions that need attention after a frame. Only this module raises them.
 
-Alarms are derived from values that an update computes anyway. A camera is compared with its own past and with the other
-cameras of the frame. A change that all cameras see is not attributed to a single camera. Because a single frame may be
-noise, small deviations must persist for two frames. The thresholds were chosen from measurements on the captures;
-docs/stability.md shows the distributions.
+Alarms are derived from values that an update computes anyway; only a search for dirt renders images. A camera is
+compared with its own past and with the other cameras of the frame. A change that all cameras see is not attributed to a
+single camera. Because a single frame may be noise, small deviations must persist for two or three frames. The
+thresholds were chosen from measurements on the captures; docs/stability.md shows the distributions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isnan, log, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome, degraded_text
 from scas4d_core.kernels.pictures import row_differences
-from scas4d_core.robust.confirmed_errors import ShiftedRegion
-from scas4d_core.robust.outliers import CAMERA_FIGURES, LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
+from scas4d_core.robust.lens_dirt import ShiftedRegion
+from scas4d_core.robust.outliers import LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
 from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
@@ -32,6 +32,8 @@ edge-on."""
 JUMP = 0.12
 """Maximum change of a camera's estimated gain from one frame to the next, as a logarithm. Drifting gains change by at
 most 0.05. If gains are estimated (effect ``camera_gain``), ``TINT`` and ``GAIN`` do not see a change of the camera."""
+CAMERA_GAIN = "camera_gain"
+"""Name of the effect that estimates gains."""
 SPREAD = 4.0
 """``TINT``, ``GAIN`` and ``JUMP`` are raised to at least this multiple of the median deviation over the cameras of the
 frame. If all cameras fit badly, as on small images, colours are unreliable."""
@@ -41,15 +43,11 @@ searched for dirt. Clean captures reach 0.004, and dirt that adds 20% white to a
 0.02."""
 DIRT_ROW = 3
 """Number of consecutive frames in which the brightness must deviate in the same direction."""
-DIRT_SHARE = 0.03
-"""Minimum size of a region that is brighter or darker than the state, as a share of the image."""
-DIRT_STATIC = 0.005
-"""Minimum size of its part with static content. A region of moving content alone may be an error of the update."""
 SHARPNESS = (0.12, 0.2)
 """Same as ``TINT``, but for the deviation of the log sharpness. Clean captures reach 0.07, and a blur of one pixel
 causes 0.42."""
 FOLLOWS = 0.2
-"""Rate at which the usual colours and sharpness of a camera follow new values, except while these are suspect."""
+"""Rate at which the usual colours, brightness and sharpness of a camera follow new values, unless these are suspect."""
 ROW = 2
 """Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
@@ -61,6 +59,7 @@ ROWS = 64
 COLOURS = ("red", "green", "blue")
 
 Numbers = NDArray[np.float64]
+Value = TypeVar("Value", float, Numbers)
 
 
 @dataclass(frozen=True)
@@ -69,19 +68,20 @@ class CameraFigures:
 
     Attributes:
         colours: [3] usual value of ``colours_of`` minus the median over cameras; NaN if unknown.
-        gains: [3] log gains before they jumped, minus the median over cameras; NaN if they have not jumped.
+        gains_before_jump: [3] log gains before they jumped, minus the median over cameras; NaN if they have not jumped.
         sharp: usual value of ``sharpness_of``; NaN if unknown.
-        light: usual mean difference between the image and its rendering, minus the median over cameras; NaN if
+        brightness: usual mean difference between the image and its rendering, minus the median over cameras; NaN if
             unknown.
         misfit, tint, gain, blur: numbers of consecutive suspect frames.
-        dirt: number of consecutive frames in which ``light`` deviates; negative if the image is darker.
+        dirt: number of consecutive images whose ``brightness`` deviates in the same direction; negative if they are
+            darker.
         same: number of consecutive frames in which the image was repeated.
     """
 
     colours: tuple[float, float, float] = (nan, nan, nan)
-    gains: tuple[float, float, float] = (nan, nan, nan)
+    gains_before_jump: tuple[float, float, float] = (nan, nan, nan)
     sharp: float = nan
-    light: float = nan
+    brightness: float = nan
     misfit: int = 0
     tint: int = 0
     gain: int = 0
@@ -93,15 +93,15 @@ class CameraFigures:
     def of(cls, past: Past, name: str) -> CameraFigures:
         """Returns a camera's figures from a row created by ``row``, or the defaults if there is no row."""
         row = past.camera_figures.get(name)
-        if row is None or len(row) != CAMERA_FIGURES:  # written by an earlier version
+        if row is None:
             return cls()
-        red, green, blue, *gains, sharp, light = row[:8]
-        return cls((red, green, blue), (gains[0], gains[1], gains[2]), sharp, light, *map(int, row[8:]))
+        red, green, blue, *gains, sharp, brightness = row[:8]
+        return cls((red, green, blue), (gains[0], gains[1], gains[2]), sharp, brightness, *map(int, row[8:]))
 
     def row(self) -> tuple[float, ...]:
         """Returns the figures as a row of ``Past.camera_figures``."""
         counts = self.misfit, self.tint, self.gain, self.blur, self.dirt, self.same
-        return (*self.colours, *self.gains, self.sharp, self.light, *counts)
+        return (*self.colours, *self.gains_before_jump, self.sharp, self.brightness, *counts)
 
 
 def alarms_of(
@@ -114,8 +114,8 @@ def alarms_of(
     offsets: Mapping[str, float],
     colours: Mapping[str, Numbers],
     gains: tuple[Mapping[str, Numbers], Mapping[str, Numbers]],
-    lights: Mapping[str, float],
-    shifted: Callable[[str], ShiftedRegion],
+    differences: Mapping[str, float],
+    region: Callable[[str], ShiftedRegion | None],
     sharp: Mapping[str, float],
     same: Collection[str],
     left_out: Collection[str] = (),
@@ -129,9 +129,9 @@ def alarms_of(
         exposure: ratio of the frame's brightness to the usual brightness.
         offsets: offset of each camera above (+) or below its usual fit, in dB.
         colours: ``colours_of`` for each rendered camera.
-        gains: ``log_gains`` before and after the update.
-        lights: ``mean_differences`` for each rendered camera.
-        shifted: function that returns the ``shifted_region`` of a camera's image.
+        gains: ``log_gains`` before and after the update; empty unless the previous update has estimated them.
+        differences: ``mean_differences`` of the cameras used for the frame.
+        region: function that searches a camera's image for dirt; see ``DirtSearch.region``.
         sharp: ``sharpness_of`` for each image of the frame.
         same: names of the cameras whose image is bit-identical to the previous one.
         left_out: names of the excluded cameras, for which ``left_out_alarms`` returns the alarms.
@@ -140,8 +140,6 @@ def alarms_of(
     found = _frame_alarms(outcome, reason, exposure, same, count)
     if outcome.rejected or not offsets:
         return found, after  # there is nothing to compare the cameras with
-    watch, raised = dict(after.camera_figures), dict[AlarmKind, dict[str, Alarm]]()
-    middle = float(np.median(list(lights.values()))) if lights else 0.0
     beside, watches = _minus_median(colours), {name: CameraFigures.of(past, name) for name in sharp}
     changes = {name: value - watches[name].sharp for name, value in sharp.items()}
     common = float(np.nanmedian(list(changes.values()))) if not np.isnan(list(changes.values())).all() else 0.0
@@ -153,19 +151,21 @@ def alarms_of(
         _upper_median(shift.odd_channel for shift in shifts.values()),
         _upper_median(shift.common for shift in shifts.values()),
     )
-    jumps = _gain_jumps(watches, *map(_minus_median, gains)) if allowed(past) == 0 else {}
+    figures, alarms = dict[str, CameraFigures](), dict[str, list[Alarm]]()
     for name, before in watches.items():
-        now, alarms = _check_camera(
+        figures[name], alarms[name] = _check_camera(
             name, before, past, offsets.get(name), shifts.get(name), sharp[name], changes[name] - common,
-            few_same and name in same, spread, lights[name] - middle if name in lights else None, shifted,
+            few_same and name in same, spread,
         )  # fmt: skip
-        kept, jump = jumps.get(name, (now.gains, None))
-        watch[name] = replace(now, gains=kept).row()
-        if name not in left_out:
-            for alarm in [*alarms, *([jump] if jump is not None else [])]:
-                raised.setdefault(alarm.kind, {})[name] = alarm
+    _check_gains(figures, alarms, *map(_minus_median, gains))
+    _check_for_dirt(figures, alarms, _minus_median(differences), region)
+    raised: dict[AlarmKind, dict[str, Alarm]] = {}
+    for name in figures:
+        for alarm in alarms[name] if name not in left_out else ():
+            raised.setdefault(alarm.kind, {})[name] = alarm
     found += [alarm for of_kind in raised.values() for alarm in unless_most(of_kind, count).values()]
-    return found, replace(after, camera_figures=watch)
+    rows = {name: now.row() for name, now in figures.items()}
+    return found, replace(after, camera_figures={**after.camera_figures, **rows})
 
 
 def _check_camera(
@@ -178,8 +178,6 @@ def _check_camera(
     sharper: float,
     same: bool,
     spread: tuple[float, float],
-    light: float | None,
-    shifted: Callable[[str], ShiftedRegion],
 ) -> tuple[CameraFigures, list[Alarm]]:
     """Returns a camera's figures for the next frame, and its alarms.
 
@@ -193,8 +191,6 @@ def _check_camera(
         sharper: change from the usual sharpness, relative to the other cameras.
         same: whether the image is unchanged while those of other cameras have changed.
         spread: median tint and gain deviations over the cameras.
-        light: mean difference between the image and its rendering, relative to the other cameras, or None if unknown.
-        shifted: function that returns the ``shifted_region`` of a camera's image.
     """
     # With one copy of the dataclass per figure, the copies would take longer than the checks.
     colours, usual_sharp, misfit, tint_frames, gain_frames, blur = (
@@ -235,24 +231,6 @@ def _check_camera(
         if not tint_frames and not gain_frames:
             red, green, blue = (shift.usual + FOLLOWS * change).tolist()
             colours = (red, green, blue)
-    usual_light, dirt = before.light, before.dirt
-    if light is not None:
-        brighter = 0.0 if isnan(usual_light) else light - usual_light
-        sign = 1 if brighter > 0 else -1
-        dirt = max(sign * dirt, 0) + 1 if abs(brighter) > BRIGHTNESS else 0
-        if dirt >= DIRT_ROW and not alarms:
-            region = shifted(name)
-            if region.share >= DIRT_SHARE and region.static >= DIRT_STATIC and sign * region.level > 0:
-                text = (
-                    f"{100 * region.share:.0f}% of its image is {100 * abs(region.level):.0f}% of full brightness "
-                    f"{'brighter' if sign > 0 else 'darker'} than the other cameras suggest; check the lens for dirt"
-                )
-                alarms.append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
-            else:  # something else has changed, and the image becomes the usual one
-                usual_light, dirt = light, 0
-        elif not dirt:
-            usual_light = light if isnan(usual_light) else usual_light + FOLLOWS * brighter
-        dirt *= sign
     if not isnan(sharper):
         blur = before.blur + 1 if abs(sharper) > SHARPNESS[0] else 0
         if abs(sharper) > SHARPNESS[1] or blur >= ROW:
@@ -266,43 +244,80 @@ def _check_camera(
         usual_sharp = sharp
     elif not blur and not isnan(sharp):
         usual_sharp = before.sharp + FOLLOWS * (sharp - before.sharp)
-    counts = misfit, tint_frames, gain_frames, blur, dirt, repeats
-    return CameraFigures(colours, before.gains, usual_sharp, usual_light, *counts), alarms
+    counts = misfit, tint_frames, gain_frames, blur, before.dirt, repeats
+    return CameraFigures(colours, before.gains_before_jump, usual_sharp, before.brightness, *counts), alarms
 
 
-Jump = tuple[tuple[float, float, float], Alarm | None]
-"""The gains before a jump, or NaN, and the alarm."""
-
-
-def _gain_jumps(
-    watches: Mapping[str, CameraFigures], before: Mapping[str, Numbers], after: Mapping[str, Numbers]
-) -> dict[str, Jump]:
-    """Compares each camera's gains with those of the previous frame, or with those before it jumped.
+def _check_gains(
+    figures: dict[str, CameraFigures],
+    alarms: Mapping[str, list[Alarm]],
+    before: Mapping[str, Numbers],
+    after: Mapping[str, Numbers],
+) -> None:
+    """Compares each camera's gains with those of the previous frame, or with those before they jumped.
 
     Args:
-        watches: previous figures of the cameras.
+        figures: figures of the cameras, which are updated.
+        alarms: alarms of each camera, to which alarms are added.
         before, after: log gains before and after the update, minus the median over cameras.
     """
     usual = {
-        name: before[name] if isnan(watches[name].gains[0]) else np.array(watches[name].gains)
-        for name in watches
+        name: before[name] if isnan(now.gains_before_jump[0]) else np.array(now.gains_before_jump)
+        for name, now in figures.items()
         if name in before and name in after
     }
     changes = {name: after[name] - gains for name, gains in usual.items()}
     largest = {name: float(np.abs(change).max()) for name, change in changes.items()}
     limit = max(JUMP, SPREAD * _upper_median(largest.values()))
-    found: dict[str, Jump] = {}
-    for name, size in largest.items():
-        if size <= limit:
-            found[name] = (nan, nan, nan), None
-            continue
-        parts = ", ".join(
-            f"{colour} {100 * part:+.0f}%" for colour, part in zip(COLOURS, np.expm1(changes[name]), strict=True)
-        )
-        text = f"its gain has jumped relative to the other cameras ({parts}); check the exposure and the white balance"
-        red, green, blue = usual[name].tolist()
-        found[name] = (red, green, blue), Alarm(AlarmKind.CAMERA_COLOURS, name, text)
-    return found
+    for name, change in changes.items():
+        red, green, blue = usual[name].tolist() if largest[name] > limit else (nan, nan, nan)
+        figures[name] = replace(figures[name], gains_before_jump=(red, green, blue))
+        if largest[name] > limit:
+            parts = ", ".join(
+                f"{colour} {100 * part:+.0f}%" for colour, part in zip(COLOURS, np.expm1(change), strict=True)
+            )
+            text = (
+                f"its gain has jumped relative to the other cameras ({parts}); check the exposure and the white balance"
+            )
+            alarms[name].append(Alarm(AlarmKind.CAMERA_COLOURS, name, text))
+
+
+def _check_for_dirt(
+    figures: dict[str, CameraFigures],
+    alarms: Mapping[str, list[Alarm]],
+    brightness: Mapping[str, float],
+    region: Callable[[str], ShiftedRegion | None],
+) -> None:
+    """Searches images for dirt whose brightness has deviated for ``DIRT_ROW`` frames, unless most images deviate.
+
+    Args:
+        figures: figures of the cameras, which are updated.
+        alarms: alarms of each camera, to which alarms are added. Cameras that have one are not searched.
+        brightness: mean difference between each camera's image and its rendering, minus the median over cameras.
+        region: see ``alarms_of``.
+    """
+    suspects = []
+    for name in figures.keys() & brightness.keys():
+        usual, dirt = figures[name].brightness, figures[name].dirt
+        change = 0.0 if isnan(usual) else brightness[name] - usual
+        sign = 1 if change > 0 else -1
+        if abs(change) > BRIGHTNESS:
+            dirt = sign * (max(sign * dirt, 0) + 1)
+        else:
+            usual, dirt = brightness[name] if isnan(usual) else usual + FOLLOWS * change, 0
+        figures[name] = replace(figures[name], brightness=usual, dirt=dirt)
+        if abs(dirt) >= DIRT_ROW and not alarms[name]:
+            suspects.append(name)
+    for name in sorted(suspects) if len(suspects) <= MAX_OUT * len(figures) else ():
+        found, sign = region(name), 1 if figures[name].dirt > 0 else -1
+        if found is not None and found.is_dirt and sign * found.level > 0:
+            text = (
+                f"a region of {100 * found.share:.0f}% of its image is {'brighter' if sign > 0 else 'darker'} than the "
+                f"other cameras suggest, by {100 * abs(found.level):.0f}% of the full range; check the lens for dirt"
+            )
+            alarms[name].append(Alarm(AlarmKind.CAMERA_MISFIT, name, text))
+        elif found is not None:  # something else has changed, and the image becomes the usual one
+            figures[name] = replace(figures[name], brightness=brightness[name], dirt=0)
 
 
 class ColourChange(NamedTuple):
@@ -373,7 +388,7 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
 
 
 def log_gains(views: Iterable[TrainingView]) -> dict[str, Numbers]:
-    """Returns the logarithm of the gain of each view's channels [3], which are sRGB values."""
+    """Returns the log gain [3] of the sRGB channels of each view."""
     return {view.name: np.log(np.maximum(view.exposure[:3, 0].astype(np.float64), DARKEST)) for view in views}
 
 
@@ -421,12 +436,12 @@ def with_first_figures(past: Past, pictures: Mapping[str, NDArray[np.uint8]]) ->
     )
 
 
-def _minus_median(colours: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    """Returns colours minus the median over cameras, which removes a lighting change that all cameras see."""
-    if not colours:
+def _minus_median(values: Mapping[str, Value]) -> dict[str, Value]:
+    """Returns values minus their median over cameras, which removes a lighting change that all cameras see."""
+    if not values:
         return {}
-    common = np.median(list(colours.values()), axis=0)
-    return {name: colour - common for name, colour in colours.items()}
+    common: Any = np.median(list(values.values()), axis=0)
+    return {name: value - common for name, value in values.items()}
 
 
 def _frame_alarms(

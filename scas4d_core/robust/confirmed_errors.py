@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label, maximum_filter, uniform_filter
+from scipy.ndimage import label, maximum_filter
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.engines.renderer import Renderer
@@ -56,12 +56,8 @@ AGREE = 0.75
 MOST, PART = 0.4, 0.05
 """Minimum confirmed shares of the squared error in a connected region that confirm the whole region. The first applies
 to the cells that other cameras see at the depth of the object, and the second to all cells."""
-SHIFTED = 0.04
-"""Minimum brightness difference of an image region, in [0, 1], that points to dirt on the lens."""
 STATIC = 0.25
 """Maximum label of a cell that shows static content. Moving Gaussians have label 1, and their errors move with them."""
-SMOOTHED = 4
-"""Size of the window, in cells, over which brightness differences are averaged."""
 
 Array = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -97,53 +93,6 @@ def credited_decibels(
             without = np.where(confirmed, np.minimum(cells, _distinct(others)), cells)
             credits[name] = 10 * log10(max(cells.mean(), ROUNDING) / max(without.mean(), ROUNDING))
     return credits
-
-
-class ShiftedRegion(NamedTuple):
-    """Region of an image that is brighter or darker than the state.
-
-    Attributes:
-        share: size of the region, as a share of the image.
-        static: size of its part with static content, as a share of the image.
-        level: mean difference between the image and the state in the region, in [-1, 1].
-    """
-
-    share: float
-    static: float
-    level: float
-
-
-def shifted_region(
-    name: str,
-    views: Sequence[TrainingView],
-    factory: ViewFactory,
-    renderer: Renderer,
-    state: Gaussians,
-) -> ShiftedRegion:
-    """Returns the largest connected region of a camera's image that is brighter, or darker, by more than ``SHIFTED``.
-
-    Errors that other cameras confirm do not count. Dirt on a lens scatters light and causes such a region.
-
-    Args:
-        name: name of the camera, which must have a view.
-        views, factory, renderer, state: see ``credited_decibels``.
-
-    Returns:
-        The region. Its share is 0 if there is none.
-    """
-    errors = {view.name: cell_errors(view, factory, renderer, state) for view in views}
-    own = errors.pop(name)
-    confirmed = confirmed_cells(name, own, errors, factory.posed, ray_depths(factory.posed[name], state))
-    smooth = uniform_filter(np.where(confirmed, 0, own.differences), SMOOTHED, mode="nearest")
-    best = ShiftedRegion(0.0, 0.0, 0.0)
-    for sign in (1, -1):
-        regions, _ = label(sign * smooth > SHIFTED)
-        sizes = np.bincount(regions.ravel())[1:]
-        if sizes.size and (share := float(sizes.max() / regions.size)) > best.share:
-            region = regions == 1 + sizes.argmax()
-            static = float((region & own.static).mean())
-            best = ShiftedRegion(share, static, float(smooth[region].mean()))
-    return best
 
 
 class CellErrors(NamedTuple):

@@ -19,8 +19,8 @@ from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust import outliers, timing
-from scas4d_core.robust.alarms import alarms_of, colours_by_camera, log_gains, mean_differences
+from scas4d_core.robust import lens_dirt, outliers, timing
+from scas4d_core.robust.alarms import CAMERA_GAIN, alarms_of, colours_by_camera, log_gains, mean_differences
 from scas4d_core.robust.checks import (
     EXPOSURE,
     check_plausible,
@@ -28,8 +28,9 @@ from scas4d_core.robust.checks import (
     measure_light_gain,
     with_light_gain,
 )
-from scas4d_core.robust.confirmed_errors import credited_decibels, shifted_region
+from scas4d_core.robust.confirmed_errors import credited_decibels
 from scas4d_core.robust.first_motion import OrderResult, best_order
+from scas4d_core.robust.lens_dirt import DirtSearch
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shift_moving
 from scas4d_core.robust.update_input import UpdateInput
@@ -105,24 +106,23 @@ class FrameSolver:
 
     def _with_alarms(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
         """Returns a result with the camera health, the alarms and the camera timing added, and the usual values."""
-        if self._settings.reject_outliers:
-            past = timing.record_timing(
-                past, given.state, result, self._renderer, given.seconds, given.step, given.seed
-            )
-        views = result.views or given.views
+        health = {name: outliers.health(given.past, off) for name, off in result.offsets.items()}
+        if not self._settings.reject_outliers:
+            return replace(result, health=health, timing=timing.timings(past)), past
+        past = timing.record_timing(past, given.state, result, self._renderer, given.seconds, given.step, given.seed)
+        views, trace = result.views or given.views, result.trace
         means = {view.name: view.mean for view in views}
-        used = [view for view in views if view.name not in result.trace.left_out]
+        used = [view for view in views if view.name not in trace.left_out]
+        search = DirtSearch(used, self._factory, self._renderer, result.gaussians)
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
-            offsets=result.offsets, colours=colours_by_camera(result.trace.cameras, means),
-            gains=(log_gains(given.views), log_gains(views)), lights=mean_differences(result.trace.cameras),
-            same=given.same,
-            shifted=lambda name: shifted_region(name, used, self._factory, self._renderer, result.gaussians),
-            left_out={*given.left_out, *result.trace.left_out},
+            offsets=result.offsets, colours=colours_by_camera(trace.cameras, means), same=given.same,
+            gains=(log_gains(given.views) if CAMERA_GAIN in given.carried else {}, log_gains(views)),
+            differences=mean_differences({name: fit for name, fit in trace.cameras.items() if name in trace.met}),
+            region=lambda name: None if self._budget_is_spent(given, lens_dirt.WITNESSES) else search.region(name),
+            left_out={*given.left_out, *trace.left_out},
         )  # fmt: skip
-        fits = {name: outliers.health(given.past, off) for name, off in result.offsets.items()}
-        alarms = alarms if self._settings.reject_outliers else []
-        return replace(result, health=fits, alarms=alarms, timing=timing.timings(past)), past
+        return replace(result, health=health, alarms=alarms, timing=timing.timings(past)), past
 
     def _solve(self, given: UpdateInput) -> Solved:
         if (

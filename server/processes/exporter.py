@@ -25,6 +25,9 @@ NICE = 15
 RESERVE_BYTES = 500_000_000
 """Free disk space in bytes that exports leave for scenes, enough for about a thousand frames."""
 
+WRITTEN_TWICE = ("usd", "tapvid-mv")
+"""Formats that are written to temporary files first, and copied at the end."""
+
 log = logging.getLogger("scas4d.exporter")
 
 
@@ -101,7 +104,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
         def progress(_: int, done: int) -> None:
             connection.send(ExportProgressed(done, size_of(folder)))
-            twice = size_of(folder) if spec.format in ("usd", "tapvid-mv") else 0  # written again at the end
+            twice = size_of(folder) if spec.format in WRITTEN_TWICE else 0
             if (free := free_bytes(folder) - twice) < RESERVE_BYTES:
                 raise DiskReserveError(
                     f"{free / 1e6:.0f} MB are free, but {RESERVE_BYTES / 1e6:.0f} MB are reserved for frames"

@@ -39,15 +39,9 @@ Equally many failed or cancelled exports are remembered.
 KEEP_S = 24 * 3600.0
 """Time in seconds for which an exported file is kept."""
 BYTES_PER_GAUSSIAN = {"ply": 68, "splat": 32, "spz": 20, "spz4": 20, "glb": 70, "usd": 120, "tracks": 60, "s4d": 12}
-"""Approximate bytes per Gaussian and frame of each format, without view-dependent colour; other formats are small.
-
-Writing USD temporarily takes twice as much space.
-"""
+"""Approximate bytes per Gaussian and frame of each format, without view-dependent colour; other formats are small."""
 BYTES_PER_PIXEL = {"tapvid-mv": 5}
-"""Approximate bytes per pixel, frame and camera of formats with images.
-
-Writing them temporarily takes twice as much space.
-"""
+"""Approximate bytes per pixel, frame and camera of formats with images."""
 MEDIA_TYPES = {".zip": "application/zip", ".glb": "model/gltf-binary", ".csv": "text/csv"}
 FINAL_STATES = frozenset({ExportState.DONE, ExportState.FAILED, ExportState.CANCELLED})
 
@@ -225,7 +219,8 @@ class Exports:
             BYTES_PER_GAUSSIAN.get(request.format, 0) * (scene.status().gaussians or 0)
             + BYTES_PER_PIXEL.get(request.format, 0) * pixels
         )
-        needed = per_frame * frames + exporter.RESERVE_BYTES
+        copies = 2 if request.format in exporter.WRITTEN_TWICE else 1
+        needed = copies * per_frame * frames + exporter.RESERVE_BYTES
         if (free := free_bytes(parent)) < needed:
             raise Problem(
                 507,

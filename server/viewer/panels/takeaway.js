@@ -11,6 +11,8 @@ const NAMES = {
   usd: "USD", tracks: "Tracks", poses: "Poses of parts", "tapvid-mv": "TAPVid-MV", s4d: "Compact 4D file",
 };
 
+const WITH_IDS = ["tracks", "tapvid-mv"]; // formats for which points can be selected
+
 /** Formats a number of bytes, such as 3.1 MB. */
 function size(bytes) {
   const step = bytes < 1e6 ? ["kB", 1e3] : bytes < 1e9 ? ["MB", 1e6] : ["GB", 1e9];
@@ -59,7 +61,7 @@ export class TakeAway {
 
   choices() {
     const followed = page.tracks.some((track) => track.gaussian >= 0);
-    $("take-followed-label").hidden = $("take-format").value !== "tracks" || !followed;
+    $("take-followed-label").hidden = !WITH_IDS.includes($("take-format").value) || !followed;
   }
 
   async begin() {

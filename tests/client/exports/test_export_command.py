@@ -92,6 +92,12 @@ def test_a_source_without_ids_or_parts_is_refused_in_words(compact: Path, tmp_pa
     export(str(compact), "glb", tmp_path / "frames", **NOBODY)
     with pytest.raises(InputError, match="has no parts"):
         export(str(tmp_path / "frames"), "glb-parts", None, **NOBODY)
+    with pytest.raises(
+        InputError, match="has no cameras, but format 'tapvid-mv' requires them; use a source with a rig"
+    ):
+        export(str(tmp_path / "frames"), "tapvid-mv", None, **NOBODY)
+    with pytest.raises(InputError, match="id cannot be used with format 'ply'; omit --id, or use tracks or tapvid-mv"):
+        export(str(compact), "ply", None, ids=[1], **NOBODY)
     said = CliRunner().invoke(app, ["export", str(tmp_path / "splats"), "--format", "usd"])
     assert said.exit_code != 0
 

@@ -145,7 +145,7 @@ def found_shift(read: ExportedStates) -> np.ndarray:
     return corner.WORLD.origin * corner.WORLD.metres_per_unit
 
 
-@pytest.mark.parametrize("format", ["splat", "spz", "glb-parts", "tracks", "poses"])
+@pytest.mark.parametrize("format", ["splat", "spz", "glb-parts", "tracks", "poses", "tapvid-mv"])
 def test_formats_that_lose_the_states_are_refused_in_words(tmp_path, format):
     if format == "spz":
         pytest.importorskip("gsply", reason="pip install 'scas4d[exports]'")

@@ -6,19 +6,21 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from math import isnan, nan
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.robust import alarms, outliers
 from scas4d_core.robust.alarms import (
     BRIGHTNESS,
+    CAMERA_GAIN,
+    DARKEST,
     DIRT_ROW,
-    DIRT_SHARE,
-    DIRT_STATIC,
     GAIN,
     SHARPNESS,
     TINT,
@@ -26,9 +28,10 @@ from scas4d_core.robust.alarms import (
     Numbers,
     alarms_of,
     left_out_alarms,
+    log_gains,
     mean_differences,
 )
-from scas4d_core.robust.confirmed_errors import ShiftedRegion
+from scas4d_core.robust.lens_dirt import SHARE, STATIC_SHARE, ShiftedRegion
 from scas4d_core.robust.outliers import LAST_DB, NEAR_DB, NEW_DB, Past
 from studies.hard_frames.footage import SyntheticFootage
 
@@ -45,7 +48,7 @@ def never(name: str) -> ShiftedRegion:
 def settled(past: Past, **changes: Any) -> tuple[list[Alarm], Past]:
     given: dict[str, Any] = {
         "outcome": FrameOutcome.UPDATED, "reason": "", "exposure": 1.0, "offsets": NONE, "colours": GREY,
-        "sharp": SHARP, "same": (), "gains": (GREY, GREY), "lights": NONE, "shifted": never, **changes,
+        "sharp": SHARP, "same": (), "gains": (GREY, GREY), "differences": NONE, "region": never, **changes,
     }  # fmt: skip
     return alarms_of(past, past, **given)
 
@@ -217,8 +220,8 @@ def test_a_scene_raises_none_and_of_one_camera_in_another_colour_one(tmp_path: P
     assert {alarm.camera for alarm in report.alarms} <= {None, "c3"}
 
 
-def region_of(*names: str, share: float = 2 * DIRT_SHARE, level: float = 0.1) -> Callable[[str], ShiftedRegion]:
-    return lambda name: ShiftedRegion(share, 2 * DIRT_STATIC, level) if name in names else never(name)
+def region_of(*names: str, share: float = 2 * SHARE, level: float = 0.1) -> Callable[[str], ShiftedRegion]:
+    return lambda name: ShiftedRegion(share, 2 * STATIC_SHARE, level) if name in names else never(name)
 
 
 def brighter(amount: float, name: str = "c3") -> dict[str, float]:
@@ -227,36 +230,36 @@ def brighter(amount: float, name: str = "c3") -> dict[str, float]:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_dirt_raises_an_alarm_in_the_third_frame_and_as_long_as_it_stays(past: Past, sign: int) -> None:
-    found = in_a_row(past, 6, lights=brighter(2 * sign * BRIGHTNESS), shifted=region_of("c3", level=0.1 * sign))
+    found = in_a_row(past, 6, differences=brighter(2 * sign * BRIGHTNESS), region=region_of("c3", level=0.1 * sign))
     assert found == [[]] * (DIRT_ROW - 1) + [[("camera_misfit", "c3")]] * (7 - DIRT_ROW)
     text = [alarm.evidence for alarm in after_frames(past, DIRT_ROW, brighter(2 * sign * BRIGHTNESS), 0.1 * sign)]
     assert text == [
-        f"6% of its image is 10% of full brightness {'brighter' if sign > 0 else 'darker'} than the other cameras "
-        "suggest; check the lens for dirt"
+        f"a region of 6% of its image is {'brighter' if sign > 0 else 'darker'} than the other cameras suggest, by 10% "
+        "of the full range; check the lens for dirt"
     ]
 
 
 def after_frames(past: Past, frames: int, lights: Mapping[str, float], level: float) -> list[Alarm]:
     found: list[Alarm] = []
     for _ in range(frames):
-        found, past = settled(past, lights=lights, shifted=region_of("c3", level=level))
+        found, past = settled(past, differences=lights, region=region_of("c3", level=level))
     return found
 
 
 def test_an_image_is_searched_only_after_three_frames_in_the_same_direction(past: Past) -> None:
     for amount in (2, 2, -2, 2, 2, 0, -2, -2, 2):
-        found, past = settled(past, lights=brighter(amount * BRIGHTNESS))
+        found, past = settled(past, differences=brighter(amount * BRIGHTNESS))
         assert found == []
-    assert in_a_row(past, 6, lights=brighter(0.9 * BRIGHTNESS)) == [[]] * 6
-    assert in_a_row(past, 6, lights=dict.fromkeys(NAMES, 5 * BRIGHTNESS)) == [[]] * 6  # all cameras see it
+    assert in_a_row(past, 6, differences=brighter(0.9 * BRIGHTNESS)) == [[]] * 6
+    assert in_a_row(past, 6, differences=dict.fromkeys(NAMES, 5 * BRIGHTNESS)) == [[]] * 6  # all cameras see it
 
 
 @pytest.mark.parametrize(
     "region",
     [
-        ShiftedRegion(0.5 * DIRT_SHARE, 2 * DIRT_STATIC, 0.1),
-        ShiftedRegion(2 * DIRT_SHARE, 2 * DIRT_STATIC, -0.1),
-        ShiftedRegion(2 * DIRT_SHARE, 0.5 * DIRT_STATIC, 0.1),
+        ShiftedRegion(0.5 * SHARE, 2 * STATIC_SHARE, 0.1),
+        ShiftedRegion(2 * SHARE, 2 * STATIC_SHARE, -0.1),
+        ShiftedRegion(2 * SHARE, 0.5 * STATIC_SHARE, 0.1),
     ],
 )
 def test_a_change_without_such_a_region_becomes_usual(past: Past, region: ShiftedRegion) -> None:
@@ -266,18 +269,34 @@ def test_a_change_without_such_a_region_becomes_usual(past: Past, region: Shifte
         searched.append(name)
         return region
 
-    assert in_a_row(past, 8, lights=brighter(2 * BRIGHTNESS), shifted=search) == [[]] * 8
+    assert in_a_row(past, 8, differences=brighter(2 * BRIGHTNESS), region=search) == [[]] * 8
     assert searched == ["c3"]
 
 
 def test_a_camera_with_another_alarm_is_not_searched(past: Past) -> None:
-    found = in_a_row(past, 4, lights=brighter(2 * BRIGHTNESS), offsets={**NONE, "c3": LAST_DB - 1})
+    found = in_a_row(past, 4, differences=brighter(2 * BRIGHTNESS), offsets={**NONE, "c3": LAST_DB - 1})
     assert found == [[("camera_misfit", "c3")]] * 4
 
 
 def test_figures_of_an_earlier_version_are_unknown(past: Past) -> None:
-    old = replace(past, camera_figures={"c3": past.camera_figures["c3"][:9]})
-    assert CameraFigures.of(old, "c3") == CameraFigures()
+    arrays = past.arrays()
+    arrays["camera_figures"] = arrays["camera_figures"][:, :9]
+    old = Past.of_arrays(arrays)
+    np.testing.assert_equal(CameraFigures.of(old, "c3").row(), CameraFigures().row())
+    _, known = settled(replace(old, camera_figures=dict(list(old.camera_figures.items())[:3])))
+    assert known.arrays()["camera_figures"].shape == (len(NAMES), outliers.CAMERA_FIGURES)
+
+
+def test_an_image_that_cannot_be_searched_stays_suspect(past: Past) -> None:
+    for _ in range(5):
+        found, past = settled(past, differences=brighter(2 * BRIGHTNESS), region=lambda name: None)
+        assert found == []
+    assert CameraFigures.of(past, "c3").dirt == 5
+
+
+def test_no_image_is_searched_if_most_deviate(past: Past) -> None:
+    most = {name: (-1) ** k * 2 * BRIGHTNESS for k, name in enumerate(NAMES)}
+    assert in_a_row(past, 5, differences=most) == [[]] * 5
 
 
 def test_mean_differences_are_those_of_the_median_channel() -> None:
@@ -315,6 +334,12 @@ def test_gains_that_drift_and_those_of_all_cameras_raise_none(past: Past) -> Non
     assert settled(past, gains=(GREY, apart))[0] == []  # as when the effect is switched on
 
 
-def test_a_jump_in_the_first_updates_raises_none(past: Past) -> None:
-    early = replace(past, updates=1)
-    assert settled(early, gains=(GREY, gained("c3", 0.3, 0.3, 0.3)))[0] == []
+def test_gains_that_were_not_estimated_before_raise_none(past: Past) -> None:
+    assert settled(past, gains=({}, gained("c9", 0.3, 0.3, 0.3)))[0] == []  # the effect has just been switched on
+
+
+def test_log_gains_are_those_of_the_colour_channels() -> None:
+    exposure = np.array([[1.0, 0.1], [2.0, 0.2], [0.0, 0.3], [5.0, 0.4]], np.float32)
+    views: Any = [SimpleNamespace(name="a", exposure=exposure)]
+    assert log_gains(views)["a"].round(3).tolist() == [0.0, 0.693, round(float(np.log(DARKEST)), 3)]
+    assert CAMERA_GAIN in EFFECTS

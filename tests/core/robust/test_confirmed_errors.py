@@ -13,15 +13,12 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.alarms import DIRT_SHARE
 from scas4d_core.robust.confirmed_errors import (
     CellErrors,
-    ShiftedRegion,
     cell_errors,
     confirmed_cells,
     credited_decibels,
     ray_depths,
-    shifted_region,
 )
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -47,11 +44,6 @@ def error_of(frame: Frame, name: str, rig: Rig = RIG) -> float:
     factory = ViewFactory(rig)
     (view,) = (view for view in factory.views(frame, {}) if view.name == name)
     return CpuRenderer((0, 0, 0)).compare(BOX, [view])[0].psnr
-
-
-def region_of(frame: Frame, name: str) -> ShiftedRegion:
-    factory = ViewFactory(RIG)
-    return shifted_region(name, factory.views(frame, {}), factory, CpuRenderer((0, 0, 0)), BOX)
 
 
 def test_an_object_that_enters_is_confirmed() -> None:
@@ -139,27 +131,3 @@ def test_cells_cover_the_image_at_any_size(size: tuple[int, int]) -> None:
     errors = cell_errors(view, factory, CpuRenderer((0, 0, 0)), BOX)
     worst = np.unravel_index(errors.squares.argmax(), errors.squares.shape)
     assert np.abs(np.array(worst) - np.array([row, column]) / errors.edge).max() <= 1.5
-
-
-@pytest.mark.parametrize("white", [0.2, -0.3])
-def test_dirt_is_a_region_that_no_other_camera_confirms(white: float) -> None:
-    frame = take_frame(1, 0.1, BOX, RIG)
-    image = frame.images["c2"].astype(np.float64)
-    middle, before = (slice(16, 32), slice(16, 32)), image.copy()
-    image[middle] += white * (255 - image[middle]) if white > 0 else white * image[middle]
-    frame = replace(frame, images={**frame.images, "c2": image.round().astype(np.uint8)})
-    found, change = region_of(frame, "c2"), (image - before)[middle].mean() / 255
-    assert found.share >= DIRT_SHARE
-    assert 0.5 < found.level / change < 1.2
-    assert region_of(frame, "c0").share == 0
-
-
-def test_an_object_that_enters_is_no_such_region() -> None:
-    frame = take_frame(1, 0.1, with_visitor(ENTERED), RIG)
-    assert region_of(frame, "c0").share < DIRT_SHARE
-
-
-def test_a_small_change_of_the_whole_image_is_no_such_region() -> None:
-    frame = take_frame(1, 0.1, BOX, RIG)
-    brighter = (1.03 * frame.images["c2"].astype(np.float64)).clip(0, 255).round().astype(np.uint8)
-    assert region_of(replace(frame, images={**frame.images, "c2": brighter}), "c2") == ShiftedRegion(0.0, 0.0, 0.0)

@@ -17,9 +17,10 @@ from waiting import HANG_S
 from client.errors import Conflict, NotFound
 from client.sdk import Client
 from client.wire import Retention
-from client.wire.exports import SUFFIXES, ExportFormat
+from client.wire.exports import SUFFIXES, WITH_IDS, ExportFormat
 from scas4d_core.compact import CompactReader
 from scas4d_core.exports import FORMATS
+from scas4d_core.exports.formats import formats_with_ids
 from scas4d_core.query.ply import read_ply
 from server.processes import exporter
 from server.scene import exports as rules
@@ -50,6 +51,7 @@ def ran(service):
 
 def test_the_wire_names_the_formats_and_their_files():
     assert get_args(ExportFormat) == tuple(FORMATS) == tuple(SUFFIXES)
+    assert list(WITH_IDS) == formats_with_ids()
     assert dict(SUFFIXES) == {name: ".zip" if one.numbered else one.suffixes[0] for name, one in FORMATS.items()}
 
 
@@ -220,6 +222,7 @@ def test_limits_are_told(ran, service, monkeypatch, http):
     monkeypatch.undo()
     monkeypatch.setattr(rules, "free_bytes", lambda path: exporter.RESERVE_BYTES + 100)
     assert "the disk has" in problem(http.post(f"/v1/scenes/{id}/exports", json={"format": "usd"}), 507)["detail"]
+    assert "the disk has" in problem(http.post(f"/v1/scenes/{id}/exports", json={"format": "tapvid-mv"}), 507)["detail"]
     monkeypatch.undo()
     manager = service.app.state.exports
     kept = manager.get(id, done.id)

@@ -1,0 +1,23 @@
+"""Choice of the Gaussians whose trajectories are exported."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.gaussians import Gaussians
+
+MAX_TRACKS = 500
+"""Maximum number of trajectories, unless the Gaussians are given by their ids."""
+
+
+def evenly_spaced_moving_rows(first: Gaussians) -> NDArray[np.intp]:
+    """Returns up to ``MAX_TRACKS`` rows of the Gaussians that move in the first frame, evenly spaced among them.
+
+    >>> state = Gaussians.of_points(np.zeros((1000, 3)), radius=0.1)
+    >>> rows = evenly_spaced_moving_rows(state)
+    >>> len(rows), rows[[0, 1, -1]].tolist()
+    (500, [0, 2, 999])
+    """
+    moving = np.flatnonzero(first.moving)
+    return moving[np.linspace(0, len(moving) - 1, min(MAX_TRACKS, len(moving))).round().astype(np.intp)]

@@ -1,0 +1,98 @@
+"""Dirt on a lens: a region of one image that no other camera confirms, over static content."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from box_scene import MOVING, make_box, make_rig, take_frame
+
+from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.robust import lens_dirt
+from scas4d_core.robust.lens_dirt import FEWEST_CAMERAS, SHARE, STATIC_SHARE, DirtSearch, ShiftedRegion
+from scas4d_core.update.view_factory import ViewFactory
+
+RIG = make_rig()
+BOX = make_box()
+MIDDLE = (slice(16, 32), slice(16, 32))
+BLACK = (0.0, 0.0, 0.0)
+
+
+def search_of(frame: Frame, state: Gaussians = BOX, cameras: int | None = None) -> DirtSearch:
+    factory = ViewFactory(RIG)
+    return DirtSearch(factory.views(frame, {})[:cameras], factory, CpuRenderer(BLACK), state)
+
+
+def with_image(frame: Frame, name: str, image: np.ndarray) -> Frame:
+    return replace(frame, images={**frame.images, name: image.clip(0, 255).round().astype(np.uint8)})
+
+
+def dirty(frame: Frame, name: str, white: float) -> tuple[Frame, float]:
+    """Adds white (or removes light) in the middle of an image, and returns the mean change there."""
+    image = frame.images[name].astype(np.float64)
+    before = image.copy()
+    image[MIDDLE] += white * (255 - image[MIDDLE]) if white > 0 else white * image[MIDDLE]
+    return with_image(frame, name, image), float((image - before)[MIDDLE].mean() / 255)
+
+
+@pytest.mark.parametrize("white", [0.2, -0.3])
+def test_dirt_is_a_region_that_no_other_camera_confirms(white: float) -> None:
+    frame, change = dirty(take_frame(1, 0.1, BOX, RIG), "c2", white)
+    search = search_of(frame, labelled(0.0))
+    found = search.region("c2")
+    assert found is not None
+    assert found.is_dirt
+    assert 0.5 < found.level / change < 1.2
+    assert search.region("c0") == ShiftedRegion(0.0, 0.0, 0.0)
+
+
+def test_a_region_of_moving_content_alone_is_no_dirt() -> None:
+    frame, _ = dirty(take_frame(1, 0.1, BOX, RIG), "c2", 0.3)
+    static, moving = (search_of(frame, labelled(label)).region("c2") for label in (0.0, 1.0))
+    assert static is not None
+    assert moving is not None
+    assert (static.share, static.level) == (moving.share, moving.level)
+    assert static.static > moving.static
+    assert static.is_dirt
+    assert ShiftedRegion(2 * SHARE, 0.9 * STATIC_SHARE, 0.2).is_dirt is False
+    assert ShiftedRegion(0.9 * SHARE, 0.5 * SHARE, 0.2).is_dirt is False
+
+
+def labelled(label: float) -> Gaussians:
+    return BOX.replace(foreground=np.full(len(BOX), label, np.float32))
+
+
+def test_an_object_that_enters_is_no_dirt() -> None:
+    visitor = BOX.rows(np.arange(MOVING))
+    means = (0.5 * visitor.means + np.float32([0.0, -0.1, 0.45])).astype(np.float32)
+    visitor = visitor.replace(means=means, factors=np.float32(0.5) * visitor.factors, ids=visitor.ids + len(BOX))
+    found = search_of(take_frame(1, 0.1, BOX.concatenate(visitor), RIG)).region("c0")
+    assert found is not None
+    assert found.share < SHARE
+
+
+def test_a_small_change_of_the_whole_image_is_no_region() -> None:
+    frame = take_frame(1, 0.1, BOX, RIG)
+    frame = with_image(frame, "c2", 1.03 * frame.images["c2"].astype(np.float64))
+    assert search_of(frame).region("c2") == ShiftedRegion(0.0, 0.0, 0.0)
+
+
+def test_few_cameras_and_unused_cameras_are_not_searched() -> None:
+    frame, _ = dirty(take_frame(1, 0.1, BOX, RIG), "c2", 0.3)
+    assert search_of(frame, cameras=FEWEST_CAMERAS - 1).region("c2") is None
+    assert search_of(frame, cameras=FEWEST_CAMERAS).region(RIG.names[FEWEST_CAMERAS]) is None
+    assert search_of(frame, cameras=FEWEST_CAMERAS).region("c2") is not None
+
+
+def test_each_image_is_rendered_at_most_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered: list[str] = []
+    errors = lens_dirt.cell_errors
+    monkeypatch.setattr(lens_dirt, "cell_errors", lambda view, *rest: rendered.append(view.name) or errors(view, *rest))
+    search = search_of(take_frame(1, 0.1, BOX, RIG))
+    assert rendered == []
+    for name in RIG.names:
+        search.region(name)
+    assert sorted(rendered) == sorted(RIG.names)
