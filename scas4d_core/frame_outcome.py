@@ -84,8 +84,8 @@ class AlarmKind(StrEnum):
     CAMERA_LEFT_OUT = "camera_left_out"
     """Nothing was learnt from the camera: its image is missing or was excluded."""
     CAMERA_MISFIT = "camera_misfit"
-    """The camera's image, or a region of it, fits worse than usual relative to the others. The camera may have moved, or
-    be dirty or late."""
+    """The camera's image, or a part of it, fits worse than usual relative to the others: the camera may have moved, be
+    dirty or lag."""
     CAMERA_COLOURS = "camera_colours"
     """The camera's colours (exposure or white balance) deviate from its earlier images and from the other cameras."""
     CAMERA_SHARPNESS = "camera_sharpness"

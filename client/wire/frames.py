@@ -93,8 +93,8 @@ class AlarmModel(Model):
         description=(
             "camera_left_out: the update did not use the camera. camera_misfit: it fits worse than usual "
             "compared with the other cameras, or its lens may be dirty. camera_colours, camera_sharpness: its "
-            "colours or sharpness differ from its own past and from the other cameras. camera_frozen: it sent the same image "
-            "again. light: the lighting changed for all cameras. frame_repeated: all cameras sent the "
+            "colours or sharpness differ from its own past and from the other cameras. camera_frozen: it sent "
+            "the same image again. light: the lighting changed for all cameras. frame_repeated: all cameras sent the "
             "same images again. frame_in_part, frame_rejected: see `degraded`."
         )
     )

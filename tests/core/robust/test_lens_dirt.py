@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import lens_dirt
 from scas4d_core.robust.lens_dirt import FEWEST_CAMERAS, SHARE, STATIC_SHARE, DirtSearch, ShiftedRegion
 from scas4d_core.update.view_factory import ViewFactory
+from studies.hard_frames.footage import SyntheticFootage
 
 RIG = make_rig()
 BOX = make_box()
@@ -96,3 +98,18 @@ def test_each_image_is_rendered_at_most_once(monkeypatch: pytest.MonkeyPatch) ->
     for name in RIG.names:
         search.region(name)
     assert sorted(rendered) == sorted(RIG.names)
+
+
+def test_slight_dirt_raises_an_alarm_in_its_third_frame(tmp_path: Path) -> None:
+    footage = SyntheticFootage()
+    scene, name, first = footage.start(tmp_path), footage.rig.names[2], 6
+    raised: list[list[str]] = []
+    for index in range(1, first + 4):
+        frame = footage.frame(index)
+        if index >= first:
+            image = frame.images[name].astype(np.float64)
+            corner = (slice(2 * len(image) // 3, None), slice(image.shape[1] // 3))
+            image[corner] += 0.1 * (255 - image[corner])
+            frame = with_image(frame, name, image)
+        raised.append([f"{alarm.camera} {alarm.kind}" for alarm in scene.step(frame).alarms])
+    assert raised == [[]] * (first - 1 + 2) + [[f"{name} camera_misfit"]] * 2

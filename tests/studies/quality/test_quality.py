@@ -208,6 +208,17 @@ def test_a_perfect_reconstruction_scores_perfectly(capture_folder, tmp_path):
     }  # fmt: skip
 
 
+def test_static_true_parts_count_as_one_if_no_number_is_given(capture_folder):
+    scene = Perfect.start(None, None, None)
+    for t in range(1, FRAMES):
+        scene.step(types.SimpleNamespace(index=t))
+    capture = open_capture(capture_folder)
+    static = tuple(dataclasses.replace(part, static=True) for part in capture.ground_truth.parts)
+    truth = dataclasses.replace(capture.ground_truth, parts=static)
+    scores = measures.measure_parts(scene, dataclasses.replace(capture, ground_truth=truth), range(FRAMES))
+    assert (scores["parts_ari"], scores["parts_ari_found"]) == (1.0, 0.0)  # one true part, but two are found
+
+
 def test_half_the_motion_is_half_the_error(capture_folder):
     scene = Slow.start(None, None, None)
     for t in range(1, FRAMES):
