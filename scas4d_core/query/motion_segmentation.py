@@ -33,6 +33,8 @@ stretching, plus a margin, because deformation is rarely even."""
 NOISE = 0.0015
 """Track noise below which no relative motion is evidence, in units of the extent. The medians of the track errors
 measured on the captures are 0.07 to 0.6% of the extent."""
+WITHIN = 1.5
+"""Maximum noise of a patch, in units of the RMS deviation of its Gaussians from a rigid motion."""
 MIN_SHARE = 0.015
 """Smallest part, as a share of the weight of all Gaussians; smaller groups join the group that moves most alike."""
 KEEP = 1.25
@@ -324,9 +326,11 @@ class _Merging:
         self._apart = np.full((count, count), np.inf)
         for row in range(count):
             self._apart[row, :row] = self._apart[:row, row] = self._relative_motion(row, np.arange(row))
-        # The motion relative to the most similar patch: noise in rigid parts, deformation in others.
+        # The motion relative to the most similar patch: noise in rigid parts, deformation in others. The most similar
+        # patch of a small part may belong to another part, so the deviation within the patch limits the noise.
         nearest = self._apart.min(axis=1, initial=np.inf)
-        self._noise = np.where(np.isfinite(nearest), nearest, 0)
+        within = self._own / np.maximum(self._mass, 1e-12)
+        self._noise = np.minimum(np.where(np.isfinite(nearest), nearest, 0), WITHIN**2 * within)
         self._usual_noise = float(np.median(self._noise[self._alive])) if self._alive.any() else 0.0
 
     def run(self) -> Int:

@@ -249,3 +249,16 @@ def test_residuals_are_those_of_the_best_rigid_motion():
 def test_one_frame_has_one_part():
     scene = arm()
     assert set(scene.parts(frames=1)) == {0}
+
+
+def test_small_parts_of_one_patch_are_separate(monkeypatch):
+    """The most similar patch of such a part belongs to another part, whose relative motion is no noise."""
+    scene = Scene()
+    scene.add(0, scene.box([1.0, 0.6, 0.6], [0, 0, 0], 500), turning([0, 0, 1], 0.03, [0, 0, 0]))
+    for part, (rate, step) in enumerate(((0.08, 0.02), (-0.08, 0.03), (0.12, -0.02), (-0.12, -0.03)), 1):
+        points = scene.box([0.15, 0.15, 0.15], [0.3 * part - 0.75, 0.6, 0], 30)
+        turn = turning([part % 2, 1 - part % 2, 0.5], rate, points.mean(axis=0))
+        scene.add(part, points, lambda t, turn=turn, step=step: (*turn(t)[:2], np.array([0, 0, step]) * t))
+    assert adjusted_rand_score(scene.truth, scene.parts()) > 0.98
+    monkeypatch.setattr(module, "WITHIN", 1e6)
+    assert adjusted_rand_score(scene.truth, scene.parts()) < 0.95
