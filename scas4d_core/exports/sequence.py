@@ -82,7 +82,7 @@ def export_sequence(
         rig: rig in the user's world; used by USD and ``s4d``, and required for ``tapvid-mv``.
         parts: [N] part label of each Gaussian, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
         ids: ids of the Gaussians to write for ``tracks`` and ``tapvid-mv``. If None, ``tracks`` contains all moving
-            Gaussians, and ``tapvid-mv`` up to 500.
+            Gaussians, and ``tapvid-mv`` up to ``MAX_TRACKS`` (``track_rows``).
         frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. If None,
             the rate of the time codes is derived from the first two frames.
         background: background colour, RGB in [0, 1]; used by ``s4d`` and ``tapvid-mv``.
@@ -181,7 +181,8 @@ def _writer(
         assert rig is not None  # checked by ``export_sequence``
         return TapVidMvSequence(target, world, rig, ids, background)
     assert parts is not None  # required by the remaining formats
-    return PartAsset(target, world, parts) if wanted.name == "glb-parts" else PoseTable(target, world, parts)
+    of_parts: dict[str, type[PartAsset | PoseTable]] = {"glb-parts": PartAsset, "poses": PoseTable}
+    return of_parts[wanted.name](target, world, parts)
 
 
 class _Folder:

@@ -78,8 +78,8 @@ class TapVidMvSequence:
         path: path of the file.
         world: transform from the user's world to the internal world.
         rig: cameras in the user's world.
-        ids: ids of the Gaussians whose centres are the tracks, which are written in ascending order. If None, up to
-            500 of the Gaussians that move in the first frame are written.
+        ids: ids of the Gaussians whose centres are the tracks, which are written in ascending order. If None, those
+            of ``evenly_spaced_moving_rows`` are written.
         background: background colour of the images, RGB in [0, 1].
 
     Raises:

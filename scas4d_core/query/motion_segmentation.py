@@ -308,9 +308,22 @@ def _label_weights(labels: NDArray[Any], patches: Int, tracks: Tracks) -> Float:
 class _Merging:
     """Merges patches into groups, most similar motion first.
 
+    All distances are mean squares, or their sums over the Gaussians and pairs of frames of a group.
+
     Args:
         moments: moments of the patches.
         known: [K, L] weight of each previous label in each patch, or None.
+
+    Attributes:
+        moments: moments of the groups. A group has the row of one of its patches.
+        _known: [K, L] weight of each previous label in each group, or None.
+        _own: [K] sum of squared distances from the rigid motion of the group.
+        _inner: [K] the same from the rigid motions of its patches.
+        _mass, _size: [K] weight in all pairs of frames, and the largest weight in a pair.
+        _alive: [K] whether the row is a group; rows of merged patches are not.
+        _groups: [K] group of each patch.
+        _apart: [K, K] relative motion of two groups.
+        _noise: [K] track noise of each group, the mean over its patches; ``_usual_noise`` is the median of the patches.
     """
 
     def __init__(self, moments: Moments, known: Float | None) -> None:

@@ -256,6 +256,8 @@ def _check_gains(
 ) -> None:
     """Compares each camera's gains with those of the previous frame, or with those before they jumped.
 
+    The alarm of a jump is repeated until the gains return.
+
     Args:
         figures: figures of the cameras, which are updated.
         alarms: alarms of each camera, to which alarms are added.

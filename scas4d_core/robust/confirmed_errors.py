@@ -49,7 +49,7 @@ NEAREST, FARTHEST = 0.12, 3.0
 SIMILAR = 0.25
 """Minimum squared error of another camera at a point, relative to that of the tested cell. Backgrounds differ between
 cameras, so errors differ as well."""
-WITNESSES = 2
+MIN_WITNESSES = 2
 """Minimum number of other cameras that see a point."""
 AGREE = 0.75
 """Minimum share of these cameras that have an error there."""
@@ -179,7 +179,7 @@ def confirmed_cells(
         at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)
         asked += inside
         agree += inside & (nearby[at] >= least)
-    visible = (asked >= WITNESSES).reshape(len(depths), len(tested))
+    visible = (asked >= MIN_WITNESSES).reshape(len(depths), len(tested))
     agreed = visible & (agree >= AGREE * asked).reshape(visible.shape)
     confirmed = np.zeros(cells.shape, np.bool_)
     confirmed[row, column] = agreed.any(axis=0)

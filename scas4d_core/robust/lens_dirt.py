@@ -1,7 +1,8 @@
 """Search for dirt on a lens: a region of one image that is brighter or darker than the other cameras suggest.
 
 Dirt scatters light or blocks it. It hardly changes the PSNR of an image, so the search compares brightness instead.
-Errors that other cameras confirm do not count.
+Errors that other cameras confirm do not count. ``alarms`` starts the search if the mean brightness of an image has
+changed for several frames, and raises the alarm. No search is made if the time budget of the frame is spent.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ STATIC_SHARE = 0.005
 moving content may be an error of the update."""
 FEWEST_CAMERAS = 4
 """Minimum number of cameras. With fewer, no two others could confirm what an image shows."""
-WITNESSES = 12
+MAX_WITNESSES = 12
 """Maximum number of other cameras that may confirm errors, spread over the rig."""
 
 
@@ -80,7 +81,7 @@ class DirtSearch:
         if name not in self._views or len(self._views) < FEWEST_CAMERAS:
             return None
         rig, own = self._factory.posed, self._errors_of(name)
-        others = spread_cameras(rig, [other for other in self._views if other != name], WITNESSES)
+        others = spread_cameras(rig, [other for other in self._views if other != name], MAX_WITNESSES)
         confirmed = confirmed_cells(
             name, own, {other: self._errors_of(other) for other in others}, rig, ray_depths(rig[name], self._state)
         )

@@ -119,7 +119,7 @@ class FrameSolver:
             offsets=result.offsets, colours=colours_by_camera(trace.cameras, means), same=given.same,
             gains=(log_gains(given.views) if CAMERA_GAIN in given.carried else {}, log_gains(views)),
             differences=mean_differences({name: fit for name, fit in trace.cameras.items() if name in trace.met}),
-            region=lambda name: None if self._budget_is_spent(given, lens_dirt.WITNESSES) else search.region(name),
+            region=lambda name: None if self._budget_is_spent(given, lens_dirt.MAX_WITNESSES) else search.region(name),
             left_out={*given.left_out, *trace.left_out},
         )  # fmt: skip
         return replace(result, health=health, alarms=alarms, timing=timing.timings(past)), past

@@ -189,6 +189,7 @@ class Exports:
         return export
 
     def _check(self, scene: Scene, request: ExportRequest, frames: int) -> None:
+        """Raises a ``Problem`` if there are too many exports, or too little disk space for this one."""
         id = scene.id
         waiting = [one for each in self._known.values() for one in each.values() if one.state not in FINAL_STATES]
         if len(waiting) >= MAX_WAITING:
@@ -227,8 +228,8 @@ class Exports:
                 f"the disk has {free / 1e6:.0f} MB free, of which {exporter.RESERVE_BYTES / 1e6:.0f} MB are reserved "
                 f"for frames; the export takes about {(needed - exporter.RESERVE_BYTES) / 1e6:.1f} MB",
                 field="last",
-                value=frames,
-                remedy="export fewer frames, choose a smaller format (spz, s4d), or remove finished exports",
+                value=request.last,
+                remedy="export fewer frames, choose a smaller format (s4d), or remove finished exports",
             )
 
     async def _run_in_turn(self, export: Export) -> None:
