@@ -5,9 +5,10 @@ Nothing is reconstructed; the states of a compact file, or of an export with Gau
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -45,6 +46,7 @@ def evaluate_states(
     options: CaptureOptions = DEFAULT_OPTIONS,
     frames: int | None = None,
     rate: float | None = None,
+    image_scale: float = 1.0,
     report: Report = print,
 ) -> Row:
     """Scores stored states, prints the table, and writes the row, per-frame lines, images and table.md to `out`.
@@ -56,6 +58,7 @@ def evaluate_states(
         options: options for reading the capture.
         frames: maximum number of frames to score; None for all.
         rate: frame rate of numbered files; None for the default of 30.
+        image_scale: scale of the images to compare with, as in the reconstruction.
         report: callback that receives each printed line.
 
     Raises:
@@ -67,7 +70,7 @@ def evaluate_states(
             f"states {str(source)!r} does not exist", "use a .s4d file, or an export with ids (see docs/exports.md)"
         )
     states = of_path(source, rate)
-    truth = options.open(folder, image_scale=Settings().scene.image_scale)
+    truth = options.open(folder, image_scale=image_scale)
     unseen = truth.full_test_rig is not None
     truth = truth if unseen else truth.with_training_as_test()
     for remark in [*states.of.remarks, *([] if states.of.damage is None else [states.of.damage])]:
@@ -83,6 +86,24 @@ def evaluate_states(
     (out / "table.md").write_text(table + "\n")
     report(table)
     return row
+
+
+def scale_of(changes: Mapping[str, Any]) -> float:
+    """Returns the image scale of changed settings, which must not change any other setting.
+
+    >>> scale_of({"scene": {"image_scale": 0.5}}), scale_of({})
+    (0.5, 1.0)
+    >>> scale_of({"update": {"iterations": 50}})
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: set 'update' has no effect with --states; use only scene.image_scale
+    """
+    scene = changes.get("scene", {})
+    others = [name for name in changes if name != "scene"] + [
+        f"scene.{name}" for name in scene if name != "image_scale"
+    ]
+    if others:
+        raise InputError(f"set {others[0]!r} has no effect with --states", "use only scene.image_scale")
+    return Settings.model_validate(changes).scene.image_scale
 
 
 def _measure(found: Source, truth: Capture, store: Store, frames: int | None, report: Report) -> Row:

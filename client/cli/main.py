@@ -137,7 +137,10 @@ def evaluate(
     ] = False,
     states: Annotated[
         Path | None,
-        typer.Option(help="Score existing states instead of reconstructing: a .s4d file, USD, or numbered .glb files."),
+        typer.Option(
+            help="Score existing states instead of reconstructing: a .s4d file, USD, or numbered .glb files. Use the "
+            "same --set scene.image_scale=... as for the reconstruction."
+        ),
     ] = None,
     rate: Annotated[
         float | None, typer.Option("--source-fps", help="Frame rate of numbered files in --states. [30]")
@@ -148,9 +151,10 @@ def evaluate(
     Without test cameras (use --test to hold some out), training cameras are scored and the table is marked accordingly.
     """
     if states is not None:
-        from client.cli.evaluate_states import evaluate_states
+        from client.cli.evaluate_states import evaluate_states, scale_of
 
-        evaluate_states(states, capture, out, options=options, frames=frames, rate=rate)
+        scale = scale_of(parse_changes(changes))
+        evaluate_states(states, capture, out, options=options, frames=frames, rate=rate, image_scale=scale)
         return
     from client.cli.evaluate import evaluate as run
 

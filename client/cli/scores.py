@@ -125,6 +125,7 @@ QUALITY = (
     Column("δ", "tapvid_within", ".3f"),
     Column("OA", "tapvid_oa", ".3f"),
     Column("parts ARI", "parts_ari", ".3f"),
+    Column("ARI, found parts", "parts_ari_found", ".3f"),
     Column("alarms", "alarms", "d"),
     Column("s/update", "seconds_update"),
     Column("MB", "peak_mb", ".0f"),

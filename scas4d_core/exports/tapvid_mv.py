@@ -2,6 +2,8 @@
 
 The layout is that of a sequence of the dataset (google-deepmind/tapnet, ``tapvidmv``). The ``.zip`` contains:
 
+- ``scas4d.json``: names of the cameras in the order of their folders, frame numbers, times in seconds, and the ids of
+  the Gaussians that are tracked. The benchmark does not read this file.
 - ``tracks_xyz.npy``: [T, N, 3] float32 positions, NaN while a Gaussian is absent.
 - ``queries_xytv.npy``: [N, 4] float32 u, v, frame and view of each query. The frame and view are drawn from those in
   which the track is visible; tracks that are never visible are omitted.
@@ -13,14 +15,13 @@ The layout is that of a sequence of the dataset (google-deepmind/tapnet, ``tapvi
   - ``intrinsics.npy``: [4] float32 fx, fy, cx, cy in pixels.
   - ``extrinsics_w2c.npy``: [T, 4, 4] float32 transforms from the world to the camera.
 
-Positions and depths are in metres. The world has the axes of the user's world, but its origin is that of the scene's
-internal world, because float32 is not precise far away from it. As in the dataset, the centre of the first pixel is at
-(0, 0).
+Positions and depths are in metres, in the user's world. As in the dataset, the centre of the first pixel is at (0, 0).
 """
 
 from __future__ import annotations
 
 import io
+import json
 import tempfile
 import zipfile
 from dataclasses import dataclass, field
@@ -113,6 +114,8 @@ class TapVidMvSequence:
         self._limits = rig_limits("auto", world, rig.cameras)
         self._renderer = ViewRenderer(world, self._limits)
         self._tracks: list[NDArray[np.float64]] = []
+        self._frames: list[int] = []
+        self._times: list[float] = []
         with translate_write_errors(self.path):
             self._temporary = tempfile.TemporaryDirectory(prefix=".part-", dir=self.path.parent)
         self._views = [_View(camera, Path(self._temporary.name) / str(k)) for k, camera in enumerate(rig.cameras)]
@@ -135,12 +138,13 @@ class TapVidMvSequence:
         positions = np.full((len(self._ids), 3), np.nan)
         _, columns, rows = np.intersect1d(self._ids, gaussians.ids, return_indices=True)
         present = gaussians.present[rows]
-        positions[columns[present]] = gaussians.means[rows[present]]
+        positions[columns[present]] = self._world.to_user(gaussians.means[rows[present]])
         self._tracks.append(positions)
-        in_user_world = self._world.to_user(positions)
+        self._frames.append(index)
+        self._times.append(time)
         with translate_write_errors(self.path):
             for view in self._views:
-                self._add_view(view, gaussians, in_user_world)
+                self._add_view(view, gaussians, positions)
 
     def _add_view(self, view: _View, gaussians: Gaussians, positions: NDArray[np.float64]) -> None:
         rendered = self._renderer.render(gaussians, view.camera, self._background)
@@ -184,14 +188,23 @@ class TapVidMvSequence:
         if not kept.any():
             raise InputError("no camera ever sees any of the tracks", "use other frames or ids")
         tracks, visible = tracks[:, kept], visible[:, kept]
-        cameras = [self._world.camera_to_inside(view.camera) for view in self._views]
-        _save(archive, "tracks_xyz.npy", tracks.astype(np.float32))
-        _save(archive, "queries_xytv.npy", _queries(tracks, visible, cameras))
-        for k, (view, camera) in enumerate(zip(self._views, cameras, strict=True)):
+        names = {
+            "cameras": [view.camera.name for view in self._views],
+            "frames": self._frames,
+            "times": self._times,
+            "ids": self._ids[kept].tolist(),
+        }
+        archive.writestr("scas4d.json", json.dumps(names))
+        metres = self._world.metres_per_unit
+        _save(archive, "tracks_xyz.npy", (metres * tracks).astype(np.float32))
+        _save(archive, "queries_xytv.npy", _queries(tracks, visible, [view.camera for view in self._views]))
+        for k, view in enumerate(self._views):
+            camera, pose = view.camera, view.camera.world_to_camera.copy()
+            pose[:3, 3] *= metres
             intrinsics = np.array(
                 [camera.fx, camera.fy, camera.cx - PIXEL_CENTRE, camera.cy - PIXEL_CENTRE], np.float32
             )
-            poses = np.repeat(camera.world_to_camera[None].astype(np.float32), count, axis=0)
+            poses = np.repeat(pose[None].astype(np.float32), count, axis=0)
             depth = np.memmap(view.folder / "depth", "<f4", "r", shape=(count, camera.height, camera.width))
             files = np.empty(count, dtype=object)
             with (view.folder / "jpeg").open("rb") as encoded:

@@ -120,7 +120,9 @@ def alarms_of(
     same: Collection[str],
     left_out: Collection[str] = (),
 ) -> tuple[list[Alarm], Past]:
-    """Returns the alarms of an update, except those of excluded cameras, and the past for the next frame.
+    """Returns the alarms of an update, and the past for the next frame.
+
+    An excluded camera has an alarm of ``left_out_alarms``, and here only that of a frozen image.
 
     Args:
         past, after: usual values before and after the frame.
@@ -161,7 +163,9 @@ def alarms_of(
     _check_for_dirt(figures, alarms, _minus_median(differences), region)
     raised: dict[AlarmKind, dict[str, Alarm]] = {}
     for name in figures:
-        for alarm in alarms[name] if name not in left_out else ():
+        for alarm in alarms[name]:
+            if name in left_out and alarm.kind is not AlarmKind.CAMERA_FROZEN:
+                continue  # only the images themselves show what is wrong with a camera that was not used
             raised.setdefault(alarm.kind, {})[name] = alarm
     found += [alarm for of_kind in raised.values() for alarm in unless_most(of_kind, count).values()]
     rows = {name: now.row() for name, now in figures.items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from client.cli.evaluate_states import evaluate_states
@@ -120,5 +121,15 @@ def test_states_of_any_source_have_the_same_scores(compact: Path, capture_folder
     background = of_path(tmp_path / "frames.zip").of.head.background
     assert background == (0, 0, 0)  # glTF has none: the scores differ by it
     assert two["psnr"] != one["psnr"]
+    half = evaluate_states(compact, capture_folder, tmp_path / "half", frames=3, image_scale=0.5, report=said.append)
+    (image,) = (tmp_path / "half" / "pictures").rglob("frame0000_camera2.png")
+    full = tmp_path / f"scores-{compact.stem}" / "pictures" / one["key"] / "frame0000_camera2.png"
+    with Image.open(image) as small, Image.open(full) as large:
+        assert small.height < large.height
+    assert half["psnr"] != one["psnr"]
+    refused = CliRunner().invoke(
+        app, ["evaluate", str(capture_folder), "--states", str(compact), "--set", "update.iterations=5"]
+    )
+    assert refused.exit_code != 0
     with pytest.raises(InputError, match="does not exist"):
         evaluate_states(tmp_path / "none.s4d", capture_folder, tmp_path / "x", report=said.append)

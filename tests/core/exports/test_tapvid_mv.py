@@ -1,6 +1,7 @@
 """TAPVid-MV: what a loader of the benchmark reads from the files, compared with the state."""
 
 import io
+import json
 import zipfile
 
 import numpy as np
@@ -69,8 +70,8 @@ def test_tracks_are_the_centres_that_some_camera_sees(sequence):
     assert kept[2]
     assert tracks.dtype == np.float32
     for k, (_, _, state) in enumerate(states()):
-        expected = np.where(state.present[:, None], state.means, np.nan)[kept]
-        np.testing.assert_allclose(tracks[k], expected, rtol=1e-6)
+        expected = np.where(state.present[:, None], 0.01 * WORLD.to_user(state.means), np.nan)[kept]
+        np.testing.assert_allclose(tracks[k], expected, rtol=1e-5)  # the user's unit is a centimetre
     assert np.isnan(tracks[2]).any()
     for view, visible in zip(views, seen, strict=True):
         assert view["visibility"].dtype == bool
@@ -90,7 +91,7 @@ def test_cameras_project_the_tracks_to_the_pixels_of_the_rig(sequence):
             expected, depth = camera.project(WORLD.to_user(state.means[kept]))
             there = state.present[kept]
             np.testing.assert_allclose(uv[there], expected[there] - 0.5, atol=0.01)  # the first pixel's centre is 0
-            np.testing.assert_allclose(z[there], 0.01 * depth[there], rtol=1e-5)  # the user's unit is a centimetre
+            np.testing.assert_allclose(z[there], 0.01 * depth[there], rtol=1e-5)
 
 
 def test_images_and_depth_are_those_of_the_renderer(sequence):
@@ -160,7 +161,13 @@ def test_ids_select_the_tracks(tmp_path):
     export_sequence(states(), "tapvid-mv", tmp_path / "a.zip", world=WORLD, rig=RIG, ids=[59, 52, 57, 52])
     tracks, _, _ = read(tmp_path / "a.zip", tmp_path / "read")
     first, kept = next(states())[2], true_visibility().any(axis=(0, 1))
-    np.testing.assert_allclose(tracks[0], first.means[[row for row in (2, 7, 9) if kept[row]]], rtol=1e-6)
+    rows = [row for row in (2, 7, 9) if kept[row]]
+    np.testing.assert_allclose(tracks[0], 0.01 * WORLD.to_user(first.means[rows]), rtol=1e-5)
+    names = json.loads((tmp_path / "read" / "scas4d.json").read_text())
+    assert names == {
+        "cameras": list(RIG.names), "frames": [12, 13, 14], "times": [0.0, 0.04, 0.08],
+        "ids": [50 + row for row in rows],
+    }  # fmt: skip
     with pytest.raises(InputError, match=r"ids \[7, 999\] are in no exported frame; use ids of present Gaussians"):
         export_sequence(states(), "tapvid-mv", tmp_path / "b.zip", world=WORLD, rig=RIG, ids=[999, 52, 7])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "read"]

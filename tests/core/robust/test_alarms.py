@@ -168,8 +168,10 @@ def test_alarms_of_the_frame_are_no_cameras(past: Past) -> None:
     assert kinds_of(settled(past, outcome=FrameOutcome.UNCHANGED, offsets={})[0]) == []
 
 
-def test_a_camera_that_was_left_out_has_that_alarm_alone(past: Past) -> None:
+def test_a_camera_that_was_left_out_has_that_alarm_alone_unless_it_is_frozen(past: Past) -> None:
     assert settled(past, offsets={**NONE, "c3": -20.0}, left_out=["c3"])[0] == []
+    frozen = in_a_row(past, 4, same=["c3"], offsets={**NONE, "c3": -20.0}, left_out=["c3"])
+    assert frozen == [[], [("camera_frozen", "c3")], [("camera_frozen", "c3")], [("camera_frozen", "c3")]]
     found = left_out_alarms(["a", "b", "c"], ["a", "b"], {"b": "it shows nothing"})
     assert [(alarm.kind, alarm.camera) for alarm in found] == [
         (AlarmKind.CAMERA_LEFT_OUT, "b"), (AlarmKind.CAMERA_LEFT_OUT, "c"),
