@@ -17,10 +17,12 @@ from client import pictures
 from client.cli.changes import format_changes
 from client.cli.reconstruct import compile_kernels, reconstruct_frames
 from client.cli.scores import Row, Store, digest, markdown, stage_table
+from client.exports.sources import STATES
 from client.importers.open_source import CaptureOptions
 from client.left_out import LeftOut
 from client.progress import Bars
 from scas4d_core.captures import Capture, CaptureError
+from scas4d_core.errors import InputError
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 
@@ -146,7 +148,13 @@ def evaluate(
 
     Raises:
         CaptureError: the capture cannot be read.
+        InputError: `out` contains a reconstruction without scores.
     """
+    if (out / STATES).exists() and not (out / "rows").exists():
+        raise InputError(
+            f"out {str(out)!r} contains a reconstruction, but no scores",
+            f"use --states {out} and another folder for --out to score it",
+        )
     job = Job(folder, preset_name, preset(preset_name, changes), frames, options=options)
     for remark in options.open(folder).remarks:
         report(remark)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -149,13 +150,12 @@ def opened(
 
 
 def is_scene_id(source: str) -> bool:
-    """Returns whether a source is a scene id: a bare name without a suffix that is not an existing path.
+    """Returns whether a source is a scene id: a hexadecimal number that is not an existing path.
 
-    >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
+    >>> is_scene_id("0f6a21"), is_scene_id("robot"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
     (True, False, False, False)
     """
-    path = Path(source)
-    return not (path.exists() or path.suffix or len(path.parts) > 1)
+    return re.fullmatch("[0-9a-f]+", source) is not None and not Path(source).exists()
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,6 @@ class CameraFigures:
 
     Attributes:
         colours: [3] usual value of ``colours_of`` minus the median over cameras; NaN if unknown.
-        gains_before_jump: [3] log gains before they jumped, minus the median over cameras; NaN if they have not jumped.
         sharp: usual value of ``sharpness_of``; NaN if unknown.
         brightness: usual mean difference between the image and its rendering, minus the median over cameras; NaN if
             unknown.
@@ -79,7 +78,6 @@ class CameraFigures:
     """
 
     colours: tuple[float, float, float] = (nan, nan, nan)
-    gains_before_jump: tuple[float, float, float] = (nan, nan, nan)
     sharp: float = nan
     brightness: float = nan
     misfit: int = 0
@@ -95,13 +93,13 @@ class CameraFigures:
         row = past.camera_figures.get(name)
         if row is None:
             return cls()
-        red, green, blue, *gains, sharp, brightness = row[:8]
-        return cls((red, green, blue), (gains[0], gains[1], gains[2]), sharp, brightness, *map(int, row[8:]))
+        red, green, blue, sharp, brightness = row[:5]
+        return cls((red, green, blue), sharp, brightness, *map(int, row[5:]))
 
     def row(self) -> tuple[float, ...]:
         """Returns the figures as a row of ``Past.camera_figures``."""
         counts = self.misfit, self.tint, self.gain, self.blur, self.dirt, self.same
-        return (*self.colours, *self.gains_before_jump, self.sharp, self.brightness, *counts)
+        return (*self.colours, self.sharp, self.brightness, *counts)
 
 
 def alarms_of(
@@ -159,7 +157,7 @@ def alarms_of(
             name, before, past, offsets.get(name), shifts.get(name), sharp[name], changes[name] - common,
             few_same and name in same, spread,
         )  # fmt: skip
-    _check_gains(figures, alarms, *map(_minus_median, gains))
+    _check_gains(alarms, *map(_minus_median, gains))
     _check_for_dirt(figures, alarms, _minus_median(differences), region)
     raised: dict[AlarmKind, dict[str, Alarm]] = {}
     for name in figures:
@@ -249,35 +247,24 @@ def _check_camera(
     elif not blur and not isnan(sharp):
         usual_sharp = before.sharp + FOLLOWS * (sharp - before.sharp)
     counts = misfit, tint_frames, gain_frames, blur, before.dirt, repeats
-    return CameraFigures(colours, before.gains_before_jump, usual_sharp, before.brightness, *counts), alarms
+    return CameraFigures(colours, usual_sharp, before.brightness, *counts), alarms
 
 
 def _check_gains(
-    figures: dict[str, CameraFigures],
-    alarms: Mapping[str, list[Alarm]],
-    before: Mapping[str, Numbers],
-    after: Mapping[str, Numbers],
+    alarms: Mapping[str, list[Alarm]], before: Mapping[str, Numbers], after: Mapping[str, Numbers]
 ) -> None:
-    """Compares each camera's gains with those of the previous frame, or with those before they jumped.
+    """Compares each camera's gains with those of the previous frame.
 
-    The alarm of a jump is repeated until the gains return.
+    A jump raises an alarm in one frame, because the estimated gain then compensates for it.
 
     Args:
-        figures: figures of the cameras, which are updated.
         alarms: alarms of each camera, to which alarms are added.
         before, after: log gains before and after the update, minus the median over cameras.
     """
-    usual = {
-        name: before[name] if isnan(now.gains_before_jump[0]) else np.array(now.gains_before_jump)
-        for name, now in figures.items()
-        if name in before and name in after
-    }
-    changes = {name: after[name] - gains for name, gains in usual.items()}
+    changes = {name: after[name] - before[name] for name in alarms if name in before and name in after}
     largest = {name: float(np.abs(change).max()) for name, change in changes.items()}
     limit = max(JUMP, SPREAD * _upper_median(largest.values()))
     for name, change in changes.items():
-        red, green, blue = usual[name].tolist() if largest[name] > limit else (nan, nan, nan)
-        figures[name] = replace(figures[name], gains_before_jump=(red, green, blue))
         if largest[name] > limit:
             parts = ", ".join(
                 f"{colour} {100 * part:+.0f}%" for colour, part in zip(COLOURS, np.expm1(change), strict=True)

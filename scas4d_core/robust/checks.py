@@ -93,7 +93,7 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
         reasons; and the reason why nothing can be learnt from the frame, or None.
     """
     left_out = {
-        name: "it has been inconsistent with the other cameras since it was excluded"
+        name: f"excluded until its images fit again; frames so far: {past.frames_left_out[name]}"
         for name in bright
         if past.is_left_out(name)
     }

@@ -61,7 +61,7 @@ OTHER_EFFORT = 1.5
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """Rates at which a camera's usual level and the overall level follow new values."""
 
-CAMERA_FIGURES, TIMING_FIGURES = 14, 6
+CAMERA_FIGURES, TIMING_FIGURES = 11, 6
 """Numbers of values per camera in ``alarms.CameraFigures`` and ``timing.CameraTimingSums``."""
 
 Fault = TypeVar("Fault")

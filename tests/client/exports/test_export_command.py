@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from client.cli.evaluate import evaluate
 from client.cli.evaluate_states import evaluate_states
 from client.cli.main import app
 from client.exports.export import export
@@ -127,6 +128,12 @@ def test_states_of_any_source_have_the_same_scores(compact: Path, capture_folder
     with Image.open(image) as small, Image.open(full) as large:
         assert small.height < large.height
     assert half["psnr"] != one["psnr"]
+    (tmp_path / "unscored").mkdir()
+    (tmp_path / "unscored" / "states.s4d").write_bytes(compact.read_bytes())
+    with pytest.raises(
+        InputError, match=r"contains a reconstruction, but no scores; use --states .*unscored and another"
+    ):
+        evaluate(capture_folder, tmp_path / "unscored", changes={})
     refused = CliRunner().invoke(
         app, ["evaluate", str(capture_folder), "--states", str(compact), "--set", "update.iterations=5"]
     )
