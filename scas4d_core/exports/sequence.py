@@ -92,8 +92,9 @@ def export_sequence(
         The paths of the numbered files, or of the single file.
 
     Raises:
-        InputError: if the format is unknown, there is no frame, parts, a rig or a package are missing, the output
-            cannot be written, or Gaussians cannot be exported. Exceptions from ``states`` propagate unchanged.
+        InputError: if the format is unknown, there is no frame, parts, a rig or a package are missing, no frame
+            contains one of the ids, the output cannot be written, or Gaussians cannot be exported. Exceptions from
+            ``states`` propagate unchanged.
 
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np

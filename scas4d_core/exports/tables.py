@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
+from scas4d_core.exports.track_rows import check_ids_found
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.part_motion import PartMotion
 from scas4d_core.query.tracks import Tracks
@@ -79,16 +80,29 @@ class TrackTable(_Table):
     def __init__(self, path: Path | str, world: WorldFrame, ids: ArrayLike | None = None) -> None:
         super().__init__(path, TRACK_COLUMNS)
         self._world = world
-        self._ids = None if ids is None else np.asarray(ids, np.int64).reshape(-1)
+        self._ids = None if ids is None else np.unique(np.asarray(ids, np.int64))
+        self._found = np.zeros(0 if self._ids is None else len(self._ids), np.bool_)
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Adds a frame, given its index, its time in seconds, and its state in the internal world."""
         chosen = gaussians.moving if self._ids is None else gaussians.present & np.isin(gaussians.ids, self._ids)
+        if self._ids is not None:
+            self._found |= np.isin(self._ids, gaussians.ids)
         ids = gaussians.ids[chosen].tolist()
         means = self._world.to_user(gaussians.means[chosen])
         self.write(
             (index, _text(time, 15), identity, *map(_text, mean), "") for identity, mean in zip(ids, means, strict=True)
         )
+
+    def finish(self) -> None:
+        """Renames the file to its final name.
+
+        Raises:
+            InputError: if one of the given ids is in no frame.
+        """
+        if self._ids is not None:
+            check_ids_found(self._ids, self._found)
+        super().finish()
 
 
 class PoseTable(_Table):

@@ -37,7 +37,7 @@ from scas4d_core.engines.limits import rig_limits
 from scas4d_core.engines.renderer import levels
 from scas4d_core.errors import InputError
 from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
-from scas4d_core.exports.track_rows import evenly_spaced_moving_rows
+from scas4d_core.exports.track_rows import check_ids_found, evenly_spaced_moving_rows
 from scas4d_core.gaussians import Gaussians, moving_extent
 from scas4d_core.query.view import ViewRenderer
 from scas4d_core.query.visibility import visible_points
@@ -110,6 +110,7 @@ class TapVidMvSequence:
         self.path = Path(path)
         self._world, self._background = world, background
         self._ids = None if ids is None else np.unique(np.asarray(ids, np.int64))
+        self._known = np.empty(0, np.int64)
         self._extent = 0.0
         self._limits = rig_limits("auto", world, rig.cameras)
         self._renderer = ViewRenderer(world, self._limits)
@@ -137,6 +138,7 @@ class TapVidMvSequence:
         assert self._ids is not None
         positions = np.full((len(self._ids), 3), np.nan)
         _, columns, rows = np.intersect1d(self._ids, gaussians.ids, return_indices=True)
+        self._known = np.union1d(self._known, self._ids[columns])
         present = gaussians.present[rows]
         positions[columns[present]] = self._world.to_user(gaussians.means[rows[present]])
         self._tracks.append(positions)
@@ -181,9 +183,7 @@ class TapVidMvSequence:
         tracks, count = np.stack(self._tracks), len(self._tracks)
         visible = np.stack([np.stack(view.visible) for view in self._views], axis=-1)  # [T, N, views]
         assert self._ids is not None
-        unknown = self._ids[np.isnan(tracks).all(axis=(0, 2))]
-        if len(unknown):
-            raise InputError(f"ids {unknown[:5].tolist()} are in no exported frame", "use ids of present Gaussians")
+        check_ids_found(self._ids, np.isin(self._ids, self._known))
         kept = visible.any(axis=(0, 2))
         if not kept.any():
             raise InputError("no camera ever sees any of the tracks", "use other frames or ids")

@@ -5,10 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
 
 MAX_TRACKS = 500
 """Maximum number of trajectories, unless the Gaussians are given by their ids."""
+
+
+def check_ids_found(ids: NDArray[np.int64], found: NDArray[np.bool_]) -> None:
+    """Raises ``InputError`` if some of the requested ids [Q] were not found, according to the mask ``found`` [Q].
+
+    >>> check_ids_found(np.array([4, 5]), np.array([True, False]))
+    Traceback (most recent call last):
+    scas4d_core.errors.InputError: ids: no exported frame contains Gaussian 5; use ids of the exported states
+    """
+    if not found.all():
+        unknown = ", ".join(map(str, ids[~found][:5].tolist()))
+        raise InputError(f"ids: no exported frame contains Gaussian {unknown}", "use ids of the exported states")
 
 
 def evenly_spaced_moving_rows(first: Gaussians) -> NDArray[np.intp]:

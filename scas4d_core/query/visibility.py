@@ -48,7 +48,7 @@ def find_visibility(
         limits: rasterizer constants.
 
     Raises:
-        HistoryError: if a frame was not committed.
+        HistoryError: if a frame with points in the image was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
@@ -58,12 +58,17 @@ def find_visibility(
     >>> find_visibility(history, WorldFrame(np.zeros(3)), points, [0], camera, index=0)
     array([[ True, False,  True]])
     """
-    extent = moving_extent(history.gaussians(index))
-    visible = [
-        visible_points(history.gaussians(int(frame)), world, positions[t], camera, extent, limits)
-        for t, frame in enumerate(indices)
-    ]
-    return np.stack(visible) if visible else np.zeros(positions.shape[:2], np.bool_)
+    extent, visible = moving_extent(history.gaussians(index)), points_in_image(positions, camera)
+    for t in np.flatnonzero(visible.any(axis=1)).tolist():  # states of other frames need not be read
+        visible[t] = visible_points(history.gaussians(int(indices[t])), world, positions[t], camera, extent, limits)
+    return visible
+
+
+def points_in_image(positions: Float, camera: Camera) -> NDArray[np.bool_]:
+    """Returns whether points [..., 3] in the user's world are in front of a camera and in its image, [...] bool."""
+    uv, z = camera.project(positions)
+    inside: NDArray[np.bool_] = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
+    return inside
 
 
 def visible_points(
@@ -94,7 +99,7 @@ def visible_points(
     from scas4d_core.kernels.front_transmittance import front_transmittance  # deferred import: it loads the kernels
 
     uv, z = camera.project(positions)
-    visible = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
+    visible = points_in_image(positions, camera)
     rows = np.flatnonzero(visible)
     if not len(rows):
         return visible

@@ -52,6 +52,8 @@ ROW = 2
 """Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
 """Lower bound of a mean channel value, [0, 1], when computing relative differences."""
+SMALLEST_GAIN = 0.02
+"""Lower bound of a gain whose logarithm is computed."""
 FLAT = 0.5
 """Minimum mean difference of neighbouring pixels, in 8-bit levels, for measuring sharpness."""
 ROWS = 64
@@ -131,7 +133,7 @@ def alarms_of(
         colours: ``colours_of`` for each rendered camera.
         gains: ``log_gains`` before and after the update; empty unless the previous update has estimated them.
         differences: ``mean_differences`` of the cameras used for the frame.
-        region: function that searches a camera's image for dirt; see ``DirtSearch.region``.
+        region: function that searches a camera's image for dirt; see ``lens_dirt.shifted_region``.
         sharp: ``sharpness_of`` for each image of the frame.
         same: names of the cameras whose image is bit-identical to the previous one.
         left_out: names of the excluded cameras, for which ``left_out_alarms`` returns the alarms.
@@ -382,7 +384,7 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
 
 def log_gains(views: Iterable[TrainingView]) -> dict[str, Numbers]:
     """Returns the log gain [3] of the sRGB channels of each view."""
-    return {view.name: np.log(np.maximum(view.exposure[:3, 0].astype(np.float64), DARKEST)) for view in views}
+    return {view.name: np.log(np.maximum(view.exposure[:3, 0].astype(np.float64), SMALLEST_GAIN)) for view in views}
 
 
 def mean_differences(fits: Mapping[str, CameraFit]) -> dict[str, float]:

@@ -51,6 +51,8 @@ SIMILAR = 0.25
 cameras, so errors differ as well."""
 MIN_WITNESSES = 2
 """Minimum number of other cameras that see a point."""
+MAX_WITNESSES = 12
+"""Number of cameras, spread over the rig, among which errors are confirmed if time is short."""
 AGREE = 0.75
 """Minimum share of these cameras that have an error there."""
 MOST, PART = 0.4, 0.05
@@ -61,38 +63,6 @@ STATIC = 0.25
 
 Array = NDArray[np.float32]
 Bool = NDArray[np.bool_]
-
-
-def credited_decibels(
-    names: Collection[str],
-    views: Sequence[TrainingView],
-    factory: ViewFactory,
-    renderer: Renderer,
-    state: Gaussians,
-) -> dict[str, float]:
-    """Returns by how much the PSNR of each named camera would rise without the errors that other cameras confirm.
-
-    Args:
-        names: names of the cameras to test.
-        views: training views of the frame, including those of the named cameras.
-        factory: factory that created the views.
-        renderer: renderer for the state.
-        state: state to compare the images with.
-
-    Returns:
-        A value in dB of at least 0 for each named camera that has a view.
-    """
-    errors = {view.name: cell_errors(view, factory, renderer, state) for view in views}
-    credits = {}
-    for name in names:
-        if name in errors:
-            cells = errors[name].squares
-            others = {other: one for other, one in errors.items() if other != name}
-            depths = ray_depths(factory.posed[name], state)
-            confirmed = confirmed_cells(name, errors[name], others, factory.posed, depths)
-            without = np.where(confirmed, np.minimum(cells, _distinct(others)), cells)
-            credits[name] = 10 * log10(max(cells.mean(), ROUNDING) / max(without.mean(), ROUNDING))
-    return credits
 
 
 class CellErrors(NamedTuple):
@@ -111,6 +81,64 @@ class CellErrors(NamedTuple):
     static: Bool
     usual: float
     edge: float
+
+
+class ImageErrors:
+    """Errors of a state in the images of one frame. Each image is rendered at most once, when it is needed.
+
+    Args:
+        views: training views of the frame.
+        factory: factory that created the views.
+        renderer: renderer for the state.
+        state: state to compare the images with.
+
+    Attributes:
+        names: names of the cameras that have a view.
+    """
+
+    def __init__(
+        self, views: Sequence[TrainingView], factory: ViewFactory, renderer: Renderer, state: Gaussians
+    ) -> None:
+        self._views = {view.name: view for view in views}
+        self.names = tuple(self._views)
+        self._factory, self._renderer, self._state = factory, renderer, state
+        self._errors: dict[str, CellErrors] = {}
+
+    def errors(self, name: str) -> CellErrors:
+        """Returns the errors in the cells of a camera's image."""
+        if name not in self._errors:
+            self._errors[name] = cell_errors(self._views[name], self._factory, self._renderer, self._state)
+        return self._errors[name]
+
+    def confirmed(self, name: str, witnesses: Collection[str]) -> Bool:
+        """Returns the [h, w] mask of a camera's erroneous cells that other cameras confirm.
+
+        Args:
+            name: name of the camera.
+            witnesses: names of the cameras that may confirm errors. The camera itself is ignored.
+        """
+        rig, others = self._factory.posed, self._others(name, witnesses)
+        return confirmed_cells(name, self.errors(name), others, rig, ray_depths(rig[name], self._state))
+
+    def credited_decibels(self, names: Collection[str]) -> dict[str, float]:
+        """Returns by how much the PSNR of each named camera would rise without the errors that other cameras confirm.
+
+        All cameras that have a view may confirm errors.
+
+        Returns:
+            A value in dB of at least 0 for each named camera that has a view.
+        """
+        credits = {}
+        for name in names:
+            if name in self._views:
+                cells, confirmed = self.errors(name).squares, self.confirmed(name, self.names)
+                usual = _distinct(self._others(name, self.names))
+                without = np.where(confirmed, np.minimum(cells, usual), cells)
+                credits[name] = 10 * log10(max(cells.mean(), ROUNDING) / max(without.mean(), ROUNDING))
+        return credits
+
+    def _others(self, name: str, witnesses: Collection[str]) -> dict[str, CellErrors]:
+        return {other: self.errors(other) for other in witnesses if other != name}
 
 
 def cell_errors(view: TrainingView, factory: ViewFactory, renderer: Renderer, state: Gaussians) -> CellErrors:
@@ -173,10 +201,10 @@ def confirmed_cells(
     points = np.concatenate([camera.unproject(uv, np.full(len(uv), depth)) for depth in depths])
     agree, asked = (np.zeros(len(points), np.int64) for _ in range(2))
     least = np.tile(SIMILAR * cells[row, column], len(depths))
-    for other, (squares, _, _, _, edge) in others.items():
+    for other, errors in others.items():
         across, down, _, inside = pixels_inside(rig[other], points)
-        nearby = maximum_filter(squares, 3)  # a point projects between two cells
-        at = (down / edge).astype(np.int64), (across / edge).astype(np.int64)
+        nearby = maximum_filter(errors.squares, 3)  # a point projects between two cells
+        at = (down / errors.edge).astype(np.int64), (across / errors.edge).astype(np.int64)
         asked += inside
         agree += inside & (nearby[at] >= least)
     visible = (asked >= MIN_WITNESSES).reshape(len(depths), len(tested))

@@ -7,18 +7,14 @@ changed for several frames, and raises the alarm. No search is made if the time 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import label, uniform_filter
 
-from scas4d_core.engines.renderer import Renderer
-from scas4d_core.engines.views import TrainingView
-from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.confirmed_errors import CellErrors, cell_errors, confirmed_cells, ray_depths
+from scas4d_core.cameras import Rig
+from scas4d_core.robust.confirmed_errors import MAX_WITNESSES, ImageErrors
 from scas4d_core.update.best_state import spread_cameras
-from scas4d_core.update.view_factory import ViewFactory
 
 SHIFTED = 0.04
 """Minimum difference in brightness, [0, 1], of a cell in the region."""
@@ -31,8 +27,6 @@ STATIC_SHARE = 0.005
 moving content may be an error of the update."""
 FEWEST_CAMERAS = 4
 """Minimum number of cameras. With fewer, no two others could confirm what an image shows."""
-MAX_WITNESSES = 12
-"""Maximum number of other cameras that may confirm errors, spread over the rig."""
 
 
 class ShiftedRegion(NamedTuple):
@@ -54,48 +48,28 @@ class ShiftedRegion(NamedTuple):
         return self.share >= SHARE and self.static >= STATIC_SHARE
 
 
-class DirtSearch:
-    """Searches the images of one frame for dirt. Each image is rendered at most once, when it is needed.
+def shifted_region(images: ImageErrors, name: str, rig: Rig) -> ShiftedRegion | None:
+    """Returns the largest connected region of a camera's image that is brighter, or darker, by ``SHIFTED``.
 
     Args:
-        views: training views of the cameras that were used for the frame.
-        factory: factory that created the views.
-        renderer: renderer for the state.
-        state: state after the update.
+        images: errors of the state after the update, in the images that were used for the frame.
+        name: name of the camera.
+        rig: rig with all of these cameras.
+
+    Returns:
+        The region, whose share is 0 if there is none; or None if the camera was not used for the frame, or too few
+        cameras were.
     """
-
-    def __init__(
-        self, views: Sequence[TrainingView], factory: ViewFactory, renderer: Renderer, state: Gaussians
-    ) -> None:
-        self._views = {view.name: view for view in views}
-        self._factory, self._renderer, self._state = factory, renderer, state
-        self._errors: dict[str, CellErrors] = {}
-
-    def region(self, name: str) -> ShiftedRegion | None:
-        """Returns the largest connected region of a camera's image that is brighter, or darker, by ``SHIFTED``.
-
-        Returns:
-            The region, whose share is 0 if there is none; or None if the camera was not used for the frame, or too few
-            cameras were.
-        """
-        if name not in self._views or len(self._views) < FEWEST_CAMERAS:
-            return None
-        rig, own = self._factory.posed, self._errors_of(name)
-        others = spread_cameras(rig, [other for other in self._views if other != name], MAX_WITNESSES)
-        confirmed = confirmed_cells(
-            name, own, {other: self._errors_of(other) for other in others}, rig, ray_depths(rig[name], self._state)
-        )
-        smooth = uniform_filter(np.where(confirmed, 0, own.differences), SMOOTHED, mode="nearest")
-        best = ShiftedRegion(0.0, 0.0, 0.0)
-        for sign in (1, -1):
-            regions, _ = label(sign * smooth > SHIFTED)
-            sizes = np.bincount(regions.ravel())[1:]
-            if sizes.size and (share := float(sizes.max() / regions.size)) > best.share:
-                region = regions == 1 + sizes.argmax()
-                best = ShiftedRegion(share, float((region & own.static).mean()), float(smooth[region].mean()))
-        return best
-
-    def _errors_of(self, name: str) -> CellErrors:
-        if name not in self._errors:
-            self._errors[name] = cell_errors(self._views[name], self._factory, self._renderer, self._state)
-        return self._errors[name]
+    if name not in images.names or len(images.names) < FEWEST_CAMERAS:
+        return None
+    witnesses = spread_cameras(rig, [other for other in images.names if other != name], MAX_WITNESSES)
+    own, confirmed = images.errors(name), images.confirmed(name, witnesses)
+    smooth = uniform_filter(np.where(confirmed, 0, own.differences), SMOOTHED, mode="nearest")
+    best = ShiftedRegion(0.0, 0.0, 0.0)
+    for sign in (1, -1):
+        regions, _ = label(sign * smooth > SHIFTED)
+        sizes = np.bincount(regions.ravel())[1:]
+        if sizes.size and (share := float(sizes.max() / regions.size)) > best.share:
+            region = regions == 1 + sizes.argmax()
+            best = ShiftedRegion(share, float((region & own.static).mean()), float(smooth[region].mean()))
+    return best

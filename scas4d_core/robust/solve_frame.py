@@ -19,7 +19,7 @@ from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust import lens_dirt, outliers, timing
+from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import CAMERA_GAIN, alarms_of, colours_by_camera, log_gains, mean_differences
 from scas4d_core.robust.checks import (
     EXPOSURE,
@@ -28,9 +28,9 @@ from scas4d_core.robust.checks import (
     measure_light_gain,
     with_light_gain,
 )
-from scas4d_core.robust.confirmed_errors import credited_decibels
+from scas4d_core.robust.confirmed_errors import MAX_WITNESSES, ImageErrors
 from scas4d_core.robust.first_motion import OrderResult, best_order
-from scas4d_core.robust.lens_dirt import DirtSearch
+from scas4d_core.robust.lens_dirt import ShiftedRegion, shifted_region
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shift_moving
 from scas4d_core.robust.update_input import UpdateInput
@@ -62,8 +62,6 @@ of `robot` are lost, the next one reaches 33.5 dB with this factor, and 32.1 dB 
 REFERENCES = 6
 """Approximate number of cameras whose confirmed errors count as usual."""
 
-CONFIRMING_CAMERAS = 12
-"""Number of cameras, spread over the rig, that may confirm new content. The time grows with its square."""
 LONGEST_GAP = 3
 """Largest factor on the iterations of an update after missing frames; the factor is the gap between the frames."""
 
@@ -113,14 +111,18 @@ class FrameSolver:
         views, trace = result.views or given.views, result.trace
         means = {view.name: view.mean for view in views}
         used = [view for view in views if view.name not in trace.left_out]
-        search = DirtSearch(used, self._factory, self._renderer, result.gaussians)
+        images = ImageErrors(used, self._factory, self._renderer, result.gaussians)
+
+        def region(name: str) -> ShiftedRegion | None:
+            spent = self._budget_is_spent(given, MAX_WITNESSES)
+            return None if spent else shifted_region(images, name, self._factory.posed)
+
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
             offsets=result.offsets, colours=colours_by_camera(trace.cameras, means), same=given.same,
             gains=(log_gains(given.views) if CAMERA_GAIN in given.carried else {}, log_gains(views)),
             differences=mean_differences({name: fit for name, fit in trace.cameras.items() if name in trace.met}),
-            region=lambda name: None if self._budget_is_spent(given, lens_dirt.MAX_WITNESSES) else search.region(name),
-            left_out={*given.left_out, *trace.left_out},
+            region=region, left_out={*given.left_out, *trace.left_out},
         )  # fmt: skip
         return replace(result, health=health, alarms=alarms, timing=timing.timings(past)), past
 
@@ -325,9 +327,10 @@ class FrameSolver:
             return False
         with self._time_checks():
             views = [view for view in result.views or given.views if view.name in result.trace.met]
-            names = spread_cameras(self._rig, [view.name for view in views], CONFIRMING_CAMERAS)
+            names = spread_cameras(self._rig, [view.name for view in views], MAX_WITNESSES)
             views = [view for view in views if view.name in names]
-            credits = credited_decibels(names, views, self._factory, self._renderer, result.gaussians)
+            images = ImageErrors(views, self._factory, self._renderer, result.gaussians)
+            credits = images.credited_decibels(names)
             credited = {name: result.trace.met[name] + credit for name, credit in credits.items()}
             return outliers.misfit_reason(given.past, credited, len(result.trace.losses)) is None
 
@@ -459,7 +462,7 @@ class FrameSolver:
         views = [view for view in views if not past.is_left_out(view.name)]
         others = [view.name for view in views if view.name not in doubtful]
         others = others[:: max(1, len(others) // REFERENCES)]
-        credits = credited_decibels([*low, *others], views, self._factory, self._renderer, state)
+        credits = ImageErrors(views, self._factory, self._renderer, state).credited_decibels([*low, *others])
         usual = float(np.median([credits[name] for name in others])) if others else 0.0
         excess = {name: min(max(credits[name] - usual, 0.0), low[name]) for name in low if name in credits}
         return {**psnr, **{name: psnr[name] + credit for name, credit in excess.items()}}

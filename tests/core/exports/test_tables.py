@@ -43,7 +43,13 @@ def test_tracks_of_what_moves(tmp_path):
 
 def test_tracks_of_some_ids(tmp_path):
     rows = filled(TrackTable(tmp_path / "a.csv", corner.WORLD, ids=[59, 51]), [moving.state(0).retire([1])])
-    assert [row["id"] for row in rows] == ["59"]
+    assert [row["id"] for row in rows] == ["59"]  # Gaussian 51 is absent
+    table = TrackTable(tmp_path / "b.csv", corner.WORLD, ids=[7, 59])
+    table.add(12, 0.0, moving.state(0))
+    with pytest.raises(InputError, match="ids: no exported frame contains Gaussian 7"):
+        table.finish()
+    table.discard()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
 
 
 def test_tracks_that_were_asked_for_have_their_confidence(tmp_path):

@@ -15,9 +15,9 @@ from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.confirmed_errors import (
     CellErrors,
+    ImageErrors,
     cell_errors,
     confirmed_cells,
-    credited_decibels,
     ray_depths,
 )
 from scas4d_core.update.view_factory import ViewFactory
@@ -37,7 +37,8 @@ def with_visitor(centre: list[float], scale: float = 0.5) -> Gaussians:
 
 def credits_of(frame: Frame, names: list[str], rig: Rig = RIG) -> dict[str, float]:
     factory = ViewFactory(rig)
-    return credited_decibels(names, factory.views(frame, {}), factory, CpuRenderer((0, 0, 0)), BOX)
+    images = ImageErrors(factory.views(frame, {}), factory, CpuRenderer((0, 0, 0)), BOX)
+    return images.credited_decibels(names)
 
 
 def error_of(frame: Frame, name: str, rig: Rig = RIG) -> float:

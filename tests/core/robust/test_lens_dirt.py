@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from box_scene import MOVING, make_box, make_rig, take_frame
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust import lens_dirt
-from scas4d_core.robust.lens_dirt import FEWEST_CAMERAS, SHARE, STATIC_SHARE, DirtSearch, ShiftedRegion
+from scas4d_core.robust import confirmed_errors
+from scas4d_core.robust.confirmed_errors import CellErrors, ImageErrors
+from scas4d_core.robust.lens_dirt import FEWEST_CAMERAS, SHARE, STATIC_SHARE, ShiftedRegion, shifted_region
 from scas4d_core.update.view_factory import ViewFactory
 from studies.hard_frames.footage import SyntheticFootage
 
@@ -23,9 +26,13 @@ MIDDLE = (slice(16, 32), slice(16, 32))
 BLACK = (0.0, 0.0, 0.0)
 
 
-def search_of(frame: Frame, state: Gaussians = BOX, cameras: int | None = None) -> DirtSearch:
+def errors_of(frame: Frame, state: Gaussians = BOX, cameras: int | None = None) -> ImageErrors:
     factory = ViewFactory(RIG)
-    return DirtSearch(factory.views(frame, {})[:cameras], factory, CpuRenderer(BLACK), state)
+    return ImageErrors(factory.views(frame, {})[:cameras], factory, CpuRenderer(BLACK), state)
+
+
+def region_of(name: str, frame: Frame, state: Gaussians = BOX, cameras: int | None = None) -> ShiftedRegion | None:
+    return shifted_region(errors_of(frame, state, cameras), name, RIG)
 
 
 def with_image(frame: Frame, name: str, image: np.ndarray) -> Frame:
@@ -43,17 +50,16 @@ def dirty(frame: Frame, name: str, white: float) -> tuple[Frame, float]:
 @pytest.mark.parametrize("white", [0.2, -0.3])
 def test_dirt_is_a_region_that_no_other_camera_confirms(white: float) -> None:
     frame, change = dirty(take_frame(1, 0.1, BOX, RIG), "c2", white)
-    search = search_of(frame, labelled(0.0))
-    found = search.region("c2")
+    found = region_of("c2", frame, labelled(0.0))
     assert found is not None
     assert found.is_dirt
     assert 0.5 < found.level / change < 1.2
-    assert search.region("c0") == ShiftedRegion(0.0, 0.0, 0.0)
+    assert region_of("c0", frame, labelled(0.0)) == ShiftedRegion(0.0, 0.0, 0.0)
 
 
 def test_a_region_of_moving_content_alone_is_no_dirt() -> None:
     frame, _ = dirty(take_frame(1, 0.1, BOX, RIG), "c2", 0.3)
-    static, moving = (search_of(frame, labelled(label)).region("c2") for label in (0.0, 1.0))
+    static, moving = (region_of("c2", frame, labelled(label)) for label in (0.0, 1.0))
     assert static is not None
     assert moving is not None
     assert (static.share, static.level) == (moving.share, moving.level)
@@ -71,7 +77,7 @@ def test_an_object_that_enters_is_no_dirt() -> None:
     visitor = BOX.rows(np.arange(MOVING))
     means = (0.5 * visitor.means + np.float32([0.0, -0.1, 0.45])).astype(np.float32)
     visitor = visitor.replace(means=means, factors=np.float32(0.5) * visitor.factors, ids=visitor.ids + len(BOX))
-    found = search_of(take_frame(1, 0.1, BOX.concatenate(visitor), RIG)).region("c0")
+    found = region_of("c0", take_frame(1, 0.1, BOX.concatenate(visitor), RIG))
     assert found is not None
     assert found.share < SHARE
 
@@ -79,24 +85,30 @@ def test_an_object_that_enters_is_no_dirt() -> None:
 def test_a_small_change_of_the_whole_image_is_no_region() -> None:
     frame = take_frame(1, 0.1, BOX, RIG)
     frame = with_image(frame, "c2", 1.03 * frame.images["c2"].astype(np.float64))
-    assert search_of(frame).region("c2") == ShiftedRegion(0.0, 0.0, 0.0)
+    assert region_of("c2", frame) == ShiftedRegion(0.0, 0.0, 0.0)
 
 
 def test_few_cameras_and_unused_cameras_are_not_searched() -> None:
     frame, _ = dirty(take_frame(1, 0.1, BOX, RIG), "c2", 0.3)
-    assert search_of(frame, cameras=FEWEST_CAMERAS - 1).region("c2") is None
-    assert search_of(frame, cameras=FEWEST_CAMERAS).region(RIG.names[FEWEST_CAMERAS]) is None
-    assert search_of(frame, cameras=FEWEST_CAMERAS).region("c2") is not None
+    assert region_of("c2", frame, cameras=FEWEST_CAMERAS - 1) is None
+    assert region_of(RIG.names[FEWEST_CAMERAS], frame, cameras=FEWEST_CAMERAS) is None
+    assert region_of("c2", frame, cameras=FEWEST_CAMERAS) is not None
 
 
 def test_each_image_is_rendered_at_most_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rendered: list[str] = []
-    errors = lens_dirt.cell_errors
-    monkeypatch.setattr(lens_dirt, "cell_errors", lambda view, *rest: rendered.append(view.name) or errors(view, *rest))
-    search = search_of(take_frame(1, 0.1, BOX, RIG))
+    errors = confirmed_errors.cell_errors
+
+    def count(view: TrainingView, *rest: Any) -> CellErrors:
+        rendered.append(view.name)
+        return errors(view, *rest)
+
+    monkeypatch.setattr(confirmed_errors, "cell_errors", count)
+    images = errors_of(take_frame(1, 0.1, BOX, RIG))
     assert rendered == []
     for name in RIG.names:
-        search.region(name)
+        shifted_region(images, name, RIG)
+    images.credited_decibels(RIG.names)
     assert sorted(rendered) == sorted(RIG.names)
 
 

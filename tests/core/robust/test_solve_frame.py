@@ -19,6 +19,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
 from scas4d_core.robust.checks import with_light as with_light
+from scas4d_core.robust.confirmed_errors import ImageErrors
 from scas4d_core.robust.outliers import ERROR_RISE, Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import UpdateInput
@@ -330,9 +331,7 @@ def test_a_held_frame_is_told_as_it_is() -> None:
 def test_a_frame_with_new_content_that_cameras_confirm_is_accepted(
     credit: float, accepted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "scas4d_core.robust.solve_frame.credited_decibels", lambda names, *rest: dict.fromkeys(names, credit)
-    )
+    monkeypatch.setattr(ImageErrors, "credited_decibels", lambda images, names: dict.fromkeys(names, credit))
     outcome, after = solve(Fake(met(LEVEL - 20)), given(replace(PAST, updates=5)))
     assert outcome.outcome is (FrameOutcome.ACCEPTED if accepted else FrameOutcome.REJECTED_MISFIT)
     assert outcome.outcome.degraded

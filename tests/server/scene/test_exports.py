@@ -101,7 +101,10 @@ def test_one_file_holds_a_sequence_with_its_rig_and_parts(ran, tmp_path):
         assert list(reader.frames) == [0, 1, 2, 3]
         assert reader.head.rig.names == make_rig().names
         assert reader.parts().tolist() == [0, 1]
-    for one in begun:
+    unknown = over(sdk, id, sdk.begin_export(id, "tracks", ids=[1, 10**9]).id)
+    assert (unknown.state, unknown.done) == ("failed", 0)  # before a frame is written
+    assert unknown.error == f"ids: the scene has no Gaussian {10**9}; use ids from a state or from tracks"
+    for one in (*begun, unknown):
         sdk.delete_export(id, one.id)
 
 
