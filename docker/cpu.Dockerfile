@@ -18,6 +18,10 @@ COPY pyproject.toml README.md LICENSE ./
 COPY scas4d_core scas4d_core
 COPY server server
 COPY client client
+COPY docs docs
+COPY mkdocs.yml CONTRIBUTING.md CHANGELOG.md ./
+COPY scripts/build_site.py scripts/
+RUN tools/bin/python scripts/build_site.py
 RUN tools/bin/python -m pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir wheel . \
     && /opt/scas4d/bin/python -m pip install --no-cache-dir --no-deps --no-index wheel/*.whl \
     && /opt/scas4d/bin/python -m pip uninstall --yes pip setuptools

@@ -64,3 +64,20 @@ def test_named_variables_are_settings(page: Path) -> None:
 def test_the_table_of_folders_is_current() -> None:
     command = [sys.executable, "scripts/folder_table.py", "--check"]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0, "run scripts/folder_table.py"
+
+
+def test_the_site_is_built_with_every_page_and_without_broken_links(tmp_path: Path) -> None:
+    command = [sys.executable, "scripts/build_site.py", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    built = {path.stem for path in (tmp_path / "site").glob("*.html")}
+    assert {page.stem for page in PAGES} - {"README"} < built
+    navigation = (ROOT / "mkdocs.yml").read_text()
+    assert not [page.name for page in PAGES[1:] if f": {page.name}\n" not in navigation]
+
+
+@pytest.mark.parametrize("script", ["figures.py", "build_site.py"])
+def test_examples_in_scripts_run(script: str) -> None:
+    command = [sys.executable, "-m", "doctest", f"scripts/{script}"]
+    done = subprocess.run(command, cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

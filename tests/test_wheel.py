@@ -38,7 +38,7 @@ def test_it_holds_the_product_and_nothing_else(wheel: zipfile.ZipFile) -> None:
     assert {name.partition("/")[0] for name in found} == set(PACKAGES)
     assert not [name for name in found if {"bench", "stability", "studies", "tests"} & set(Path(name).parts)]
     sources = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
-    pages = [ROOT / "server" / name for name in ("viewer", "reference")]
+    pages = [ROOT / "server" / name for name in ("viewer", "reference", "site")]
     shown = {path.relative_to(ROOT).as_posix() for page in pages for path in page.rglob("*") if path.is_file()}
     assert "server/viewer/index.html" in shown
     assert found == sources | {name for name in shown if "__pycache__" not in name}

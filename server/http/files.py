@@ -11,7 +11,16 @@ from starlette.responses import FileResponse, Response
 from server.http.immutable import matches_etag
 from server.problems import Problem
 
-MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+MEDIA_TYPES = {
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+    ".xml": "application/xml",
+    ".png": "image/png",
+    ".webp": "image/webp",
+}
 
 
 def security_headers(**changes: str) -> dict[str, str]:

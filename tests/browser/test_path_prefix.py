@@ -50,7 +50,7 @@ def test_the_sdk_works_under_a_prefix(prefixed, finished):
 
 
 def test_the_reference_sends_its_requests_under_a_prefix(page, prefixed, finished):
-    page.goto(f"{prefixed}/docs")
+    page.goto(f"{prefixed}/docs/reference.html")
     page.get_by_text("Lists all scenes").first.click()
     page.get_by_role("button", name="Try it out").first.click()
     with page.expect_response(f"{prefixed}/v1/scenes*") as answer:

@@ -136,7 +136,7 @@ def test_a_range_behind_the_end_is_refused(http, address, asked):
     assert answer.headers["content-range"] == f"bytes */{len(whole)}"
 
 
-@pytest.mark.parametrize("path", ["/viewer/main.js", "/viewer/", "/docs", "/docs/reference.js"])
+@pytest.mark.parametrize("path", ["/viewer/main.js", "/viewer/", "/docs/reference.html", "/docs/reference.js"])
 def test_files_of_the_pages_are_not_sent_again(http, path):
     first = http.get(path)
     again = http.get(path, headers={"If-None-Match": first.headers["etag"]})

@@ -127,14 +127,14 @@ def test_the_service_s_own_page_and_an_allowed_one_are_let_in(service, guarded):
 
 def test_pictures_and_frames_of_other_sites_are_refused_and_links_are_not(service):
     picture = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors", "Sec_Fetch_Dest": "image"}
-    assert problem(get(service, "/docs", **picture), 403)["field"] == "Sec-Fetch-Site"
-    problem(get(service, "/docs", **picture | {"Sec_Fetch_Site": "same-site"}), 403)
-    assert get(service, "/docs", **picture | {"Sec_Fetch_Site": "same-origin"}).status_code == 200
+    assert problem(get(service, "/docs/reference.html", **picture), 403)["field"] == "Sec-Fetch-Site"
+    problem(get(service, "/docs/reference.html", **picture | {"Sec_Fetch_Site": "same-site"}), 403)
+    assert get(service, "/docs/reference.html", **picture | {"Sec_Fetch_Site": "same-origin"}).status_code == 200
     link = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate", "Sec_Fetch_Dest": "document"}
-    answer = get(service, "/docs", **link)
+    answer = get(service, "/docs/reference.html", **link)
     assert answer.status_code == 200
     assert answer.headers["x-frame-options"] == "DENY"
-    problem(get(service, "/docs", **link | {"Sec_Fetch_Dest": "iframe"}), 403)
+    problem(get(service, "/docs/reference.html", **link | {"Sec_Fetch_Dest": "iframe"}), 403)
     form = httpx.post(
         f"{service.url}/v1/scenes", headers={k.replace("_", "-"): v for k, v in link.items()}, timeout=HANG_S
     )

@@ -1,0 +1,88 @@
+"""Figures of the pages come from docs/figures.json, with their command, date and machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+from source_tree import ROOT
+
+SPEC = importlib.util.spec_from_file_location("figures", ROOT / "scripts" / "figures.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+figures = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(figures)
+
+RECORDS = {"robot": {"command": "c", "date": "2026-12-01", "machine": "m", "values": {"psnr": 35.748, "count": 21821}}}
+
+
+def test_figures_of_the_pages_are_current() -> None:
+    records = figures.load()
+    for page in figures.PAGES:
+        assert figures.with_figures(page.read_text(), records) == page.read_text(), "run scripts/figures.py"
+
+
+def test_the_readme_has_no_other_figures() -> None:
+    assert figures.unrecorded((ROOT / "README.md").read_text()) == []
+
+
+def test_every_record_names_command_date_and_machine_and_is_used() -> None:
+    used = {name.partition(".")[0] for page in figures.PAGES for _, name in figures.FIGURE.findall(page.read_text())}
+    records = figures.load()
+    assert set(records) == used
+    for name, record in records.items():
+        assert record["command"], name
+        assert record["machine"], name
+        assert re.fullmatch(r"\d{4}-\d{2}-\d{2}", record["date"]), name
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("1.0<!-- robot.psnr --> dB", "35.7<!-- robot.psnr --> dB"),
+        ("| 0.00<!-- robot.psnr -->|", "| 35.75<!-- robot.psnr -->|"),
+        ("1,000<!-- robot.count --> Gaussians (2025-01-01<!-- robot.date -->)",
+         "21,821<!-- robot.count --> Gaussians (2026-12-01<!-- robot.date -->)"),
+    ],
+)  # fmt: skip
+def test_a_figure_has_the_decimals_of_the_text(text: str, written: str) -> None:
+    assert figures.with_figures(text, RECORDS) == written
+
+
+def test_an_unknown_figure_is_an_error() -> None:
+    with pytest.raises(KeyError, match="ssim"):
+        figures.with_figures("1<!-- robot.ssim -->", RECORDS)
+
+
+@pytest.mark.parametrize("text", ["35.7 dB", "about two minutes", "1.5 s", "a 40% gain", "200 MB", "30 frames/s"])
+def test_numbers_with_units_must_be_recorded(text: str) -> None:
+    assert len(figures.unrecorded(text)) == 1
+    assert figures.unrecorded(f"`{text}`\n```\n{text}\n```\n") == []
+
+
+def test_what_is_no_measurement_needs_no_record() -> None:
+    assert (
+        figures.unrecorded("Python 3.11, 27 cameras 640×360, port 8000, two commands, 1.0<!-- robot.psnr --> dB") == []
+    )
+
+
+def test_rows_and_times_are_recorded(tmp_path: Path) -> None:
+    row = {
+        "capture": "robot", "measured": "2026-12-01T03:00:00+00:00", "psnr": 35.74812, "parts_ari": None,
+        "machine": {"processor": "AMD EPYC", "cores": 2},
+    }  # fmt: skip
+    (tmp_path / "robot.json").write_text(json.dumps(row))
+    assert dict(figures.record_rows([tmp_path / "robot.json"])) == {
+        "robot": {
+            "command": "scripts/bench quality CAPTURES/robot", "date": "2026-12-01", "machine": "AMD EPYC, 2 cores",
+            "values": {"psnr": 35.7481},
+        }
+    }  # fmt: skip
+    ran: list[list[str]] = []
+    record = figures.record_time(["scripts/test", "--fast"], ran.append)
+    assert ran == [["scripts/test", "--fast"]]
+    assert record["command"] == "scripts/test --fast"
+    assert set(record["values"]) == {"seconds", "minutes"}
