@@ -94,7 +94,8 @@ def demo(
         console.print(f"images (truth | render | difference x4): {out}", soft_wrap=True)
         if stays:
             console.print(
-                f"open {url}/#scene={id} (documentation: {url}/docs); press Ctrl-C to stop the service", soft_wrap=True
+                f"open {url}/#scene={id}&tour for a short tour (documentation: {url}/docs); Ctrl-C stops the service",
+                soft_wrap=True,
             )
             try:
                 while True:

@@ -9,6 +9,7 @@ import { showCameras, showEffects, showFacts, showLatency, showQueue, showWarnin
 import { PartList } from "./panels/parts.js";
 import { TakeAway } from "./panels/takeaway.js";
 import { Timeline } from "./panels/timeline.js";
+import { Tour } from "./panels/tour.js";
 import { Tracks } from "./panels/tracks.js";
 import { Tradeoff } from "./panels/tradeoff.js";
 import { SceneList, remember, wanted } from "./scenes.js";
@@ -48,6 +49,7 @@ const tracks = new Tracks(view);
 const figures = new Figures((index) => timeline.choose(index));
 const tradeoff = new Tradeoff($);
 const takeAway = new TakeAway();
+const tour = new Tour();
 const manage = new Manage(showStatus, letGo);
 const list = new SceneList(openScene, () => cluster.appear());
 const cluster = new ClusterView((id) => list.called(id), (id) => list.choose(id));
@@ -92,6 +94,7 @@ async function openScene({ id, asleep }) {
   beside.look(0);
   tradeoff.open(id);
   takeAway.open(id);
+  tour.wanted = hash.tour !== undefined;
   await loadReports();
 }
 
@@ -244,6 +247,7 @@ function bulk(head, bytes) {
 
 function showInfo(info) {
   $("curtain").hidden = true;
+  tour.start();
   if (info.here || info.tag === view.tag) $("busy").hidden = true;
   if (page.failed === "view") note("");
   const legend = $("legend");
