@@ -7,7 +7,7 @@ import random
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -21,8 +21,6 @@ from studies.options import Echo
 from studies.running.outcome import ScenarioResult
 from studies.running.process import PATIENCE_S, Service, StudyError, wait_until
 from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, running, undisturbed
-
-Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 
 GOES_ON_S = 30.0
 """Seconds within which a scene must resume after its node is lost."""
@@ -248,18 +246,11 @@ def _works(service: Service, scene: str, before: int | None) -> bool:
     return status.state == "updating" or status.queued == 0
 
 
-ON_NODES = ("nodes", "stopped", "full")
-"""Names of the node scenarios."""
-OF_THE_HEAD = "head"
-"""Name of the scenario in which the head is killed. It runs in a cluster of its own, whose head uses Redis."""
-AS_LOCALLY = ("kills", "beginnings", "log", "bits")
-"""Names of the scenarios that are shared with the single-machine study.
-
-The remaining scenarios of that study do not depend on where the workers run.
-"""
+PARTS = ("nodes", "stopped", "full", "head")
+"""Names of the scenarios. In "head", a cluster of its own is used, whose head stores its state in Redis."""
 
 
-def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
+def run(study: Study, *, count: int, seed: int, parts: Sequence[str], echo: Echo) -> list[ScenarioResult]:
     """Runs the scenarios named in `parts` on a cluster and compares the states with a single-machine run.
 
     Args:
@@ -267,25 +258,20 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         count: number of kills.
         seed: random seed for the moments of the kills.
         parts: names of the scenarios to run.
-        local: function that runs the named scenarios of a study whose service uses the cluster.
         echo: callback that prints progress messages.
 
     Raises:
-        StudyError: the scenario "head" is requested alone, but redis-server is not installed.
+        StudyError: the scenario "head" is requested, but redis-server is not installed.
     """
-    outcomes = []
-    if set(parts) & {*ON_NODES, OF_THE_HEAD}:
-        expected, update_s = undisturbed(study)
-        echo(f"undisturbed run on one machine: {len(expected)} states, {update_s:.2f} s per update")
-    if OF_THE_HEAD in parts:
-        if (redis_server := shutil.which("redis-server")) is not None:
-            with Nodes(redis_server=redis_server) as nodes:
-                outcomes.append(restarted_head(_on(study, nodes), nodes, expected, update_s, echo))
-        elif len(parts) == 1:
-            raise StudyError("part head requires redis-server; install it with: apt-get install redis-server")
-        else:
-            echo("skipping part head, which requires redis-server")
-    if not set(parts) & {*ON_NODES, *AS_LOCALLY}:
+    outcomes, redis_server = [], shutil.which("redis-server")
+    if "head" in parts and redis_server is None:
+        raise StudyError("part head requires redis-server; install it with: apt-get install redis-server")
+    expected, update_s = undisturbed(study)
+    echo(f"undisturbed run on one machine: {len(expected)} states, {update_s:.2f} s per update")
+    if "head" in parts:
+        with Nodes(redis_server=redis_server) as nodes:
+            outcomes.append(restarted_head(_on(study, nodes), nodes, expected, update_s, echo))
+    if set(parts) == {"head"}:
         return outcomes
     with Nodes() as nodes:
         there = _on(study, nodes)
@@ -295,8 +281,6 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
             outcomes.append(stopped_node(there, nodes, expected, update_s, echo))
         if "full" in parts:
             outcomes.append(full_nodes(there, nodes, expected, update_s, echo))
-        if others := [part for part in parts if part in AS_LOCALLY]:
-            outcomes += local(there, others)
     return outcomes
 
 

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench compact` and `scripts/bench opening`."""
+"""The command `scripts/bench compact`."""
 
 from __future__ import annotations
 
@@ -38,12 +38,3 @@ def compact(
     text = summarize(figures)
     print(text)
     write_page(page, text)
-
-
-def opening(
-    frames: Annotated[int, typer.Option(min=200, help="Frames in the history; default: a day at 1 Hz.")] = 86_400,
-) -> None:
-    """Measures how long it takes to open a long history whose older states are in compact files."""
-    from studies.compact.opening import opening as measured
-
-    print(measured(frames))

@@ -20,7 +20,7 @@ from scas4d_core.engines.choose import WARP_DEVICE, warp_device
 from scas4d_core.metrics.evaluation import measure_pictures
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
-from studies.synthetic.wall import Size, known, rig, shown, wall
+from studies.wall import Size, known, rig, shown, wall
 
 TESTS = (
     "tests/core/engines/warp", "tests/core/engines/test_contract.py", "tests/core/engines/test_renderers.py",

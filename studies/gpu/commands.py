@@ -33,7 +33,7 @@ def gpu_check(
     """
     from studies.devices.devices import use_cpu_without_gpu
     from studies.gpu import check
-    from studies.synthetic.wall import Size
+    from studies.wall import Size
 
     stands_for, began = use_cpu_without_gpu(), perf_counter()
     sample, frames = ROOT / "samples" / "robot", 3 if quick else None

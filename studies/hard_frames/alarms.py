@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.settings import Settings
 from studies.captures import open_measured
-from studies.hard_frames.camera_faults import FRAMES, blurred, dirty, noisy, scaled
-from studies.hard_frames.frames import Picture
-from studies.machine import core_version, machine
+from studies.hard_frames.camera_faults import FRAMES, Picture, blurred, dirty, noisy, scaled
+from studies.machine import core_version
 from studies.quality.first_frame import continued, started
 from studies.quality.settings import settings_of
+from studies.rows import RowStudy
 from studies.variants.variants import VARIANTS
 
 AFTER = 5
@@ -161,23 +161,19 @@ def run(
             raise ValueError(
                 f"no fault contains {part!r}; choose from {', '.join({fault.kind: 0 for fault in FAULTS})}"
             )
-    rows = []
+    study = RowStudy(out, "alarms", (), again=again, report=report)
     for folder in captures:
         for variant in variants or VARIANTS:
             for seed in seeds:
                 settings = settings_of("scas4d", None, seed, (*VARIANTS[variant].changes, *changes))
-                key = digest(
-                    settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()
+                study.add(
+                    f"{folder.resolve().name}-{variant.replace(' ', '-')}",
+                    (settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()),
+                    partial(_row, folder, variant, settings, out, frames, faults, options),
+                    _line,
                 )
-                path = out / "alarms" / f"{folder.resolve().name}-{variant.replace(' ', '-')}-{key}.json"
-                measured = partial(_row, folder, variant, settings, out, frames, faults, options)
-                row = kept_row(path, measured, again=again)
-                report(_line(row))
-                rows.append(row)
-    text = page(rows)
-    (out / "alarms.md").write_text(text + "\n")
-    report(text)
-    return rows
+    study.write(page(study.rows))
+    return study.rows
 
 
 def _row(
@@ -207,7 +203,7 @@ def _row(
             reports = [scene.step(_with(capture, first + n, name, fault)) for n in range(FRAMES)]
             found.append({"kind": fault.kind, "strength": fault.strength, "camera": name, **_found(reports, name)})
     identity = {"capture": capture.name, "variant": variant, "seed": settings.update.seed, "cameras": len(names)}
-    return {**identity, "clean": clean, "faults": found, "core": core_version(), "machine": machine()}
+    return {**identity, "clean": clean, "faults": found}
 
 
 def _with(capture: Capture, index: int, name: str, fault: Fault) -> Frame:

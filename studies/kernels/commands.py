@@ -1,4 +1,4 @@
-"""The commands `scripts/bench kernels`, `gpu-kernels`, `moving` and `startup`."""
+"""The commands `scripts/bench kernels` and `gpu-kernels`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import QUALITY, Capture, Changes, Page, write_page, write_part
+from studies.options import QUALITY, Changes, Page, write_page, write_part
 
 
 def kernels(
@@ -53,37 +53,5 @@ def gpu_kernels(
     assembler = ptxas or study.find_ptxas()
     uses = study.measure(architectures or ARCHITECTURES, assembler)
     text = study.table(uses) if assembler else "All kernels compile. Register counts are unknown without ptxas."
-    typer.echo(text)
-    write_page(out, text)
-
-
-def moving(
-    share: Annotated[
-        list[float] | None, typer.Option(min=0.01, max=1, help="Share of moving pixels; default 0.05, 0.2 and 1.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=2, help="Updates per share; the first one is not counted.")] = 8,
-    out: Page = None,
-) -> None:
-    """Measures how the update time depends on the share of moving pixels, on synthetic footage."""
-    from scas4d_core.warm_up import compile_in_processes
-    from studies.kernels import moving as study
-
-    compile_in_processes()
-    text = study.table(study.measure(share or (0.05, 0.2, 1.0), frames))
-    typer.echo(text)
-    write_page(out, text)
-
-
-def startup(
-    capture: Capture,
-    against: Annotated[Path | None, typer.Option(help="Another checkout to compare with; runs alternate.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Number of starts per checkout.")] = 3,
-    out: Page = None,
-) -> None:
-    """Times the start of a service, from an empty kernel cache to the first committed update."""
-    from studies.kernels import startup as study
-
-    checkouts = [study.ROOT] if against is None else [against.resolve(), study.ROOT]
-    text = study.table(study.measure(capture, checkouts, repeats, typer.echo))
     typer.echo(text)
     write_page(out, text)

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench live`, `soak` and `viewer`."""
+"""The commands `scripts/bench live` and `viewer`."""
 
 from __future__ import annotations
 
@@ -35,44 +35,6 @@ def live(
     text = report(rig, run(source, rig, frames, work))
     typer.echo(text)
     write_page(out, text)
-
-
-def soak(
-    capture: Repeated,
-    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras; the first ones of the capture.")] = 4,
-    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Scale of the images.")] = 0.25,
-    frames: Annotated[int, typer.Option(min=100, help="Number of frames.")] = 20_000,
-    work: Annotated[Path, typer.Option(help="Folder for data folder, rows and log; its contents are deleted.")] = Path(
-        "out/soak"
-    ),
-    out: Page = None,
-) -> None:
-    """Sends thousands of frames at full rate, and checks that the memory of service and worker does not grow.
-
-    The updates run on an engine whose iterations take no time. Fails if memory grows by more than 2%.
-
-    Example: scripts/bench soak samples/robot
-    """
-    from client.cli.extras import need_server
-    from client.importers.open_source import open_source
-    from scas4d_core.cameras import Rig
-    from studies.live.soak import TARGET, growth, report, run
-
-    need_server()
-    source = open_source(capture)
-    rig = Rig(source.full_rig.cameras[:cameras]).scaled(scale)
-    rows = run(
-        source,
-        rig,
-        frames,
-        work,
-        echo=lambda row: typer.echo(f"frame {row.frame}: service {row.service:.1f} MB, worker {row.worker:.1f} MB"),
-    )
-    text = report(rig, rows)
-    typer.echo(text)
-    write_page(out, text)
-    if growth(rows) > TARGET:
-        raise typer.Exit(1)
 
 
 def viewer(

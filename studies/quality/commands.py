@@ -143,23 +143,6 @@ def effects(
     )
 
 
-def switches(
-    captures: Captures,
-    out: Study = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 50,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Plays captures and reports which effects are switched on and off, and when.
-
-    Writes switches.md to the study's folder. Captures that were already played are not played again.
-    """
-    from studies.quality.switches import run
-
-    run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
-
-
 def targets(
     captures: Annotated[Path, typer.Argument(metavar="CAPTURES", help="Folder that contains the captures.")],
     out: Study = QUALITY,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.captures import Capture
@@ -28,9 +29,9 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import compile_in_processes
 from studies.captures import open_measured
-from studies.machine import core_version, machine
 from studies.quality.first_frame import first_of
 from studies.quality.settings import settings_of
+from studies.rows import RowStudy
 
 Pins = Mapping[str, str]
 """Maps each effect to its mode: "on", "off", or "removed"."""
@@ -89,19 +90,26 @@ def run(
     if frames is not None and frames < 2:
         raise ValueError("frames must be at least 2, because effects are compared in updates")
     compile_in_processes()
-    rows = []
+    study = RowStudy(out, "effects", COLUMNS, again=again, report=report)
     for folder in captures:
+        capture = open_measured(folder, options)
+        count = min(frames or capture.frame_count, capture.frame_count)
+        if count < 2:
+            raise ValueError(f"{capture.name} has only one frame, but effects are compared in updates")
         for seed in seeds:
             settings = settings_of(preset, None, seed, changes)
+            record = settings_record(settings, ())
             singles = variants(names or (() if pins else tuple(EFFECTS)), settings)
             for variant in [*singles, *pins]:
-                row = _row(folder, out, settings, variant, frames, again, options)
-                report(f"{row['capture']}, seed {seed}, {row['pinned']}: {row['gain']:+.2f} dB")
-                rows.append(row)
-    table = markdown(rows, COLUMNS)
-    (out / "effects.md").write_text(table + "\n")
-    report(table)
-    return rows
+                known: Row = {"capture": capture.name, "seed": seed, "settings": record}
+                known["pinned"] = ", ".join(f"{name} {mode}" for name, mode in variant.items())
+                study.add(
+                    "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in variant.items())]),
+                    (record, count, *options.changed.items()),
+                    partial(_compared, known, capture, out, settings, variant, count),
+                    lambda row: f"{row['capture']}, seed {row['seed']}, {row['pinned']}: {row['gain']:+.2f} dB",
+                )
+    return study.finish()
 
 
 def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
@@ -159,30 +167,7 @@ def without(pins: Pins) -> Iterator[None]:
         EFFECTS.update(before)
 
 
-def _row(
-    folder: Path,
-    out: Path,
-    settings: Settings,
-    pins: Pins,
-    frames: int | None,
-    again: bool,
-    options: CaptureOptions,
-) -> Row:
-    """Returns the row of a variant, measuring it if it is missing."""
-    capture = open_measured(folder, options)
-    count = min(frames or capture.frame_count, capture.frame_count)
-    if count < 2:
-        raise ValueError(f"{capture.name} has only one frame, but effects are compared in updates")
-    words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
-    seed = settings.update.seed
-    file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])
-    path = out / "effects" / f"{file}-{digest(settings_record(settings, ()), count, *options.changed.items())}.json"
-    known: Row = {"key": path.stem, "capture": capture.name, "seed": seed, "pinned": words, "frames": count}
-    of = {"settings": settings_record(settings, ()), "core": core_version(), "machine": machine()}
-    return kept_row(path, lambda: known | _compared(capture, out, settings, pins, count) | of, again=again)
-
-
-def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
+def _compared(known: Row, capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
     """Returns the measurements of a variant relative to auto."""
     given = (settings, pinned(settings, pins))
     scenes, psnr = [], np.zeros((2, count - 1))
@@ -209,7 +194,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
         same &= auto.keys() == other.keys() and all(np.array_equal(auto[key], other[key]) for key in auto)
     timed = slice(1 if count > 2 else 0, None)  # the first update loads kernels and searches for the motion
     report = scenes[0].report
-    return {
+    return known | {
         "updates": count - 1,
         "in_auto": _words(scenes[0], pins),
         "psnr_auto": float(psnr[0].mean()),

@@ -8,18 +8,19 @@ frames. Their scores are read from the rows of ``scripts/bench quality`` in the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
-from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
+from client.cli.scores import Column, Row, Store
 from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import Capture
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import compile_in_processes
 from studies.captures import open_measured
-from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
+from studies.rows import RowStudy
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -68,42 +69,26 @@ def run(
     Raises:
         ValueError: a capture does not have the frame, or a setting is unknown.
     """
-    store, rows = Store(out), list[Row]()
     compile_in_processes()
+    study, store = RowStudy(out, "refit", COLUMNS, again=again, report=report), Store(out)
     for folder in captures:
+        capture = open_measured(folder, options, use_points=points)
+        if not -capture.frame_count <= frame < capture.frame_count:
+            raise ValueError(f"{capture.name} has no frame {frame}; use 0 to {capture.frame_count - 1}")
+        index = range(capture.frame_count)[frame]
         for seed in seeds:
             settings = settings_of(preset, None, seed, changes)
-            row = _refitted(folder, store.folder / "refit", frame, settings, seed, points, again, options)
-            rows.append(row | _beside(row, settings, preset, store))
-            report(f"{row['capture']}, frame {row['frame']}, seed {seed}: {row['psnr']:.2f} dB")
-    table = markdown(rows, COLUMNS)
-    (store.folder / "refit.md").write_text(table + "\n")
-    report(table)
-    return rows
+            row = study.add(
+                f"{capture.name}-{index}-s{seed}",
+                (settings_record(settings, ()), points, *options.changed.items()),
+                partial(_measured, capture, index, seed, settings),
+                lambda row: f"{row['capture']}, frame {row['frame']}, seed {row['seed']}: {row['psnr']:.2f} dB",
+            )
+            row |= _beside(row, settings, preset, store)
+    return study.finish()
 
 
-def _refitted(
-    folder: Path,
-    rows: Path,
-    frame: int,
-    settings: Settings,
-    seed: int,
-    points: bool,
-    again: bool,
-    options: CaptureOptions,
-) -> Row:
-    """Returns the row of one frame, fitting the frame if the row is missing."""
-    capture = open_measured(folder, options, use_points=points)
-    index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
-    if index is None:
-        raise ValueError(f"{capture.name} has no frame {frame}; use 0 to {capture.frame_count - 1}")
-    key = f"{capture.name}-{index}-s{seed}-{digest(settings_record(settings, ()), points, *options.changed.items())}"
-    return kept_row(
-        rows / f"{key}.json", lambda: {"key": key, "seed": seed, **_measured(capture, index, settings)}, again=again
-    )
-
-
-def _measured(capture: Capture, index: int, settings: Settings) -> Row:
+def _measured(capture: Capture, index: int, seed: int, settings: Settings) -> Row:
     """Fits a frame independently of all others and returns its row."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
@@ -113,13 +98,12 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
     return {
         "capture": capture.name,
         "frame": index,
+        "seed": seed,
         "cloud": "given" if capture.points is not None else "from the images",
         "gaussians": len(scene.history.first),
         "seconds": sum(scene.report.seconds.values()),
         **scores,
         "settings": settings_record(settings, ()),
-        "core": core_version(),
-        "machine": machine(),
     }
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from client.cli.changes import parse_changes
 from client.cli.evaluate import Report, save_comparisons, settings_record
-from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
+from client.cli.scores import Column, Row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.cameras import Rig
@@ -31,8 +31,8 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import compile_in_processes
-from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
+from studies.rows import RowStudy
 
 ENOUGH_TO_HOLD_OUT = 5
 """Minimum number of cameras for holding one out. With fewer, each camera sees content that no other camera sees."""
@@ -93,19 +93,17 @@ def run(
     Returns:
         One row per capture.
     """
-    store, rows = Store(out), list[Row]()
+    study = RowStudy(out, "rigs", COLUMNS, again=again, report=report)
     compile_in_processes()
     for folder in captures:
-        key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
-        path = store.folder / "rigs" / f"{key}.json"
-        pictures = store.folder / "pictures" / key
-        row = kept_row(path, partial(measured, folder, options, frames, longer, changes, pictures), again=again)
-        rows.append(row)
-        report(markdown([row], COLUMNS))
-    table = markdown(rows, COLUMNS)
-    (store.folder / "rigs.md").write_text(table + "\n")
-    report(table)
-    return rows
+        name = folder.resolve().name
+        study.add(
+            name,
+            (list(changes), frames, longer, *options.changed.items()),
+            partial(measured, folder, options, frames, longer, changes, out / "pictures" / name),
+            lambda row: markdown([row], COLUMNS),
+        )
+    return study.finish()
 
 
 def measured(
@@ -161,8 +159,6 @@ def measured(
         "psnr_training": float(np.mean(trained)),
         "psnr_training_last": trained[-1],
         "settings": settings_record(settings, ()),
-        "core": core_version(),
-        "machine": machine(),
     }
     if (unseen := truth.test_rig) is not None:
         scores = [_psnr(scene, unseen, truth.test_frame(index)) for index in range(count)]

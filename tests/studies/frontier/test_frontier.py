@@ -316,31 +316,6 @@ def test_watching_an_update_does_not_change_it(box_capture, with_frame_0):
     assert row == convergence.read_convergence(with_frame_0, "box")
 
 
-def test_flicker_is_told_of_pixels_that_show_something_and_stand(monkeypatch):
-    rng = np.random.default_rng(0)
-    true = np.zeros((4, 60, 40, 3), np.uint8)
-    true[:, :, :20] = 120
-    true[1::2, :10, :20] = 160  # changes
-    shown = true / 255.0
-    shown[:, 10:, :20] += rng.choice([-4, 4], size=(4, 1, 1, 1)) / 255  # all still pixels up and down alike
-    shown[1:, :, 30:] = 0.5  # where nothing is, nothing counts
-    camera = types.SimpleNamespace(name="a")
-    capture = types.SimpleNamespace(
-        test_rig=types.SimpleNamespace(cameras=[camera]),
-        test_frame=lambda index: types.SimpleNamespace(images={"a": true[index]}),
-    )
-    scene = types.SimpleNamespace(render=lambda camera, index: types.SimpleNamespace(colour=shown[index]))
-    found = measures.measure_flicker(scene, capture, range(4))
-    assert found["still_pixels"] == 50 * 20
-    assert found["flicker"] == pytest.approx((255 * shown[:, 30, 5, 0]).std())
-    assert found["mtv"] == pytest.approx(100 * np.abs(np.diff(shown[:, 30, 5, 0])).mean())
-    assert found["mtv"] > 1
-    monkeypatch.setattr(measures, "MIN_STILL", 1001)
-    few = measures.measure_flicker(scene, capture, range(4))
-    assert few["flicker"] is None
-    assert few["mtv"] is None
-
-
 def test_the_drift_goes_through_whole_captures(tmp_path):
     made_study(tmp_path, ("robot",), axes=("drift",))
     drift = of_axis(read_points(tmp_path, ["robot"], 5), "drift", "robot")

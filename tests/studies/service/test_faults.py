@@ -12,7 +12,6 @@ from scas4d_core.captures import open_capture
 from studies.running import study as of
 from studies.service import faults
 from studies.service.beginnings import beginnings
-from studies.service.strangers import Attack, strangers
 
 ROOT = Path(__file__).parents[3]
 CAPTURE = ROOT / "samples" / "robot"
@@ -57,13 +56,6 @@ def test_cuts_and_flipped_bytes(study, expected):
 
 def test_a_full_disk(study, expected):
     assert faults.full_disk(study, expected[0], echo=lambda said: None).faults == []
-
-
-def test_strangers(study):
-    attack = Attack(header=5_000_000, halves=40, uploads=40)  # tests/server/http has it in full
-    found = strangers(study, attack, turns=1, seconds=1, token=False, echo=lambda said: None)
-    # Times of a busy machine are not judged here.
-    assert not [fault for fault in found.faults if "p99" not in fault and "times" not in fault]
 
 
 def test_kills_with_the_method_itself(tmp_path):
