@@ -15,7 +15,6 @@ from studies.live.commands import live, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
-    quality,
     refit,
     table,
     targets,
@@ -26,7 +25,7 @@ from studies.service.commands import faults, ingest, memory, views
 from studies.variants.commands import confidence, gaps, variants
 
 STUDIES = {
-    "Quality": (quality, refit, effects, targets, table, confidence),
+    "Quality": (refit, effects, targets, table, confidence),
     "Rigs": (rigs, calibration),
     "Quality of the output": (compact, exports),
     "Accuracy against time": (frontier, paper, variants, gaps),

@@ -18,13 +18,6 @@ def compact(
     frames: Annotated[
         int, typer.Option(min=2, help="Number of frames in the file; the states are repeated back and forth.")
     ] = 240,
-    key_every: Annotated[int | None, typer.Option(min=1, help="Frames between keyframes.")] = None,
-    bounds: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--bound", metavar="NAME=VALUE", help="Change an error bound, such as colour=0.02. May be repeated."
-        ),
-    ] = None,
     page: Page = None,
 ) -> None:
     """Writes states to a compact file and measures its size, its PSNR and track errors, and the read and write times.
@@ -33,8 +26,7 @@ def compact(
     """
     from studies.compact.compact import measure, summarize
 
-    changed = dict(one.split("=", 1) for one in bounds or ())
-    figures = measure(capture, states, frames, {name: float(value) for name, value in changed.items()}, key_every)
+    figures = measure(capture, states, frames, {}, None)
     text = summarize(figures)
     print(text)
     write_page(page, text)

@@ -73,7 +73,7 @@ def use_cpu_without_gpu() -> str:
 
 
 def compare(
-    folder: Path, scale: float, frames: int, iterations: int, static: int, seed: int = 0, apart: bool = False
+    folder: Path, scale: float = 0.25, frames: int = 5, iterations: int = 10, static: int = 600, apart: bool = False
 ) -> list[DeviceRow]:
     """Updates a capture on both devices and returns a row for each updated frame.
 
@@ -86,13 +86,12 @@ def compare(
         frames: number of updates.
         iterations: iterations per update.
         static: iterations of frame 0, which is fitted on the CPU.
-        seed: seed of the updates.
         apart: whether each device continues from its own states instead.
     """
     capture = open_measured(folder, image_scale=scale)
     changes = {
         "static": {"iterations": static, "seconds": None},
-        "update": {"iterations": iterations, "stop_gain": 0, "seed": seed},
+        "update": {"iterations": iterations, "stop_gain": 0},
     }
     settings: dict[Device, Settings] = {device: preset("scas4d", {**changes, "device": device}) for device in DEVICES}
     rows, last = list[DeviceRow](), min(frames, capture.frame_count - 1)

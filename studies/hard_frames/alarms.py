@@ -125,7 +125,6 @@ def run(
     out: Path,
     *,
     variants: Sequence[str] = (),
-    seeds: Sequence[int] = (0,),
     frames: int | None = None,
     faults: Sequence[str] = ("",),
     changes: Sequence[str] = (),
@@ -139,16 +138,15 @@ def run(
         captures: capture folders.
         out: study folder, which stores each finished variant; a second call resumes the study.
         variants: names from ``VARIANTS``; all if empty.
-        seeds: seeds of the updates.
         frames: maximum number of frames without faults per variant; at least those before the faults are updated.
-        faults: parts of the names of faults to plant; none if empty.
+        faults: parts of the names of faults to plant.
         changes: changes to the settings, such as ``"scene.image_scale=0.5"``.
         again: whether to repeat finished variants.
         options: options for reading the captures.
         report: callback that prints progress messages.
 
     Returns:
-        One row per capture, variant and seed.
+        One row per capture and variant.
 
     Raises:
         ValueError: a variant or fault is unknown.
@@ -164,14 +162,13 @@ def run(
     study = RowStudy(out, "alarms", (), again=again, report=report)
     for folder in captures:
         for variant in variants or VARIANTS:
-            for seed in seeds:
-                settings = settings_of("scas4d", None, seed, (*VARIANTS[variant].changes, *changes))
-                study.add(
-                    f"{folder.resolve().name}-{variant.replace(' ', '-')}",
-                    (settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()),
-                    partial(_row, folder, variant, settings, out, frames, faults, options),
-                    _line,
-                )
+            settings = settings_of("scas4d", None, 0, (*VARIANTS[variant].changes, *changes))
+            study.add(
+                f"{folder.resolve().name}-{variant.replace(' ', '-')}",
+                (settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()),
+                partial(_row, folder, variant, settings, out, frames, faults, options),
+                _line,
+            )
     study.write(page(study.rows))
     return study.rows
 
@@ -202,7 +199,7 @@ def _row(
             scene = continued(Path(place) / "before", Path(place) / "fault", capture.full_rig, settings)
             reports = [scene.step(_with(capture, first + n, name, fault)) for n in range(FRAMES)]
             found.append({"kind": fault.kind, "strength": fault.strength, "camera": name, **_found(reports, name)})
-    identity = {"capture": capture.name, "variant": variant, "seed": settings.update.seed, "cameras": len(names)}
+    identity = {"capture": capture.name, "variant": variant, "cameras": len(names)}
     return {**identity, "clean": clean, "faults": found}
 
 
@@ -243,7 +240,7 @@ def _found(reports: Sequence[FrameReport], name: str) -> dict[str, Any]:
 def _line(row: Row) -> str:
     clean, missed = row["clean"], [fault for fault in row["faults"] if fault["by"] is None]
     lines = [
-        f"{row['capture']}, {row['variant']}, seed {row['seed']}: {len(clean)} clean updates, "
+        f"{row['capture']}, {row['variant']}: {len(clean)} clean updates, "
         f"{len(_camera_alarms(row))} false alarms, {sum(frame['rejected'] for frame in clean)} rejected; "
         f"{len(row['faults']) - len(missed)} of {len(row['faults'])} faults found"
     ]

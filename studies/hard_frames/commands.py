@@ -18,7 +18,6 @@ def timing(
         Path, typer.Option(help="Folder of the quality study, with its rows and stored frames 0.")
     ] = QUALITY,
     updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 24,
-    masks: Annotated[bool, typer.Option(help="Use the captures' masks.")] = True,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -28,7 +27,7 @@ def timing(
     """
     from studies.hard_frames.out_of_step import run
 
-    run(captures, out, updates=updates, masks=masks, changes=changes or (), again=again)
+    run(captures, out, updates=updates, changes=changes or (), again=again)
 
 
 @with_capture_options
@@ -45,7 +44,6 @@ def alarms(
             "pixels or later. May be repeated; default: all."
         ),
     ] = None,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates. May be repeated.")] = None,
     frames: Annotated[
         int | None, typer.Option(min=2, help="Maximum number of frames without faults, at least those before them.")
     ] = None,
@@ -56,7 +54,6 @@ def alarms(
             "frozen or swapped. May be repeated; default: all."
         ),
     ] = None,
-    clean: Annotated[bool, typer.Option("--clean", help="Plant no faults.")] = False,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
@@ -73,9 +70,8 @@ def alarms(
             captures,
             out,
             variants=variant or (),
-            seeds=seed or (0,),
             frames=frames,
-            faults=() if clean else tuple(fault or ("",)),
+            faults=tuple(fault or ("",)),
             changes=changes or (),
             again=again,
             options=options,

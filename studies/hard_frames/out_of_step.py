@@ -66,7 +66,6 @@ def run(
     out: Path,
     *,
     updates: int = 24,
-    masks: bool = True,
     changes: Sequence[str] = (),
     again: bool = False,
     report: Report = print,
@@ -77,7 +76,6 @@ def run(
         captures: capture folders.
         out: study folder, which stores each finished run; a second call resumes the study.
         updates: updates per capture.
-        masks: whether the masks are used.
         changes: changes to the settings.
         again: whether to repeat finished runs.
         report: callback that prints progress messages.
@@ -91,8 +89,8 @@ def run(
         for case in CASES:
             study.add(
                 f"{folder.resolve().name}-{case.step}-{case.shift}",
-                (settings_record(settings, ()), updates, case, masks),
-                partial(_row, folder, out, settings, updates, case, masks),
+                (settings_record(settings, ()), updates, case),
+                partial(_row, folder, out, settings, updates, case),
                 lambda row: (
                     f"{row['capture']}, every {row['step']}: {row['true'] or 'in step'}, "
                     f"found {row['found'] or 'none off'}"
@@ -101,8 +99,8 @@ def run(
     return study.finish()
 
 
-def _row(folder: Path, out: Path, settings: Settings, updates: int, case: Case, masks: bool) -> Row:
-    capture = open_source(folder, use_masks=masks)
+def _row(folder: Path, out: Path, settings: Settings, updates: int, case: Case) -> Row:
+    capture = open_source(folder)
     names = capture.rig.names
     shifts = {names[2]: case.shift, names[len(names) // 2 - 1]: -case.shift} if case.shift else {}
     scene = started(capture, settings, out)
@@ -111,7 +109,7 @@ def _row(folder: Path, out: Path, settings: Settings, updates: int, case: Case, 
     row = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
     whole = float(np.median([sum(report.seconds.values()) for report in reports]))
     row |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
-    identity = {"capture": capture.name, "step": case.step, "settings": settings_record(settings, ()), "masks": masks}
+    identity = {"capture": capture.name, "step": case.step, "settings": settings_record(settings, ())}
     return {**identity, **row}
 
 

@@ -14,11 +14,6 @@ def kernels(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; the targets apply to robot.")],
     out: Page = None,
     store: Annotated[Path, typer.Option(help="Study folder, which `scripts/bench table` reads.")] = QUALITY,
-    preset: Annotated[str, typer.Option(help="Settings preset.")] = "scas4d",
-    frames: Annotated[
-        int, typer.Option(min=3, help="Number of frames in the timed run; the first update is not counted.")
-    ] = 8,
-    repeats: Annotated[int, typer.Option(min=1, help="Repetitions of the rasterizer and its arithmetic.")] = 9,
     changes: Changes = None,
 ) -> None:
     """Compares rasterizer time with that of its arithmetic, and update time with rasterizer time, on the CPU.
@@ -29,8 +24,8 @@ def kernels(
     from studies.kernels import kernels as study
     from studies.quality.settings import settings_of
 
-    settings = settings_of(preset, changes=changes or ())
-    row = study.study(capture, settings, store, frames=frames, repeats=repeats)
+    settings = settings_of("scas4d", changes=changes or ())
+    row = study.study(capture, settings, store)
     if out is not None:
         write_part(out, study.page(row))
 

@@ -2,7 +2,7 @@
 
 A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. The
 updates score lower at that frame if they miss changes that no effect models, or if they have lost quality over the
-frames. Their scores are read from the rows of ``scripts/bench quality`` in the same folder.
+frames. Their scores are read from the rows of ``scripts/bench targets`` in the same folder.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from studies.rows import RowStudy
 COLUMNS = (
     Column("capture", "capture"),
     Column("frame", "frame", "d"),
-    Column("seed", "seed", "d"),
-    Column("cloud", "cloud"),
     Column("from scratch dB", "psnr"),
     Column("fg dB", "psnr_foreground"),
     Column("updates dB", "psnr_update"),
@@ -41,9 +39,6 @@ def run(
     out: Path,
     *,
     frame: int = -1,
-    preset: str = "scas4d",
-    seeds: Sequence[int] = (0,),
-    points: bool = False,
     changes: Sequence[str] = (),
     again: bool = False,
     options: CaptureOptions = DEFAULT_OPTIONS,
@@ -55,40 +50,36 @@ def run(
         captures: capture folders.
         out: quality study folder; a second call resumes the study.
         frame: frame to fit; negative numbers count from the end.
-        preset: settings preset.
-        seeds: seeds for the fit; every seed is measured.
-        points: whether to start from the point cloud of the capture's first frame, instead of the images alone.
         changes: changes to the settings, such as ``"effects.direction=off"``.
         again: whether to repeat fits that ``out`` already contains.
         options: options for reading the captures.
         report: callback that prints progress messages.
 
     Returns:
-        One row per capture and seed.
+        One row per capture.
 
     Raises:
         ValueError: a capture does not have the frame, or a setting is unknown.
     """
     compile_in_processes()
     study, store = RowStudy(out, "refit", COLUMNS, again=again, report=report), Store(out)
+    settings = settings_of("scas4d", None, 0, changes)
     for folder in captures:
-        capture = open_measured(folder, options, use_points=points)
+        capture = open_measured(folder, options, use_points=False)
         if not -capture.frame_count <= frame < capture.frame_count:
             raise ValueError(f"{capture.name} has no frame {frame}; use 0 to {capture.frame_count - 1}")
         index = range(capture.frame_count)[frame]
-        for seed in seeds:
-            settings = settings_of(preset, None, seed, changes)
-            row = study.add(
-                f"{capture.name}-{index}-s{seed}",
-                (settings_record(settings, ()), points, *options.changed.items()),
-                partial(_measured, capture, index, seed, settings),
-                lambda row: f"{row['capture']}, frame {row['frame']}, seed {row['seed']}: {row['psnr']:.2f} dB",
-            )
-            row |= _beside(row, settings, preset, store)
+        row = study.add(
+            f"{capture.name}-{index}",
+            (settings_record(settings, ()), *options.changed.items()),
+            partial(_measured, capture, index, settings),
+            lambda row: f"{row['capture']}, frame {row['frame']}: {row['psnr']:.2f} dB",
+        )
+        row |= _beside(row, settings, store)
     return study.finish()
 
 
-def _measured(capture: Capture, index: int, seed: int, settings: Settings) -> Row:
+def _measured(capture: Capture, index: int, settings: Settings) -> Row:
     """Fits a frame independently of all others and returns its row."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
@@ -98,8 +89,6 @@ def _measured(capture: Capture, index: int, seed: int, settings: Settings) -> Ro
     return {
         "capture": capture.name,
         "frame": index,
-        "seed": seed,
-        "cloud": "given" if capture.points is not None else "from the images",
         "gaussians": len(scene.history.first),
         "seconds": sum(scene.report.seconds.values()),
         **scores,
@@ -107,13 +96,13 @@ def _measured(capture: Capture, index: int, seed: int, settings: Settings) -> Ro
     }
 
 
-def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
+def _beside(row: Row, settings: Settings, store: Store) -> Row:
     """Returns the PSNR of the updates at the same frame and its difference from the fit, if available."""
     wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])
         same = other.get("capture") == row["capture"] and other.get("settings") == wanted
-        if same and other.get("preset") == preset and row["frame"] < len(frames):
+        if same and row["frame"] < len(frames):
             update = frames[row["frame"]]
             return {"psnr_update": update, "below": update - row["psnr"]}
     return {}

@@ -2,8 +2,7 @@
 
 Frame 0 keeps its time limit, because its duration is measured. The study should run on an otherwise idle machine. With
 five or more cameras, one is held out. As a baseline, the image of the nearest training camera is also compared with
-that of the held-out camera. For all captures, tracks are compared with optical flow (``flow.py``). If a folder has a
-``joints.npz`` (``points3d`` [T, J, 3], in the calibration's world), its points are also tracked from frame 0.
+that of the held-out camera. For all captures, tracks are compared with optical flow (``flow.py``).
 """
 
 from __future__ import annotations
@@ -61,8 +60,6 @@ COLUMNS = (
     Column("nearest picture dB", "psnr_nearest", ".1f"),
     Column("flow px", "flow_px", ".1f"),
     Column("epipolar px", "epipolar_px", ".1f"),
-    Column("joints px", "joints_px", ".1f"),
-    Column("last", "joints_px_last", ".1f"),
 )
 
 
@@ -173,8 +170,6 @@ def measured(
     seen = truth if truth.test_rig is not None else truth.with_training_as_test()
     for index in sorted({0, count - 1}):
         save_comparisons(scene, seen, index, pictures)
-    if (folder / "joints.npz").is_file():
-        row |= _joints(folder / "joints.npz", scene, given.full_rig, count)
     return row
 
 
@@ -201,26 +196,3 @@ def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uin
     lines, columns = (np.arange(want) * have // want for want, have in zip(shape[:2], image.shape[:2], strict=True))
     resized: NDArray[np.uint8] = image[lines[:, None], columns[None]]
     return resized
-
-
-def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:
-    """Returns the median error in full-resolution pixels of joints tracked from frame 0, over cameras and frames."""
-    with np.load(path) as file:
-        true = file["points3d"][:count].astype(np.float64)
-    tracks = scene.tracks_of_points(true[0], 0, list(range(count))).positions
-    error = np.stack(
-        [
-            np.linalg.norm(
-                camera.project(tracks.reshape(-1, 3))[0] - camera.project(true.reshape(-1, 3))[0], axis=1
-            ).reshape(true.shape[:2])
-            for camera in rig.cameras
-        ]
-    )
-    lost = np.isnan(error)  # the Gaussian that carried it has left the scene
-    error = np.where(lost, np.inf, error)
-    return {
-        "joints_px": float(np.median(error[:, 1:])),
-        "joints_px_last": float(np.median(error[:, -1])),
-        "joints_px_each": np.median(error[:, 1:], axis=(0, 1)).tolist(),
-        "joints_lost": float(lost.mean()),
-    }

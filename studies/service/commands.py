@@ -19,8 +19,6 @@ def faults(
             min=0, help="Number of kills (kill -9) of the worker or the service, and of interrupted restarts."
         ),
     ] = 30,
-    cuts: Annotated[int, typer.Option(min=0, help="Number of log files to truncate.")] = 20,
-    flips: Annotated[int, typer.Option(min=0, help="Number of log files in which to flip a bit.")] = 1,
     part: Annotated[
         list[str] | None,
         typer.Option(
@@ -59,9 +57,7 @@ def faults(
     opened = open_source(capture)
     study = Study(work.resolve(), opened, encoded_frames(opened, frames), parse_changes(changes), {})
     if placement == "local":
-        outcomes = of_faults.run(
-            study, moments=kills, cuts=cuts, flips=flips, seed=seed, parts=part or known, echo=typer.echo
-        )
+        outcomes = of_faults.run(study, moments=kills, seed=seed, parts=part or known, echo=typer.echo)
     else:
         outcomes = of_nodes.run(study, count=kills, seed=seed, parts=part or known, echo=typer.echo)
     text = table(outcomes)
@@ -95,12 +91,8 @@ def ingest(
 
 def views(
     capture: Repeated,
-    rate: Annotated[
-        list[float] | None, typer.Option(min=0.1, help="Views per second; default: 1, 5 and 20. May be repeated.")
-    ] = None,
     updates: Annotated[int, typer.Option(min=1, help="Number of updates per turn, without and with views.")] = 8,
     turns: Annotated[int, typer.Option(min=1, help="Number of turns per rate.")] = 3,
-    width: Annotated[int, typer.Option(min=1, help="Width of a view in pixels.")] = 256,
     work: Annotated[Path, typer.Option(help="Folder for the service's data; its contents are deleted.")] = Path(
         "out/views"
     ),
@@ -120,15 +112,12 @@ def views(
     rows = of_views.measure(
         open_source(capture),
         work.resolve(),
-        rates=rate or (1, 5, 20),
         updates=updates,
         turns=turns,
-        width=width,
         settings=parse_changes(changes),
-        environment={},
         echo=typer.echo,
     )
-    text = of_views.page(rows, capture.name, width, updates, turns)
+    text = of_views.page(rows, capture.name, updates, turns)
     typer.echo(text)
     write_page(out, text)
 

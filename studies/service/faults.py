@@ -46,6 +46,8 @@ RANDOM = "at random"
 POLL_S = 0.0005
 """Seconds between checks whether a frame has reached a stage, less than a write takes."""
 
+CUTS, FLIPS = 20, 1
+"""Numbers of truncated log files, and of log files with a flipped bit."""
 PARTS = ("kills", "beginnings", "log", "disk")
 """Names of the scenarios."""
 
@@ -323,16 +325,12 @@ def _no_room(pid: int) -> Any:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def run(
-    study: Study, *, moments: int, cuts: int, flips: int, seed: int, parts: Sequence[str], echo: Echo
-) -> list[ScenarioResult]:
+def run(study: Study, *, moments: int, seed: int, parts: Sequence[str], echo: Echo) -> list[ScenarioResult]:
     """Runs the scenarios named in `parts` and returns their results.
 
     Args:
         study: study that defines the frames and the service.
         moments: number of kills, and of reconstruction restarts.
-        cuts: number of truncated log files.
-        flips: number of log files with a flipped bit.
         seed: random seed for the moments and places of the faults.
         parts: names of the scenarios to run.
         echo: callback that prints progress messages.
@@ -342,7 +340,7 @@ def run(
     scenarios: dict[str, Callable[[], ScenarioResult]] = {
         "kills": lambda: kills(study, expected, update_s, moments, seed, echo),
         "beginnings": lambda: beginnings(study, expected, moments, seed, echo),
-        "log": lambda: damaged_log(study, expected, cuts, flips, seed, echo),
+        "log": lambda: damaged_log(study, expected, CUTS, FLIPS, seed, echo),
         "disk": lambda: full_disk(study, expected, echo),
     }
     return [scenarios[part]() for part in PARTS if part in parts]

@@ -29,6 +29,8 @@ Float = NDArray[np.float64]
 
 PLAYED = ("as it is", "backwards")
 """Variants of each capture; the second has the second seed."""
+SCALE = 0.5
+"""Scale of the images."""
 SAMPLE = 4000
 """Maximum number of positions of a run that are used, chosen at random. All runs count equally."""
 BINS = 5
@@ -37,15 +39,15 @@ SMALLEST = 1e-4
 """Probability to which estimates are clipped in the loss."""
 
 
-def run(captures: Sequence[Path], out: Path, scale: float) -> str:
+def run(captures: Sequence[Path], out: Path) -> str:
     """Measures the runs that are not in the folder ``out``, and returns the report as Markdown."""
     out.mkdir(parents=True, exist_ok=True)
     runs: dict[str, list[Float]] = {}
     for capture in captures:
         for seed, variant in enumerate(PLAYED):
-            file = out / f"{capture.name}-{variant.replace(' ', '-')}-{scale:g}.npy"
+            file = out / f"{capture.name}-{variant.replace(' ', '-')}.npy"
             if not file.exists():
-                opened = open_capture(capture, image_scale=scale)
+                opened = open_capture(capture, image_scale=SCALE)
                 rows = measure(opened if seed == 0 else VARIANTS[variant].made(opened), seed)
                 np.save(file, rows)
                 print(f"{file}: {len(rows)} positions")

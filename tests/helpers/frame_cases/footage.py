@@ -123,7 +123,7 @@ class CapturedFootage:
     Args:
         capture: capture that provides the frames.
         settings: reconstruction settings.
-        study: study folder in which frame 0 is stored, such as the one of ``scripts/bench quality``.
+        study: study folder in which frame 0 is stored, such as the one of ``scripts/bench targets``.
     """
 
     constants = ()

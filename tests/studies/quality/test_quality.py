@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from plates import FRAMES, HEIGHT, TEST, WIDTH, Perfect, Slow, colours, plates, write_capture
 
+from client.cli.evaluate import Job
 from client.cli.scores import Store, markdown
 from scas4d_core.captures import InitialPoints, open_capture
 from scas4d_core.captures.reader import FileReader
@@ -21,6 +22,11 @@ from studies.quality.settings import settings_of
 @pytest.fixture(scope="module")
 def capture_folder(tmp_path_factory):
     return write_capture(tmp_path_factory.mktemp("captures") / "plates")
+
+
+def measured(folder, out, lines, *presets, iterations=None, **given):
+    jobs = [Job(folder, name, settings_of(name, iterations), **given) for name in presets or ("scas4d",)]
+    return quality.run_jobs(jobs, out, report=lines.append)
 
 
 @pytest.fixture
@@ -40,7 +46,7 @@ def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, t
     stand_in(Slow)
     monkeypatch.setattr(Slow, "fitted", 0)
     lines: list[str] = []
-    rows = quality.run([capture_folder], tmp_path, ["scas4d", "dynamic3dgs"], iterations=[7], report=lines.append)
+    rows = measured(capture_folder, tmp_path, lines, "scas4d", "dynamic3dgs", iterations=7)
     assert [row["preset"] for row in rows] == ["scas4d", "dynamic3dgs"]
     assert Slow.fitted == 1  # both presets start from the same frame 0
     assert len(list((tmp_path / "first").iterdir())) == 1
@@ -72,15 +78,15 @@ def test_the_study_measures_saves_and_goes_on_where_it_stopped(capture_folder, t
             raise AssertionError("the row was there already")
 
     stand_in(NeverAgain)
-    assert quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], report=lines.append) == rows[:1]
+    assert measured(capture_folder, tmp_path, lines, iterations=7) == rows[:1]
     assert any(line.endswith("already measured") for line in lines)
     monkeypatch.setattr(quality, "core_version", lambda: "another")
-    quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], report=lines.append)
+    measured(capture_folder, tmp_path, lines, iterations=7)
     assert any(line.endswith("already measured, with another version of the core") for line in lines)
     with pytest.raises(AssertionError):
-        quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[8], report=lines.append)
+        measured(capture_folder, tmp_path, lines, iterations=8)
     with pytest.raises(AssertionError):
-        quality.run([capture_folder], tmp_path, ["scas4d"], iterations=[7], masks=False, report=lines.append)
+        measured(capture_folder, tmp_path, lines, iterations=7, masks=False)
 
 
 def test_another_constant_of_frame_0_is_another_frame_0(capture_folder, tmp_path, stand_in):
@@ -88,7 +94,7 @@ def test_another_constant_of_frame_0_is_another_frame_0(capture_folder, tmp_path
     constants = ("scas4d_core.first_frame.static_scene.RATE_COLOUR", "scas4d_core.update.warm_start.WARM_START")
     for place in (None, *constants):
         given = ((place, 0.5),) if place else ()
-        job = quality.Job(capture_folder, "scas4d", settings_of("scas4d"), frames=2, constants=given)
+        job = Job(capture_folder, "scas4d", settings_of("scas4d"), frames=2, constants=given)
         Store(tmp_path)
         quality.measure(job, tmp_path, lambda _: None)
     names = sorted(file.stem.count("-") for file in (tmp_path / "first").iterdir())
@@ -98,7 +104,7 @@ def test_another_constant_of_frame_0_is_another_frame_0(capture_folder, tmp_path
 def test_frame_0_alone_without_help(capture_folder, tmp_path, stand_in):
     stand_in(Perfect)
     lines: list[str] = []
-    (row,) = quality.run([capture_folder], tmp_path, frames=1, masks=False, points=False, report=lines.append)
+    (row,) = measured(capture_folder, tmp_path, lines, frames=1, masks=False, points=False)
     assert row["updates"] == 0
     assert row["given"] == {"frames": 1, "masks": False, "points": False}
     assert row["psnr_first"] > 80
@@ -109,22 +115,22 @@ def test_frame_0_alone_without_help(capture_folder, tmp_path, stand_in):
 
 
 def test_changes_are_what_differs_from_the_preset(tmp_path):
-    job = quality.Job(tmp_path, "scas4d", settings_of("scas4d", 300, 5, ["update.clusters=[64]"]), points=False)
+    job = Job(tmp_path, "scas4d", settings_of("scas4d", 300, 5, ["update.clusters=[64]"]), points=False)
     assert job.changes == "update.clusters=[64], no points"
-    assert quality.Job(tmp_path, "scas4d", settings_of("scas4d", 300, 5)).changes == ""
+    assert Job(tmp_path, "scas4d", settings_of("scas4d", 300, 5)).changes == ""
     keys = {dataclasses.replace(job, **other).key for other in ({}, {"masks": False}, {"frames": 3}, {"lpips": True})}
     assert len(keys) == 4
 
 
 def test_a_row_that_fails_says_so_and_is_tried_again(tmp_path, monkeypatch):
     lines: list[str] = []
-    (row,) = quality.run([tmp_path / "nowhere"], tmp_path / "out", report=lines.append)  # in a process of its own
+    (row,) = measured(tmp_path / "nowhere", tmp_path / "out", lines)  # in a process of its own
     assert "CaptureError" in row["error"]
     assert "nowhere" in lines[-1]
     assert "failed" in lines[-1]
-    tried: list[quality.Job] = []
+    tried: list[Job] = []
     monkeypatch.setattr(quality, "_apart", lambda job, folder: tried.append(job) or row)
-    quality.run([tmp_path / "nowhere"], tmp_path / "out", report=lines.append)
+    measured(tmp_path / "nowhere", tmp_path / "out", lines)
     assert [job.key for job in tried] == [row["key"]]
 
 
