@@ -10,7 +10,7 @@ from studies.exports.commands import exports
 from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
 from studies.hard_frames.commands import alarms, timing
-from studies.kernels.commands import gpu_kernels, kernels
+from studies.kernels.commands import kernels
 from studies.live.commands import live, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
@@ -29,7 +29,7 @@ STUDIES = {
     "Rigs": (rigs, calibration),
     "Quality of the output": (compact, exports),
     "Accuracy against time": (frontier, paper, variants, gaps),
-    "Speed of the code": (kernels, gpu_kernels, scale, devices, gpu_check),
+    "Speed of the code": (kernels, scale, devices, gpu_check),
     "Faults of cameras": (timing, alarms),
     "The running service": (
         faults,

@@ -15,7 +15,6 @@ QUALITY = Path("out/quality")
 FRONTIER = Path("out/frontier")
 """Default folder of the study of accuracy against time, shared with the paper study."""
 
-Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")]
 Repeated = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Capture folder; a short capture is played back and forth.")
 ]

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
+from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture
 from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault, warp_device
 from scas4d_core.metrics.evaluation import measure_pictures, measure_tracks
@@ -144,22 +145,36 @@ def distances(scenes: dict[Device, Reconstruction], index: int) -> NDArray[np.fl
     return away if len(away) else np.zeros(1)
 
 
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("updates", "updates", "d"),
+    Column("PSNR on the CPU, dB", "psnr"),
+    Column("GPU minus CPU, dB", "difference", "+.3f"),
+    Column("worst frame", "worst", "+.3f"),
+    Column("distance, % of the extent", "distance", ".4f"),
+    Column("track error, GPU minus CPU, worst frame", "tracks", "+.4f"),
+    Column("CPU, s per update", "cpu"),
+    Column("GPU", "gpu"),
+)
+
+
 def table(rows: Sequence[DeviceRow]) -> str:
     """Formats the rows of one or more captures as a Markdown table, with one line per capture."""
-    lines = [
-        "| capture | updates | PSNR on the CPU | GPU minus CPU: mean, worst frame | distance, % of the extent | "
-        "track error, % of the extent: GPU minus CPU, worst frame | seconds per update: CPU, GPU |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines: list[Row] = []
     for name in dict.fromkeys(row.capture for row in rows):
         own = [row for row in rows if row.capture == name]
-        differences = np.array([row.difference for row in own])
-        seconds = [np.median([row.seconds[device] for row in own]) for device in DEVICES]
-        errors = [row.tracks for row in own if len(row.tracks) == len(DEVICES)]
-        tracks = f"{max((each['gpu'] - each['cpu'] for each in errors), key=abs):+.4f}" if errors else "–"
+        differences = [row.difference for row in own]
+        tracks = [row.tracks["gpu"] - row.tracks["cpu"] for row in own if len(row.tracks) == len(DEVICES)]
         lines.append(
-            f"| {name} | {len(own)} | {np.mean([row.psnr['cpu'] for row in own]):.2f} dB | "
-            f"{differences.mean():+.3f} dB, {differences[np.argmax(abs(differences))]:+.3f} dB | "
-            f"{100 * max(row.distance for row in own):.4f} | {tracks} | {seconds[0]:.2f}, {seconds[1]:.2f} |"
+            {
+                "capture": name,
+                "updates": len(own),
+                "psnr": float(np.mean([row.psnr["cpu"] for row in own])),
+                "difference": float(np.mean(differences)),
+                "worst": max(differences, key=abs),
+                "distance": 100 * max(row.distance for row in own),
+                "tracks": max(tracks, key=abs, default=None),
+                **{device: float(np.median([row.seconds[device] for row in own])) for device in DEVICES},
+            }
         )
-    return "\n".join(lines)
+    return markdown(lines, COLUMNS)

@@ -20,7 +20,7 @@ from studies.frontier.tradeoff import (
     read_points,
     undominated,
 )
-from studies.machine import in_words
+from studies.machine import provenance
 
 PREVIEW_LOSS_DB = 4.0
 """Largest PSNR loss allowed for a preview, relative to the default."""
@@ -126,13 +126,11 @@ def score_table(points: Sequence[Point], default: Point | None = None) -> str:
 
 def equal_table(compared: Sequence[EqualSeconds]) -> str:
     """Returns a Markdown table of captures by budgets, whose cells show the lead and the PSNR of both methods."""
-    budgets = sorted({one.iterations for one in compared})
-    head = ["capture", *(f"{count} iterations" for count in budgets)]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for capture in dict.fromkeys(one.capture for one in compared):
-        by_budget = {one.iterations: one for one in compared if one.capture == capture}
-        lines.append("| " + " | ".join([capture, *(_equal_cell(by_budget.get(count)) for count in budgets)]) + " |")
-    return "\n".join(lines)
+    rows: dict[str, Row] = {}
+    for one in compared:
+        rows.setdefault(one.capture, {"capture": one.capture})[str(one.iterations)] = _equal_cell(one)
+    budgets = [Column(f"{count} iterations", str(count)) for count in sorted({one.iterations for one in compared})]
+    return markdown(rows.values(), (Column("capture", "capture"), *budgets))
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
@@ -271,21 +269,15 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
 def _provenance(out: Path, captures: Sequence[str]) -> str:
     rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
     times = [row for name in captures if (row := read_times(out, name)) is not None]
-    days = sorted({str(row["measured"])[:10] for row in [*rows, *times]})
-    when = " to ".join(dict.fromkeys((days[0], days[-1])))
-    cores = sorted({str(row["core"]) for row in [*rows, *times]})
-    where = (
-        "; ".join(sorted({in_words(row["machine"]) for row in times}))
-        or "not timed separately; CPU seconds of single-threaded rows"
-    )
-    accuracy = "; ".join(sorted({in_words(row["machine"]) for row in rows}))
+    when, _, cores = provenance([*rows, *times])
+    where = provenance(times)[1] if times else "not timed separately; CPU seconds of single-threaded rows"
     return (
-        f"- Measured: {when}.\n- Machine for times: {where}.\n- Machine for accuracy: {accuracy}.\n"
-        f"- Source versions of the core: {', '.join(cores)}."
+        f"- Measured: {when}.\n- Machine for times: {where}.\n- Machine for accuracy: {provenance(rows)[1]}.\n"
+        f"- Source versions of the core: {cores}."
     )
 
 
-def _equal_cell(one: EqualSeconds | None) -> str:
-    if one is None or one.psnr is None or one.lead is None:
+def _equal_cell(one: EqualSeconds) -> str:
+    if one.psnr is None or one.lead is None:
         return "–"
     return f"{one.lead:+.2f} ({one.psnr:.2f} : {one.baseline_psnr:.2f}) at {one.seconds:.2f} s"

@@ -134,16 +134,7 @@ def run(
 ) -> list[Row]:
     """Measures every variant of every capture, and writes the tables to ``out/alarms.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished variant; a second call resumes the study.
-        variants: names from ``VARIANTS``; all if empty.
-        frames: maximum number of frames without faults per variant; at least those before the faults are updated.
-        faults: parts of the names of faults to plant.
-        changes: changes to the settings, such as ``"scene.image_scale=0.5"``.
-        again: whether to repeat finished variants.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench alarms --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture and variant.

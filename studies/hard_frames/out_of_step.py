@@ -72,13 +72,7 @@ def run(
 ) -> list[Row]:
     """Runs every case on each capture, prints the table and writes it to ``out/timing.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished run; a second call resumes the study.
-        updates: updates per capture.
-        changes: changes to the settings.
-        again: whether to repeat finished runs.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench timing --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture and case.

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench kernels` and `gpu-kernels`."""
+"""The command `scripts/bench kernels`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import QUALITY, Changes, Page, write_page, write_part
+from studies.options import QUALITY, Changes, Page, write_part
 
 
 def kernels(
@@ -28,25 +28,3 @@ def kernels(
     row = study.study(capture, settings, store)
     if out is not None:
         write_part(out, study.page(row))
-
-
-def gpu_kernels(
-    ptxas: Annotated[
-        Path | None,
-        typer.Option(help="ptxas of CUDA 13.4 or later, from the package nvidia-cuda-nvcc; default: on PATH."),
-    ] = None,
-    architectures: Annotated[
-        list[int] | None,
-        typer.Option("--arch", help="Compute capability times 10, such as 90. May be repeated; default: all."),
-    ] = None,
-    out: Page = None,
-) -> None:
-    """Compiles the GPU kernels without a GPU, and reports registers and spills per thread if ptxas is available."""
-    from scas4d_core.engines.warp.compile_ahead import ARCHITECTURES
-    from studies.kernels import gpu_kernels as study
-
-    assembler = ptxas or study.find_ptxas()
-    uses = study.measure(architectures or ARCHITECTURES, assembler)
-    text = study.table(uses) if assembler else "All kernels compile. Register counts are unknown without ptxas."
-    typer.echo(text)
-    write_page(out, text)

@@ -12,9 +12,7 @@ from studies.options import Page, Repeated, write_page
 
 def live(
     capture: Repeated,
-    cameras: Annotated[
-        int, typer.Option(min=1, help="Number of cameras; the first ones of the capture, and copies if it has fewer.")
-    ] = 24,
+    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras; the first ones of the capture.")] = 24,
     frames: Annotated[int, typer.Option(min=10, help="Number of frames for each of the two measurements.")] = 200,
     work: Annotated[Path, typer.Option(help="Folder for the data folder and log; its contents are deleted.")] = Path(
         "out/live"
@@ -27,11 +25,12 @@ def live(
     """
     from client.cli.extras import need_server
     from client.importers.open_source import open_source
-    from studies.live.live import report, rig_with, run
+    from scas4d_core.cameras import Rig
+    from studies.live.live import report, run
 
     need_server()
     source = open_source(capture)
-    rig = rig_with(source, cameras)
+    rig = Rig(source.full_rig.cameras[:cameras])
     text = report(rig, run(source, rig, frames, work))
     typer.echo(text)
     write_page(out, text)

@@ -115,7 +115,7 @@ def table(
     Only rows with the settings of the current presets are used. If several rows qualify, the one with the most frames
     is used.
     """
-    from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
+    from studies.quality.targets import compare, count_words, page, read_study, target_table
 
     if not study.is_dir():
         raise typer.BadParameter(
@@ -125,7 +125,5 @@ def table(
     outcomes = compare(rows)
     print(target_table(outcomes))
     print(f"\n{count_words(outcomes)}.")
-    if others := left_out(study, rows):
-        print(f"{others} rows of the study are not used, because their settings differ or they have fewer frames.")
     if out is not None:
         write_page(out, page(rows))

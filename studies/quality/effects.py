@@ -62,16 +62,7 @@ def run(
 ) -> list[Row]:
     """Measures every variant of each capture, prints the table and writes it to ``out/effects.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished run; a second call resumes the study.
-        names: effect names; all effects if empty, unless there are ``pins``.
-        pins: additional variants, each given as the effects that it pins together.
-        frames: number of frames; all if None.
-        changes: changes to the settings that both reconstructions share.
-        again: whether to repeat the runs that ``out`` already contains.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench effects --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture and variant.

@@ -46,14 +46,7 @@ def run(
 ) -> list[Row]:
     """Fits a frame of each capture from scratch, prints the table and writes it to ``out/refit.md``.
 
-    Args:
-        captures: capture folders.
-        out: quality study folder; a second call resumes the study.
-        frame: frame to fit; negative numbers count from the end.
-        changes: changes to the settings, such as ``"effects.direction=off"``.
-        again: whether to repeat fits that ``out`` already contains.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench refit --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture.

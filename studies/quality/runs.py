@@ -90,13 +90,7 @@ def measure_runs(
 ) -> list[Row]:
     """Measures runs on the available captures. Existing rows are not measured again.
 
-    Args:
-        captures: folder that contains the captures.
-        out: study folder.
-        names: names from ``RUNS``; all runs if empty.
-        frames: number of frames per capture; all if None.
-        again: whether to repeat rows that are already on disk.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench targets --help``.
 
     Returns:
         One row per run and available capture.

@@ -92,13 +92,7 @@ def run(
 ) -> list[Row]:
     """Measures each capture, prints two tables and writes them to ``out/calibration.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished run; a second call resumes the study.
-        fit: whether to also fit frame 0 to faulty rigs.
-        changes: changes to the settings.
-        again: whether to repeat finished runs.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench calibration --help``. A second call for the same folder resumes the study.
 
     Returns:
         The rows of both tables.

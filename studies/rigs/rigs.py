@@ -76,16 +76,7 @@ def run(
 ) -> list[Row]:
     """Reconstructs captures, prints the table and writes it to ``out/rigs.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder; a second call resumes the study.
-        frames: maximum number of frames.
-        longer: maximum length of the longer side of the largest image, in pixels.
-        changes: changes to the settings, such as ``"static.seconds=60"``.
-        again: whether to repeat rows that ``out`` already contains.
-        options: options for reading the captures; ``options.test`` names the cameras to hold out instead of the middle
-            one.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench rigs --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture.

@@ -14,17 +14,11 @@ def faults(
     capture: Repeated,
     frames: Annotated[int, typer.Option(min=4, help="Number of frames sent in each scenario.")] = 20,
     kills: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Number of kills (kill -9) of the worker or the service, and of interrupted restarts."
-        ),
+        int, typer.Option(min=0, help="Number of kills (kill -9) of the worker or the service, or of nodes.")
     ] = 30,
     part: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Run only this part: kills, beginnings, log or disk; on a cluster: nodes, stopped, full or head "
-            "(requires redis-server). May be repeated."
-        ),
+        typer.Option(help="On a cluster, run only this part: nodes or head (requires redis-server). May be repeated."),
     ] = None,
     placement: Annotated[
         str, typer.Option(help="`local`, or `ray` for a Ray cluster of three nodes on this machine.")
@@ -36,7 +30,7 @@ def faults(
     out: Page = None,
     changes: Changes = None,
 ) -> None:
-    """Kills the service and its workers, damages logs and fills the disk, and compares with an undisturbed run.
+    """Kills the service and its workers, or the nodes and head of a cluster, and compares with an undisturbed run.
 
     Example: scripts/bench faults samples/robot --set static.iterations=300 --set update.iterations=20
     """
@@ -45,21 +39,20 @@ def faults(
     from client.importers.open_source import open_source
     from studies.cluster import faults as of_nodes
     from studies.running.outcome import table
-    from studies.running.study import Study, encoded_frames
+    from studies.running.study import Study, encoded_frames, undisturbed
     from studies.service import faults as of_faults
 
     need_server()
     if placement not in ("local", "ray"):
         raise typer.BadParameter(f"unknown placement {placement!r}; choose from local, ray", param_hint="--placement")
-    known = of_faults.PARTS if placement == "local" else of_nodes.PARTS
-    if unknown := set(part or []) - set(known):
-        raise typer.BadParameter(f"unknown part {sorted(unknown)[0]!r}; choose from {', '.join(known)}")
+    if unknown := set(part or []) - set(of_nodes.PARTS):
+        raise typer.BadParameter(f"unknown part {sorted(unknown)[0]!r}; choose from {', '.join(of_nodes.PARTS)}")
     opened = open_source(capture)
     study = Study(work.resolve(), opened, encoded_frames(opened, frames), parse_changes(changes), {})
     if placement == "local":
-        outcomes = of_faults.run(study, moments=kills, seed=seed, parts=part or known, echo=typer.echo)
+        outcomes = [of_faults.kills(study, *undisturbed(study), kills, seed, typer.echo)]
     else:
-        outcomes = of_nodes.run(study, count=kills, seed=seed, parts=part or known, echo=typer.echo)
+        outcomes = of_nodes.run(study, count=kills, seed=seed, parts=part or of_nodes.PARTS, echo=typer.echo)
     text = table(outcomes)
     typer.echo(text)
     write_page(out, text)

@@ -50,13 +50,7 @@ def noise_rig(cameras: int, side: int) -> Rig:
 def measure(folder: Path, *, frames: int, cameras: int, side: int, rounds: int, senders: int) -> dict[str, list[float]]:
     """Measures the rates over HTTP and over a WebSocket, alternating between them, in MB per second and round.
 
-    Args:
-        folder: folder on the disk to measure.
-        frames: number of frames per round.
-        cameras: number of cameras of the rig.
-        side: width and height of the JPEGs in pixels.
-        rounds: number of rounds; a further round warms up.
-        senders: number of HTTP connections.
+    For the arguments, see ``scripts/bench ingest --help``.
 
     Raises:
         StudyError: the service refused a frame.

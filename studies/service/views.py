@@ -23,6 +23,7 @@ from typing import Any
 import httpx
 import numpy as np
 
+from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
 from studies.options import Echo
@@ -136,13 +137,7 @@ def measure(
 ) -> list[ViewTimes]:
     """Measures views and updates, alone and together, and returns the times at each rate.
 
-    Args:
-        capture: capture whose frames are sent.
-        folder: folder for the service's data; its contents are deleted.
-        updates: number of updates per turn, both with and without views.
-        turns: number of turns per rate.
-        settings: scene settings.
-        echo: callback that prints progress messages.
+    For the arguments, see ``scripts/bench views --help``.
     """
     shutil.rmtree(folder, ignore_errors=True)
     data = folder / "data"
@@ -174,7 +169,7 @@ def measure(
                     row.together += frames.run(updates)
                 row.loaded += load.latencies
                 row.refused += load.refused
-                echo(line(row))
+                echo(str(row_of(row)))
         return times
     finally:
         with contextlib.suppress(Exception):
@@ -182,28 +177,33 @@ def measure(
         service.kill()
 
 
-def line(row: ViewTimes) -> str:
-    """Formats the times at one rate as a row of the Markdown table."""
-    cells = [
-        f"{row.rate:g}",
-        *(f"{statistics.median(times):.0f} ({np.percentile(times, 95):.0f})" for times in (row.idle, row.loaded)),
-        f"{row.latency:.2f}",
-        f"{statistics.median(row.alone):.2f}",
-        f"{statistics.median(row.together):.2f}",
-        f"{100 * row.slower:+.0f}%",
-        str(row.refused),
-    ]
-    return "| " + " | ".join(cells) + " |"
+COLUMNS = (
+    Column("views per second", "rate", "g"),
+    Column("idle, ms (95%)", "idle"),
+    Column("during updates, ms (95%)", "loaded"),
+    Column("ratio", "latency"),
+    Column("update alone, s", "alone"),
+    Column("under views, s", "together"),
+    Column("slower", "slower", "+.0%"),
+    Column("no response", "refused", "d"),
+)
+
+
+def row_of(times: ViewTimes) -> Row:
+    """Returns the medians at one rate as a row of the table."""
+    idle, loaded = (
+        f"{statistics.median(each):.0f} ({np.percentile(each, 95):.0f})" for each in (times.idle, times.loaded)
+    )
+    alone, together = (statistics.median(each) for each in (times.alone, times.together))
+    return vars(times) | {
+        "idle": idle, "loaded": loaded, "alone": alone, "together": together, "latency": times.latency,
+        "slower": times.slower,
+    }  # fmt: skip
 
 
 def table(rows: Sequence[ViewTimes]) -> str:
     """Formats the results as a Markdown table, followed by a sentence on the target."""
-    head = [
-        "| views per second | idle, ms (95%) | during updates, ms (95%) | ratio | update alone, s | under views, s | "
-        "slower | no response |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    text = "\n".join([*head, *map(line, rows)])
+    text = markdown([row_of(times) for times in rows], COLUMNS)
     for row in rows:
         if row.rate == TARGET_RATE:
             reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0

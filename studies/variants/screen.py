@@ -106,16 +106,7 @@ def run(
 ) -> str:
     """Measures every contender on every variant of every capture, writes ``out/variants.md`` and returns its text.
 
-    Args:
-        captures: capture folders.
-        contenders: settings to compare; the first is the baseline.
-        out: folder for rows and frames 0; a second call with the same folder resumes the study.
-        variants: names from ``VARIANTS``; all if empty.
-        seeds: seeds for the updates; frame 0 always uses the first one.
-        frames: maximum number of frames per variant.
-        again: whether to repeat rows that are already on disk.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench variants --help``.
 
     Raises:
         ValueError: a preset or setting is unknown, or a value is out of range.

@@ -7,6 +7,8 @@ floor. After each round trip, the truth is bit-identical to that of frame 0.
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +26,6 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
-from studies.machine import resident_mb
 from studies.wall import photograph
 
 SIZE = 48
@@ -206,3 +207,12 @@ def violations(rows: Sequence[Row]) -> list[str]:
 
 def _rms(distances: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(distances))))
+
+
+def resident_mb() -> float:
+    """Returns the resident memory of this process in 10⁶ bytes, or NaN if it cannot be read."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmRSS"):
+                return int(line.split()[1]) * 1024 / 1e6
+    return math.nan

@@ -1,4 +1,4 @@
-"""The study of accuracy against time on rows made of formulas, and its watch over updates of a small scene."""
+"""The study of accuracy against time on rows made of formulas, and its times."""
 
 import json
 import types
@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from box_scene import held_out_camera, make_box, make_rig, moved, photograph
 from made_frontier import made_psnr, made_row, made_seconds, made_study
 from PIL import Image
+from plates import write_capture
 from typer.testing import CliRunner
 
 from client.cli.scores import Store
@@ -25,35 +25,6 @@ from studies.frontier.tradeoff import (
     undominated,
 )
 from studies.quality import first_frame
-
-FRAMES = 4
-
-
-@pytest.fixture(scope="module")
-def box_capture(tmp_path_factory):
-    """The box on its plate, moved a little every frame, as a capture with one test camera."""
-    folder = tmp_path_factory.mktemp("captures") / "box"
-    boxes = [make_box()]
-    for _ in range(FRAMES - 1):
-        boxes.append(moved(boxes[-1]))
-    for file, cameras in (("train_meta.json", make_rig().cameras), ("test_meta.json", (held_out_camera(),))):
-        names = [c.name for c in cameras]
-        meta = {
-            "w": cameras[0].width,
-            "h": cameras[0].height,
-            "k": [[c.intrinsics.tolist() for c in cameras]] * FRAMES,
-            "w2c": [[c.world_to_camera.tolist() for c in cameras]] * FRAMES,
-            "fn": [[f"{name}/{t:06d}.png" for name in names] for t in range(FRAMES)],
-            "cam_id": [names] * FRAMES,
-        }
-        folder.mkdir(exist_ok=True)
-        (folder / file).write_text(json.dumps(meta))
-        for t, box in enumerate(boxes):
-            for camera in cameras:
-                for kind, image in zip(("ims", "seg"), photograph(box, camera), strict=True):
-                    (folder / kind / camera.name).mkdir(parents=True, exist_ok=True)
-                    Image.fromarray(image).save(folder / kind / camera.name / f"{t:06d}.png")
-    return folder
 
 
 def test_every_setting_is_another_and_the_default_comes_first():
@@ -210,7 +181,8 @@ def test_a_page_of_nothing_says_what_to_do(tmp_path):
         write_page(tmp_path, ["robot"], tmp_path / "page.md")
 
 
-def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capture, tmp_path, monkeypatch):
+def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(tmp_path, monkeypatch):
+    capture = write_capture(tmp_path / "plates")  # of four frames
     took: list[str] = []
     now = [0.0]
 
@@ -232,16 +204,16 @@ def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capt
         lambda capture, settings, out: Paced(settings.update.iterations, paces[settings.update.iterations]),
     )
     monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
-    row = timing.measure_times(box_capture, [short, long], tmp_path, report=lambda line: None)
+    row = timing.measure_times(capture, [short, long], tmp_path, report=lambda line: None)
     assert took == ["10:1", "1000:1", "1000:2", "10:2", "10:3"]
     assert row["rounds"] == 2  # the capture has no more frames
-    assert row == timing.read_times(tmp_path, "box")
+    assert row == timing.read_times(tmp_path, "plates")
     assert [entry["seconds"] for entry in row["settings"]] == [2.5, 6.0]
     assert timing.time_of(row, short)["label"] == "short"
     assert timing.time_of(row, DEFAULT) is None
     paces[short.settings.update.iterations] = 2.0  # a busier machine
-    alone = timing.measure_times(box_capture, [short], tmp_path, report=lambda line: None)
+    alone = timing.measure_times(capture, [short], tmp_path, report=lambda line: None)
     kept = alone["settings"][1]
     assert (kept["label"], kept["seconds"], kept["stages"]) == ("long", 12.0, {"render": 6.0})
-    timing.measure_times(box_capture, [long], tmp_path, report=lambda line: None)
-    assert len(timing.read_times(tmp_path, "box")["settings"]) == 1  # nothing to compare by
+    timing.measure_times(capture, [long], tmp_path, report=lambda line: None)
+    assert len(timing.read_times(tmp_path, "plates")["settings"]) == 1  # nothing to compare by

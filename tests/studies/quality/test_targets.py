@@ -16,7 +16,6 @@ from studies.quality.targets import (
     Target,
     compare,
     count_words,
-    left_out,
     page,
     read_study,
     target_table,
@@ -150,7 +149,6 @@ def test_only_rows_of_todays_settings_count_and_the_longest_of_them(tmp_path):
         ("scas4d", "robot"): 31.0,
         ("robot-unaided", "robot"): 0,
     }
-    assert left_out(tmp_path, found) == 3
 
 
 def test_runs_differ_in_what_they_say_they_do(tmp_path):

@@ -2,10 +2,12 @@
 
 from statistics import median
 
+import pytest
 from box_regions import regions_of_box
 
 from studies.apart import in_a_process
 
+pytestmark = pytest.mark.slow
 MOST = 10
 """Cascade, projection, tile covers, tile lists, blending, image loss, blending and projection backward, neighbours and
 cascade backward. Adam takes the box's few rows on one thread."""
