@@ -44,8 +44,9 @@ def write_part(path: Path, text: str) -> None:
     path.write_text(new)
 
 
-def write_page(out: Path | None, text: str) -> None:
-    """Writes the text to `out`, creating its folder if necessary. Does nothing if `out` is None."""
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text if text.endswith("\n") else text + "\n")
+def show(text: str, page: Path | None) -> None:
+    """Prints a text, and also writes it to a page if one is given, creating its folder if necessary."""
+    print(text)
+    if page is not None:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text(text if text.endswith("\n") else text + "\n")

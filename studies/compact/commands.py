@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Page, write_page
+from studies.options import Page, show
 
 
 def compact(
@@ -28,5 +28,4 @@ def compact(
 
     figures = measure(capture, states, frames, {}, None)
     text = summarize(figures)
-    print(text)
-    write_page(page, text)
+    show(text, page)

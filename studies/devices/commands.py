@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Captures, Page, write_page
+from studies.options import Captures, Page, show
 
 
 def devices(
@@ -16,9 +16,9 @@ def devices(
     ] = False,
     page: Page = None,
 ) -> None:
-    """Compares images, tracks and times of updates on the CPU and on a GPU, from the same states.
+    """Compares images and tracks of updates on the CPU and on a GPU, from the same states.
 
-    Without a GPU, the GPU kernels run on the CPU. The results are then comparable, but the times are not.
+    Without a GPU, the GPU kernels run on the CPU.
 
     Example: scripts/bench devices samples/robot
     """
@@ -28,5 +28,4 @@ def devices(
     stands_for = use_cpu_without_gpu()
     rows = [row for folder in captures for row in compare(folder, apart=apart)]
     text = f"{table(rows)}\n\n*GPU* is {stands_for}. {in_words(machine())}."
-    print(text)
-    write_page(page, text)
+    show(text, page)

@@ -1,7 +1,6 @@
-"""Updates the same frames on both devices, from the same states, and compares images, tracks and times.
+"""Updates the same frames on both devices, from the same states, and compares images and tracks.
 
-Without a GPU, the GPU kernels run on the CPU device of NVIDIA Warp. The results are then comparable, but the times are
-not.
+Without a GPU, the GPU kernels run on the CPU device of NVIDIA Warp.
 """
 
 from __future__ import annotations
@@ -37,8 +36,6 @@ class DeviceRow:
         capture: capture name.
         index: frame index.
         psnr: mean PSNR on the test cameras in dB, keyed by device.
-        seconds: duration of the update in seconds, keyed by device.
-        gaussians: number of Gaussians present, keyed by device.
         distance: median distance between the positions of the same moving Gaussian on both devices, divided by the
             extent of the scene.
         tracks: median track error up to this frame, in percent of the extent, keyed by device; empty without ground
@@ -48,8 +45,6 @@ class DeviceRow:
     capture: str
     index: int
     psnr: dict[Device, float]
-    seconds: dict[Device, float]
-    gaussians: dict[Device, int]
     distance: float
     tracks: dict[Device, float]
 
@@ -106,13 +101,12 @@ def compare(
         for index in range(1, last + 1):
             if index == 1 or not apart:
                 scenes["gpu"] = continued(folders["cpu"], folders["gpu"], capture.rig, settings["gpu"])
-            reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
+            for scene in scenes.values():
+                scene.step(capture.frame(index))
             psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
             row = DeviceRow(
                 capture.name, index,
                 psnr={device: value if value is not None else float("nan") for device, value in psnr.items()},
-                seconds={device: sum(report.seconds.values()) for device, report in reports.items()},
-                gaussians={device: report.gaussians for device, report in reports.items()},
                 distance=float(np.median(distances(scenes, index))) / extent,
                 tracks=track_errors(scenes, capture, index),
             )  # fmt: skip
@@ -153,8 +147,6 @@ COLUMNS = (
     Column("worst frame", "worst", "+.3f"),
     Column("distance, % of the extent", "distance", ".4f"),
     Column("track error, GPU minus CPU, worst frame", "tracks", "+.4f"),
-    Column("CPU, s per update", "cpu"),
-    Column("GPU", "gpu"),
 )
 
 
@@ -174,7 +166,6 @@ def table(rows: Sequence[DeviceRow]) -> str:
                 "worst": max(differences, key=abs),
                 "distance": 100 * max(row.distance for row in own),
                 "tracks": max(tracks, key=abs, default=None),
-                **{device: float(np.median([row.seconds[device] for row in own])) for device in DEVICES},
             }
         )
     return markdown(lines, COLUMNS)

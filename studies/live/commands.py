@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Page, Repeated, write_page
+from studies.options import Page, Repeated, show
 
 
 def live(
@@ -32,8 +32,7 @@ def live(
     source = open_source(capture)
     rig = Rig(source.full_rig.cameras[:cameras])
     text = report(rig, run(source, rig, frames, work))
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)
 
 
 def viewer(
@@ -54,5 +53,4 @@ def viewer(
 
     need_server()
     text = report(run(folder, frames, fps, work), fps)
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)

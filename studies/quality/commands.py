@@ -9,7 +9,7 @@ import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import QUALITY, Again, Captures, Changes, write_page
+from studies.options import QUALITY, Again, Captures, Changes
 
 Study = Annotated[
     Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
@@ -126,4 +126,5 @@ def table(
     print(target_table(outcomes))
     print(f"\n{count_words(outcomes)}.")
     if out is not None:
-        write_page(out, page(rows))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(page(rows))

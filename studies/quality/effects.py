@@ -149,7 +149,6 @@ def _compared(known: Row, capture: Capture, out: Path, settings: Settings, pins:
         auto, other = (scene.history.newest.arrays() for scene in scenes)
         same &= auto.keys() == other.keys() and all(np.array_equal(auto[key], other[key]) for key in auto)
     timed = slice(1 if count > 2 else 0, None)  # the first update loads kernels and searches for the motion
-    report = scenes[0].report
     return known | {
         "updates": count - 1,
         "in_auto": _words(scenes[0], pins),
@@ -161,7 +160,6 @@ def _compared(known: Row, capture: Capture, out: Path, settings: Settings, pins:
         "seconds_ratio": float(np.median(wall[1, timed] / wall[0, timed])),
         "cpu_ratio": float(cpu[1, timed].sum() / cpu[0, timed].sum()),
         "same_bits": "yes" if same else "no",
-        "gaussians": 0 if report is None else report.gaussians,
     }
 
 

@@ -46,17 +46,13 @@ COLUMNS = (
     Column("Gaussians", "gaussians", ",d"),
     Column("pairs", "pairs", ".1f"),
     Column("99%", "pairs_99", ".0f"),
-    Column("last", "pairs_last", ".1f"),
-    Column("99%", "pairs_last_99", ".0f"),
     Column("frame 0 s", "seconds_first", ".0f"),
     Column("update s", "seconds_update", ".1f"),
     Column("held", "held", "d"),
     Column("unmoved", "unmoved", "d"),
     Column("training dB", "psnr_training", ".1f"),
-    Column("last", "psnr_training_last", ".1f"),
     Column("held out", "held_out"),
     Column("its dB", "psnr_held_out", ".1f"),
-    Column("last", "psnr_held_out_last", ".1f"),
     Column("nearest picture dB", "psnr_nearest", ".1f"),
     Column("flow px", "flow_px", ".1f"),
     Column("epipolar px", "epipolar_px", ".1f"),
@@ -122,10 +118,7 @@ def measured(
         unmoved += report.candidate is Candidate.PREVIOUS
     cameras = [CameraArrays.of(camera) for camera in scene.rig.cameras]
     renderer = renderer_of("cpu", (0, 0, 0), rig_limits(settings.scene.near, scene.world, given.rig.cameras))
-    pairs, pairs_last = (
-        np.concatenate([pairs.ravel() for pairs in renderer.pairs_per_pixel(state, cameras)])
-        for state in map(scene.history.gaussians, (0, count - 1))
-    )
+    pairs = np.concatenate([each.ravel() for each in renderer.pairs_per_pixel(scene.history.first, cameras)])
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,
@@ -137,15 +130,12 @@ def measured(
         "gaussians": len(scene.history.first),
         "pairs": float(pairs.mean()),
         "pairs_99": float(np.percentile(pairs, 99)),
-        "pairs_last": float(pairs_last.mean()),
-        "pairs_last_99": float(np.percentile(pairs_last, 99)),
         "seconds_first": first,
         "shortened": list(scene.history.report(0).get("shortened") or []),
         "seconds_update": float(np.median(seconds)) if seconds else None,
         "held": held,
         "unmoved": unmoved,
         "psnr_training": float(np.mean(trained)),
-        "psnr_training_last": trained[-1],
         "settings": settings_record(settings, ()),
     }
     if (unseen := truth.test_rig) is not None:
@@ -153,7 +143,6 @@ def measured(
         row |= {
             "held_out": ", ".join(unseen.names),
             "psnr_held_out": float(np.mean(scores)),
-            "psnr_held_out_last": scores[-1],
             "psnr_nearest": float(np.mean([_nearest_psnr(truth, unseen, index) for index in range(count)])),
         }
     if count > 1:

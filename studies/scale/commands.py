@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Page, write_page
+from studies.options import Page, show
 
 
 def scale(
@@ -31,5 +31,4 @@ def scale(
     if unknown := set(sweep or []) - set(SWEEPS):
         raise typer.BadParameter(f"unknown sweep {sorted(unknown)[0]!r}; choose from {', '.join(SWEEPS)}")
     text = summarize(run(work.resolve(), sweep or list(SWEEPS), typer.echo))
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)

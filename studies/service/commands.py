@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Changes, Page, Repeated, write_page
+from studies.options import Changes, Page, Repeated, show
 
 
 def faults(
@@ -23,7 +23,6 @@ def faults(
     placement: Annotated[
         str, typer.Option(help="`local`, or `ray` for a Ray cluster of three nodes on this machine.")
     ] = "local",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
     work: Annotated[Path, typer.Option(help="Folder for data folders and logs; its contents are deleted.")] = Path(
         "out/faults"
     ),
@@ -50,12 +49,11 @@ def faults(
     opened = open_source(capture)
     study = Study(work.resolve(), opened, encoded_frames(opened, frames), parse_changes(changes), {})
     if placement == "local":
-        outcomes = [of_faults.kills(study, *undisturbed(study), kills, seed, typer.echo)]
+        outcomes = [of_faults.kills(study, *undisturbed(study), kills, 0, typer.echo)]
     else:
-        outcomes = of_nodes.run(study, count=kills, seed=seed, parts=part or of_nodes.PARTS, echo=typer.echo)
+        outcomes = of_nodes.run(study, count=kills, seed=0, parts=part or of_nodes.PARTS, echo=typer.echo)
     text = table(outcomes)
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)
     if not all(outcome.reached for outcome in outcomes):
         raise typer.Exit(1)
 
@@ -78,8 +76,7 @@ def ingest(
     need_server()
     given = {"frames": frames, "cameras": cameras, "side": side, "senders": senders}
     text = of_ingest.page(of_ingest.measure(work.resolve(), rounds=rounds, **given), **given)
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)
 
 
 def views(
@@ -111,8 +108,7 @@ def views(
         echo=typer.echo,
     )
     text = of_views.page(rows, capture.name, updates, turns)
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)
 
 
 def memory(

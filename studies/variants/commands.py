@@ -9,7 +9,7 @@ import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import Again, Captures, Changes, Page, write_page
+from studies.options import Again, Captures, Changes, Page, show
 
 
 @with_capture_options
@@ -61,7 +61,7 @@ def variants(
         again=again,
         options=options,
     )
-    write_page(page, text)
+    show(text, page)
 
 
 @with_capture_options
@@ -87,8 +87,7 @@ def gaps(
     scale = settings.scene.image_scale
     jobs = [(options.open(path), open_measured(path, options, image_scale=scale), settings) for path in captures]
     text = run(jobs, frames, step, queue, typer.echo)
-    typer.echo(text)
-    write_page(page, text)
+    show(text, page)
 
 
 def confidence(
@@ -107,5 +106,4 @@ def confidence(
     if len(captures) < 2:
         raise typer.BadParameter("pass at least two captures, because one is left out", param_hint="CAPTURE...")
     text = run(captures, out)
-    typer.echo(text)
-    write_page(page, text)
+    show(text, page)

@@ -127,5 +127,4 @@ def run(
     measured = run_jobs(jobs, out, again=again, report=report)
     text = page([row | place for row, place in zip(measured, places, strict=True)], [one.name for one in contenders])
     (out / "variants.md").write_text(text + "\n")
-    report(text)
     return text
