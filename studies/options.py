@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-Echo = Callable[[str], None]
-"""Function that prints one line of a study's output."""
 QUALITY = Path("out/quality")
 """Default folder of the quality study. Other studies read its results."""
 FRONTIER = Path("out/frontier")
@@ -19,6 +16,9 @@ Repeated = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Capture folder; a short capture is played back and forth.")
 ]
 Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Capture folders.")]
+Study = Annotated[
+    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
+]
 Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
 Changes = Annotated[
     list[str] | None,

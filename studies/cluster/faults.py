@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
+from client.cli.evaluate import Report
 from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
-from studies.options import Echo
 from studies.running.outcome import ScenarioResult
 from studies.running.process import PATIENCE_S, Service, StudyError, wait_until
 from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, running, undisturbed
@@ -24,7 +24,7 @@ HEAD_GONE_S = 10.0
 
 
 def killed_nodes(
-    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Report
 ) -> ScenarioResult:
     """Kills the node of the scene's worker with `kill -9` at `count` random moments. A new node joins each time."""
     random_ = random.Random(seed)
@@ -56,7 +56,7 @@ def killed_nodes(
 
 
 def restarted_head(
-    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Report
 ) -> ScenarioResult:
     """Kills the cluster's head with `kill -9` during an update, and later restarts it from the state kept in Redis."""
     with running(study, "head") as (service, scene, sender):
@@ -137,7 +137,7 @@ PARTS = ("nodes", "head")
 """Names of the scenarios. In "head", a cluster of its own is used, whose head stores its state in Redis."""
 
 
-def run(study: Study, *, count: int, seed: int, parts: Sequence[str], echo: Echo) -> list[ScenarioResult]:
+def run(study: Study, *, count: int, seed: int, parts: Sequence[str], echo: Report) -> list[ScenarioResult]:
     """Runs the scenarios named in `parts` on a cluster and compares the states with a single-machine run.
 
     Args:

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import QUALITY, Again, Captures, Changes
-
-Study = Annotated[
-    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
-]
+from studies.options import QUALITY, Again, Captures, Changes, Study
 
 
 @with_capture_options

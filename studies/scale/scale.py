@@ -12,12 +12,12 @@ from time import perf_counter
 
 import numpy as np
 
+from client.cli.evaluate import Report
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from scas4d_core.captures import InitialPoints
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.apart import in_a_process
-from studies.options import Echo
 from studies.wall import Size, known, rig, shown, wall
 
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}
@@ -87,7 +87,7 @@ def cost(size: Size) -> Row:
     return {"update": median(seconds[1:]), "view": median(views[1:]), "frame_0": first, "memory": memory}
 
 
-def run(work: Path, sweeps: Sequence[str], echo: Echo) -> dict[str, list[Row]]:
+def run(work: Path, sweeps: Sequence[str], echo: Report) -> dict[str, list[Row]]:
     """Measures the sizes that are not in the folder ``work``, and returns the costs of each sweep."""
     found: dict[str, list[Row]] = {}
     for name in sweeps:

@@ -16,11 +16,11 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from client.cli.evaluate import Report
 from client.wire import FrameState
 from scas4d_core.storage.frame_files import checkpoint_file, frame_file
 from server.storage.frame_store import has_record
 from server.storage.layout import DataFolder
-from studies.options import Echo
 from studies.running.outcome import ScenarioResult
 from studies.running.process import PATIENCE_S, Service, StudyError
 from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, running
@@ -71,7 +71,7 @@ def _in_order(kills: Sequence[Kill]) -> list[Kill]:
 
 
 def kills(
-    study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
+    study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Report
 ) -> ScenarioResult:
     """Kills the worker or the whole service with `kill -9` `count` times: between pipeline stages and at random."""
     random_ = random.Random(seed)

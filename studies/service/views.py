@@ -23,10 +23,10 @@ from typing import Any
 import httpx
 import numpy as np
 
+from client.cli.evaluate import Report
 from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
-from studies.options import Echo
 from studies.running.process import Service
 from studies.running.study import Updates, encoded_frames
 
@@ -133,7 +133,7 @@ def measure(
     updates: int,
     turns: int,
     settings: Mapping[str, Any],
-    echo: Echo,
+    echo: Report,
 ) -> list[ViewTimes]:
     """Measures views and updates, alone and together, and returns the times at each rate.
 
