@@ -146,7 +146,7 @@ def measure(
     service.start()
     try:
         many = 1 + WARM_UP + 2 * updates * turns * len(RATES)
-        scene = service.create(capture.rig, settings, ingest={"queue_frames": updates + 1})
+        scene = service.create(capture.rig, settings, ingest={"queue_frames": max(updates, WARM_UP) + 1})
         if capture.points is not None:
             service.put_points(scene, capture.points)
         frames = Updates(service, scene, encoded_frames(capture, many))

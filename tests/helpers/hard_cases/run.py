@@ -26,7 +26,7 @@ def backends() -> list[str]:
 
 
 def violations(case: HardCase, size: Any, on: Iterable[str]) -> list[str]:
-    """Runs one case at one size on the given backends and returns the violated checks. So does an exception count."""
+    """Runs one case at one size on the given backends and returns the violated checks; an exception is one of them."""
     try:
         with np.errstate(all="ignore"):
             problem = case.make(size)
