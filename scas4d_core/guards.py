@@ -5,8 +5,8 @@ non-finite, undefined or denormal. Every action of a guard is counted, so that g
 fault. A *convention* is part of the method: it always acts, and its actions are not counted.
 Kernels import the values, and ``kernels.cache`` recompiles the kernels when a value changes.
 
-``scripts/bench stability`` runs a catalogue of hard cases and documents both tables. With
-``--mutate``, the command disables each constant in turn, and reports the cases that then fail.
+``tests/core/test_hard_cases.py`` runs a catalogue of hard cases. Its long version also disables each
+constant in turn, and checks that a case then fails.
 """
 
 from __future__ import annotations

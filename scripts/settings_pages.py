@@ -1,4 +1,4 @@
-"""Writes the settings tables of docs/service-settings.md and docs/settings.md from the field definitions.
+"""Writes the tables of settings and guards in docs/ from their definitions.
 
 python scripts/settings_pages.py            # writes
 python scripts/settings_pages.py --check    # exits with an error if a page is out of date
@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from client.cli.changes import format_changes
+from scas4d_core.guards import CONVENTIONS, GUARDS, OBSERVED
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
 from server.settings import PREFIX, ServerSettings
@@ -76,6 +77,27 @@ def method_table() -> str:
     return "\n".join([*settings, "", "| preset | changes |", "|---|---|", *preset_rows()])
 
 
+def guards_table() -> str:
+    """Returns the table of the guards, followed by what else is counted, and by the conventions."""
+    rows = ["| guard | value | acts on | counts |", "|---|---|---|---|"]
+    for guard in GUARDS.values():
+        clause = guard.reason.split(":")[0].split(". ")[0].rstrip(".")
+        rows.append(f"| `{guard.name}` | {guard.value:g} {guard.unit} | {clause} | {guard.counted} |")
+    observed = [f"- `{name}`: {words}" for name, words in OBSERVED.items()]
+    conventions = ", ".join(f"`{guard.name}`" for guard in CONVENTIONS.values())
+    return "\n".join(
+        [
+            *rows,
+            "",
+            "Also counted, although they do not change the result:",
+            "",
+            *observed,
+            "",
+            f"Conventions always apply and are not counted: {conventions}.",
+        ]
+    )
+
+
 def written(page: Path, table: str) -> str:
     """Returns the text of a page with the given table between the markers."""
     before, _, rest = page.read_text().partition(BEGIN)
@@ -86,7 +108,8 @@ def written(page: Path, table: str) -> str:
 def main() -> None:
     """Writes the pages. With `--check`, only compares them and exits with an error if one is out of date."""
     stale = []
-    for name, table in (("service-settings.md", server_table()), ("settings.md", method_table())):
+    tables = {"service-settings.md": server_table(), "settings.md": method_table(), "stability.md": guards_table()}
+    for name, table in tables.items():
         page = DOCS / name
         text = written(page, table)
         if text != page.read_text():

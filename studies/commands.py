@@ -4,49 +4,40 @@ from __future__ import annotations
 
 import typer
 
-from studies.cluster.commands import cluster, head
-from studies.compact.commands import compact, opening
+from studies.compact.commands import compact
 from studies.devices.commands import devices
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
-from studies.hard_cases.commands import alarms, stability, timing
-from studies.kernels.commands import gpu_kernels, kernels, moving, startup
-from studies.live.commands import live, soak, viewer
+from studies.hard_frames.commands import alarms, timing
+from studies.kernels.commands import kernels
+from studies.live.commands import live, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
-    quality,
     refit,
-    switches,
     table,
     targets,
 )
-from studies.rigs.commands import calibration, drift, rigs
+from studies.rigs.commands import calibration, rigs
 from studies.scale.commands import scale
-from studies.service.commands import faults, ingest, memory, sleeping, views
-from studies.simulation.commands import simulate
+from studies.service.commands import faults, ingest, memory, views
 from studies.variants.commands import confidence, gaps, variants
 
 STUDIES = {
-    "Quality": (quality, refit, effects, switches, targets, table, confidence),
-    "Rigs": (rigs, calibration, drift),
-    "Quality of the output": (compact, opening, exports),
+    "Quality": (refit, effects, targets, table, confidence),
+    "Rigs": (rigs, calibration),
+    "Quality of the output": (compact, exports),
     "Accuracy against time": (frontier, paper, variants, gaps),
-    "Speed of the code": (kernels, gpu_kernels, moving, scale, startup, devices, gpu_check),
-    "Hard cases": (stability, timing, alarms),
+    "Speed of the code": (kernels, scale, devices, gpu_check),
+    "Faults of cameras": (timing, alarms),
     "The running service": (
         faults,
         ingest,
         live,
-        soak,
         viewer,
         views,
         memory,
-        sleeping,
-        cluster,
-        head,
-        simulate,
     ),
 }
 """Maps each heading of `scripts/bench --help` to its commands."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import math
 import os
 import platform
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +40,16 @@ def in_words(of: Mapping[str, Any]) -> str:
     return ", ".join(words)
 
 
+def provenance(rows: Iterable[Mapping[str, Any]]) -> tuple[str, str, str]:
+    """Returns the range of days, the machines and the source versions of rows, as text; dashes if there are none."""
+    known = list(rows)
+    days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
+    machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
+    cores = sorted({str(row["core"]) for row in known if "core" in row})
+    when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "–"
+    return when, "; ".join(machines) or "–", ", ".join(cores) or "–"
+
+
 def processor() -> str:
     """Returns the name of the processor, or its architecture if the name is unknown."""
     if CPU_INFO.exists():
@@ -54,15 +62,6 @@ def processor() -> str:
 def browser_path() -> str | None:
     """Returns the path of Chromium, or of Chrome; None if neither is installed."""
     return os.environ.get("SCAS4D_TEST_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
-
-
-def resident_mb(pid: int | None = None) -> float:
-    """Returns the resident memory of a process (default: this one) in 10⁶ bytes, or NaN if it cannot be read."""
-    with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid or 'self'}/status").read_text().splitlines():
-            if line.startswith("VmRSS"):
-                return int(line.split()[1]) * 1024 / 1e6
-    return math.nan
 
 
 def core_version() -> str:

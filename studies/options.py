@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-Echo = Callable[[str], None]
-"""Function that prints one line of a study's output."""
 QUALITY = Path("out/quality")
 """Default folder of the quality study. Other studies read its results."""
 FRONTIER = Path("out/frontier")
 """Default folder of the study of accuracy against time, shared with the paper study."""
 
-Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder.")]
 Repeated = Annotated[
     Path, typer.Argument(metavar="CAPTURE", help="Capture folder; a short capture is played back and forth.")
 ]
 Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Capture folders.")]
+Study = Annotated[
+    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
+]
 Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
 Changes = Annotated[
     list[str] | None,
@@ -45,8 +44,9 @@ def write_part(path: Path, text: str) -> None:
     path.write_text(new)
 
 
-def write_page(out: Path | None, text: str) -> None:
-    """Writes the text to `out`, creating its folder if necessary. Does nothing if `out` is None."""
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text if text.endswith("\n") else text + "\n")
+def show(text: str, page: Path | None) -> None:
+    """Prints a text, and also writes it to a page if one is given, creating its folder if necessary."""
+    print(text)
+    if page is not None:
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text(text if text.endswith("\n") else text + "\n")

@@ -15,7 +15,7 @@ WITHOUT_KERNELS = (
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (
     "test_ray_placement.py",
-    "test_hard_frames.py",
+    "test_hard_cases.py",
     "test_faults.py",
     "test_damage.py",
     "test_reproducible.py",
@@ -23,7 +23,7 @@ LONGEST = (
     "test_client_demo.py",
     "test_soak.py",
     "test_gradients.py",
-    "test_frames.py",
+    "test_frame_cases.py",
     "test_light.py",
 )
 """Files that take longest: begun last, they would have the other processes wait for them."""

@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
-from client.wire import Cluster
-from server.storage.fencing import current_epoch, epochs
-from server.storage.layout import DataFolder, epoch_folder
+from client.cli.evaluate import Report
+from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
-from studies.options import Echo
 from studies.running.outcome import ScenarioResult
 from studies.running.process import PATIENCE_S, Service, StudyError, wait_until
 from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, running, undisturbed
-
-Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 
 GOES_ON_S = 30.0
 """Seconds within which a scene must resume after its node is lost."""
 HEAD_GONE_S = 10.0
 """Seconds for which the head stays down."""
-WAITS_S = 5.0
-"""Seconds after which an unplaced worker counts as waiting for resources. Workers with resources start earlier."""
-SWEPT_S = 180.0
-"""Seconds within which the folders of earlier workers must be removed."""
 
 
 def killed_nodes(
-    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Report
 ) -> ScenarioResult:
     """Kills the node of the scene's worker with `kill -9` at `count` random moments. A new node joins each time."""
     random_ = random.Random(seed)
@@ -66,84 +55,8 @@ def killed_nodes(
         return ScenarioResult(f"a node killed at {count} random moments", target, summary, faults)
 
 
-def stopped_node(
-    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
-) -> ScenarioResult:
-    """Stops a node with SIGSTOP during an update and resumes it after its scene has moved to another node."""
-    with running(study, "stopped") as (service, scene, sender):
-        states = DataFolder(service.data).scene(scene).states
-        _send(sender, _second_half(study, service, scene, sender))
-        time.sleep(0.5 * update_s)
-        node, _ = _node_of(service, nodes, scene)
-        stale = current_epoch(states)
-        assert stale is not None
-        nodes.stop(node)
-        began, committed = time.monotonic(), service.status(scene).committed
-        wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume")
-        pause = time.monotonic() - began
-        echo(f"the scene resumed after {pause:.1f} s; resuming the old node")
-        folder = epoch_folder(states, stale)
-        before = _changed(folder)
-        nodes.resume(node)
-        written: set[str] = set()
-        until = time.monotonic() + 5 * update_s + 5
-        while time.monotonic() < until:
-            written |= {name for name, changed in _changed(folder).items() if before.get(name) != changed}
-            time.sleep(AGAIN_S / 5)
-        service.finish(scene, len(study.frames))
-        faults = sender.check() + compare(digests(states), expected)
-        if not written:
-            faults.append("the old worker wrote nothing, so nothing was tested; run the scenario again")
-        until = time.monotonic() + SWEPT_S
-        while len(epochs(states)) > 1 and time.monotonic() < until:
-            time.sleep(AGAIN_S)
-        if still := sorted(epochs(states))[:-1]:
-            faults.append(f"the folders of epochs {still} still exist")
-        summary = (
-            f"resumed after {pause:.1f} s; the old worker wrote {len(written)} files, all removed without being read"
-        )
-        target = "the old worker's files are removed without being read; final state bit-identical"
-        return ScenarioResult("a node stopped, then resumed after its scene has moved", target, summary, faults)
-
-
-def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
-    """Kills the scene's node while other scenes fill the remaining nodes, then deletes those scenes."""
-    with running(study, "full") as (service, scene, sender):
-        left = _second_half(study, service, scene, sender)
-        others = _fill(study, service)
-        node, _ = _node_of(service, nodes, scene)
-        committed = service.status(scene).committed
-        nodes.kill(node)
-        wait_until(lambda: _waits(service, scene), "the scene does not report that it is waiting")
-        said = str(service.status(scene).error)
-        _send(sender, left)
-        time.sleep(5 * update_s)
-        faults = []
-        if service.status(scene).committed > committed:
-            faults.append("the scene continued although no node was free, so nothing was tested")
-        echo(f"{len(others)} scenes fill the nodes; reported reason: {said}")
-        began = time.monotonic()
-        for other in others:
-            service.http.delete(f"/v1/scenes/{other}").raise_for_status()
-        wait_until(lambda: service.status(scene).committed > committed, "the scene did not resume once a node was free")
-        pause = time.monotonic() - began
-        nodes.add()
-        status = service.finish(scene, len(study.frames))
-        faults += _faults_of_kills(service, scene, sender, expected, [pause])
-        if status.degraded:
-            faults.append(f"the scene is still degraded: {status.error}")
-        summary = (
-            f"{len(left)} frames acknowledged while the scene waited and reported why; next commit {pause:.1f} s after "
-            "a node was free"
-        )
-        target = (
-            "frames are acknowledged, the scene reports why it waits and resumes once a node is free; bit-identical"
-        )
-        return ScenarioResult("a node killed while other scenes fill the rest", target, summary, faults)
-
-
 def restarted_head(
-    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Report
 ) -> ScenarioResult:
     """Kills the cluster's head with `kill -9` during an update, and later restarts it from the state kept in Redis."""
     with running(study, "head") as (service, scene, sender):
@@ -197,34 +110,6 @@ def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
     raise StudyError("the scene's worker is not running on any node")
 
 
-def _changed(folder: Path) -> dict[str, int]:
-    """Returns the modification time of each file in a folder, keyed by name. Files that disappear are skipped."""
-    changes = {}
-    for name in os.listdir(folder) if folder.is_dir() else ():
-        with suppress(FileNotFoundError):
-            changes[name] = (folder / name).stat().st_mtime_ns
-    return changes
-
-
-def _fill(study: Study, service: Service) -> list[str]:
-    """Creates scenes until no node has room for another worker, and returns their ids."""
-    scenes: list[str] = []
-    while not scenes or not _waits(service, scenes[-1]):
-        scenes.append(study.create(service))
-        wait_until(partial(_is_placed_or_waits, service, scenes[-1]), "a scene is neither placed nor waiting")
-    return scenes
-
-
-def _is_placed_or_waits(service: Service, scene: str) -> bool:
-    return service.worker_pid(scene) is not None or _waits(service, scene)
-
-
-def _waits(service: Service, scene: str) -> bool:
-    """Returns whether the scene's worker is waiting because no node has room."""
-    waiting = Cluster.model_validate_json(service.http.get("/v1/cluster").content).waiting
-    return any(one.scene == scene and one.role == "worker" and one.seconds > WAITS_S for one in waiting)
-
-
 def _faults_of_kills(
     service: Service, scene: str, sender: FrameSender, expected: Mapping[int, str], pauses: Sequence[float]
 ) -> list[str]:
@@ -248,18 +133,11 @@ def _works(service: Service, scene: str, before: int | None) -> bool:
     return status.state == "updating" or status.queued == 0
 
 
-ON_NODES = ("nodes", "stopped", "full")
-"""Names of the node scenarios."""
-OF_THE_HEAD = "head"
-"""Name of the scenario in which the head is killed. It runs in a cluster of its own, whose head uses Redis."""
-AS_LOCALLY = ("kills", "beginnings", "log", "bits")
-"""Names of the scenarios that are shared with the single-machine study.
-
-The remaining scenarios of that study do not depend on where the workers run.
-"""
+PARTS = ("nodes", "head")
+"""Names of the scenarios. In "head", a cluster of its own is used, whose head stores its state in Redis."""
 
 
-def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
+def run(study: Study, *, count: int, seed: int, parts: Sequence[str], echo: Report) -> list[ScenarioResult]:
     """Runs the scenarios named in `parts` on a cluster and compares the states with a single-machine run.
 
     Args:
@@ -267,36 +145,22 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         count: number of kills.
         seed: random seed for the moments of the kills.
         parts: names of the scenarios to run.
-        local: function that runs the named scenarios of a study whose service uses the cluster.
         echo: callback that prints progress messages.
 
     Raises:
-        StudyError: the scenario "head" is requested alone, but redis-server is not installed.
+        StudyError: the scenario "head" is requested, but redis-server is not installed.
     """
-    outcomes = []
-    if set(parts) & {*ON_NODES, OF_THE_HEAD}:
-        expected, update_s = undisturbed(study)
-        echo(f"undisturbed run on one machine: {len(expected)} states, {update_s:.2f} s per update")
-    if OF_THE_HEAD in parts:
-        if (redis_server := shutil.which("redis-server")) is not None:
-            with Nodes(redis_server=redis_server) as nodes:
-                outcomes.append(restarted_head(_on(study, nodes), nodes, expected, update_s, echo))
-        elif len(parts) == 1:
-            raise StudyError("part head requires redis-server; install it with: apt-get install redis-server")
-        else:
-            echo("skipping part head, which requires redis-server")
-    if not set(parts) & {*ON_NODES, *AS_LOCALLY}:
-        return outcomes
-    with Nodes() as nodes:
-        there = _on(study, nodes)
-        if "nodes" in parts:
-            outcomes.append(killed_nodes(there, nodes, expected, update_s, count, seed, echo))
-        if "stopped" in parts:
-            outcomes.append(stopped_node(there, nodes, expected, update_s, echo))
-        if "full" in parts:
-            outcomes.append(full_nodes(there, nodes, expected, update_s, echo))
-        if others := [part for part in parts if part in AS_LOCALLY]:
-            outcomes += local(there, others)
+    outcomes, redis_server = [], shutil.which("redis-server")
+    if "head" in parts and redis_server is None:
+        raise StudyError("part head requires redis-server; install it with: apt-get install redis-server")
+    expected, update_s = undisturbed(study)
+    echo(f"undisturbed run on one machine: {len(expected)} states, {update_s:.2f} s per update")
+    if "head" in parts:
+        with Nodes(redis_server=redis_server) as nodes:
+            outcomes.append(restarted_head(_on(study, nodes), nodes, expected, update_s, echo))
+    if "nodes" in parts:
+        with Nodes() as nodes:
+            outcomes.append(killed_nodes(_on(study, nodes), nodes, expected, update_s, count, seed, echo))
     return outcomes
 
 

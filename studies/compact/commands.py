@@ -1,4 +1,4 @@
-"""The commands `scripts/bench compact` and `scripts/bench opening`."""
+"""The command `scripts/bench compact`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Page, write_page
+from studies.options import Page, show
 
 
 def compact(
@@ -18,13 +18,6 @@ def compact(
     frames: Annotated[
         int, typer.Option(min=2, help="Number of frames in the file; the states are repeated back and forth.")
     ] = 240,
-    key_every: Annotated[int | None, typer.Option(min=1, help="Frames between keyframes.")] = None,
-    bounds: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--bound", metavar="NAME=VALUE", help="Change an error bound, such as colour=0.02. May be repeated."
-        ),
-    ] = None,
     page: Page = None,
 ) -> None:
     """Writes states to a compact file and measures its size, its PSNR and track errors, and the read and write times.
@@ -33,17 +26,6 @@ def compact(
     """
     from studies.compact.compact import measure, summarize
 
-    changed = dict(one.split("=", 1) for one in bounds or ())
-    figures = measure(capture, states, frames, {name: float(value) for name, value in changed.items()}, key_every)
+    figures = measure(capture, states, frames, {}, None)
     text = summarize(figures)
-    print(text)
-    write_page(page, text)
-
-
-def opening(
-    frames: Annotated[int, typer.Option(min=200, help="Frames in the history; default: a day at 1 Hz.")] = 86_400,
-) -> None:
-    """Measures how long it takes to open a long history whose older states are in compact files."""
-    from studies.compact.opening import opening as measured
-
-    print(measured(frames))
+    show(text, page)

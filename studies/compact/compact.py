@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Column, markdown
 from client.importers.open_source import open_source
 from client.rig.sequence import ping_pong
 from scas4d_core import metrics
@@ -18,7 +18,6 @@ from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures import Capture
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, FileHeader
 from scas4d_core.compact.encoder import KEY_EVERY
-from scas4d_core.compact.records import RecordKind, scan
 from scas4d_core.engines.limits import DEFAULT, Limits, rig_limits
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent
@@ -45,7 +44,6 @@ class CompactFigures:
         frames: number of frames in the file.
         exact: size of the exact states on disk, in bytes per frame.
         size: size of the compact file including its header, births and index, in bytes per frame.
-        sizes: mean size of a record in bytes, keyed by record kind.
         psnr: mean PSNR on the test cameras minus that of the exact states, over ``VIEWS`` frames, in dB. None if there
             are no test cameras.
         worst: lowest PSNR difference of a single frame, in dB.
@@ -53,9 +51,6 @@ class CompactFigures:
         write: median CPU time to write a frame, in ms.
         read: median CPU time to read a random frame, in ms.
         read_worst: longest CPU time to read a random frame, in ms.
-        opening: time to open the file, in ms.
-        unindexed: time to open the file without its index, in ms.
-        errors: largest error of each attribute.
     """
 
     capture: str
@@ -64,16 +59,12 @@ class CompactFigures:
     frames: int
     exact: float
     size: float
-    sizes: Mapping[str, float]
     psnr: float | None
     worst: float | None
     tracks: float
     write: float
     read: float
     read_worst: float
-    opening: float
-    unindexed: float
-    errors: Mapping[str, float]
 
 
 def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
@@ -114,23 +105,11 @@ def measure(
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / "states.s4d"
         written = _write(file, head, (history.gaussians(index) for index in order), key_every or KEY_EVERY)
-        with file.open("rb") as opened:
-            records = list(scan(opened, 0, file.name))
-        kinds = {
-            kind.name.lower(): float(np.mean(sizes))
-            for kind in RecordKind
-            if (sizes := [record.size for record in records if record.kind is kind])
-        }
-        opening = _seconds(lambda: CompactReader(file).close())
-        cut = file.with_suffix(".cut")
-        cut.write_bytes(file.read_bytes()[:-8])
-        unindexed = _seconds(lambda: CompactReader(cut).close())
         with CompactReader(file) as reader:
             reads = _reads(reader)
             first = {index: reader.state(place) for place, index in enumerate(history.indices)}
             psnr, worst = _pictures(capture, world, history, first)
             tracks = _tracks(world, history, first)
-            errors = reader.about["errors"]
         state = history.gaussians(history.indices[0])
         return CompactFigures(
             capture=capture.name,
@@ -139,38 +118,34 @@ def measure(
             frames=len(order),
             exact=exact,
             size=file.stat().st_size / len(order),
-            sizes=kinds,
             psnr=psnr,
             worst=worst,
             tracks=tracks,
             write=1e3 * float(np.median(written)),
             read=1e3 * float(np.median(reads)),
             read_worst=1e3 * max(reads),
-            opening=1e3 * opening,
-            unindexed=1e3 * unindexed,
-            errors=errors,
         )
 
 
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("Gaussians", "gaussians", ",d"),
+    Column("moving", "moving", ",d"),
+    Column("frames", "frames", "d"),
+    Column("exact, kB/frame", "exact", ".0f"),
+    Column("compact, kB/frame", "size", ".1f"),
+    Column("test PSNR, dB", "psnr", "+.3f"),
+    Column("worst frame", "worst", "+.3f"),
+    Column("tracks, % of the extent", "tracks", ".4f"),
+    Column("write, ms", "write", ".1f"),
+    Column("random read, ms", "read", ".1f"),
+    Column("worst", "read_worst", ".1f"),
+)
+
+
 def summarize(found: CompactFigures) -> str:
-    """Formats the measurements as Markdown."""
-    kinds = ", ".join(f"{name} {size / 1e3:.1f}" for name, size in found.sizes.items())
-    errors = ", ".join(f"{name} {value:.4f}" for name, value in found.errors.items())
-    pictures = "–" if found.psnr is None else f"{found.psnr:+.3f} (worst frame {found.worst:+.3f})"
-    return "\n".join(
-        [
-            f"**{found.capture}**: {found.gaussians:,} Gaussians, of which {found.moving:,} move; {found.frames} "
-            "frames",
-            "",
-            "| kB per frame | exact | test PSNR, dB | tracks, % of the extent | write ms | read ms | open ms |",
-            "|---|---|---|---|---|---|---|",
-            f"| {found.size / 1e3:.1f} | {found.exact / 1e3:.0f} | {pictures} | {found.tracks:.4f} | {found.write:.1f} "
-            f"| {found.read:.1f} (worst {found.read_worst:.1f}) "
-            f"| {found.opening:.1f} ({found.unindexed:.1f} without index) |",
-            "",
-            f"kB per record: {kinds}. Largest errors: {errors}.",
-        ]
-    )
+    """Formats the measurements as a Markdown table."""
+    return markdown([asdict(found) | {"exact": found.exact / 1e3, "size": found.size / 1e3}], COLUMNS)
 
 
 def _write(file: Path, head: FileHeader, states: Iterator[Gaussians], key_every: int) -> list[float]:
@@ -182,12 +157,6 @@ def _write(file: Path, head: FileHeader, states: Iterator[Gaussians], key_every:
             writer.add(place, place / 30, state)
             seconds.append(time.process_time() - began)
     return seconds[1:]
-
-
-def _seconds(call: Callable[[], Any]) -> float:
-    began = time.perf_counter()
-    call()
-    return time.perf_counter() - began
 
 
 def _reads(reader: CompactReader) -> list[float]:

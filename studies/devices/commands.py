@@ -6,24 +6,19 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Captures, Page, write_page
+from studies.options import Captures, Page, show
 
 
 def devices(
     captures: Captures,
-    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Image scale.")] = 0.25,
-    frames: Annotated[int, typer.Option(min=1, help="Number of updates.")] = 5,
-    iterations: Annotated[int, typer.Option(min=1, help="Iterations per update.")] = 10,
-    static: Annotated[int, typer.Option(min=1, help="Iterations of frame 0, which is fitted on the CPU.")] = 600,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the updates.")] = 0,
     apart: Annotated[
         bool, typer.Option("--apart", help="Let each device continue from its own states, not from the CPU's.")
     ] = False,
     page: Page = None,
 ) -> None:
-    """Compares images, tracks and times of updates on the CPU and on a GPU, from the same states.
+    """Compares images and tracks of updates on the CPU and on a GPU, from the same states.
 
-    Without a GPU, the GPU kernels run on the CPU. The results are then comparable, but the times are not.
+    Without a GPU, the GPU kernels run on the CPU.
 
     Example: scripts/bench devices samples/robot
     """
@@ -31,7 +26,6 @@ def devices(
     from studies.machine import in_words, machine
 
     stands_for = use_cpu_without_gpu()
-    rows = [row for folder in captures for row in compare(folder, scale, frames, iterations, static, seed, apart)]
+    rows = [row for folder in captures for row in compare(folder, apart=apart)]
     text = f"{table(rows)}\n\n*GPU* is {stands_for}. {in_words(machine())}."
-    print(text)
-    write_page(page, text)
+    show(text, page)

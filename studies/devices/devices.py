@@ -1,7 +1,6 @@
-"""Updates the same frames on both devices, from the same states, and compares images, tracks and times.
+"""Updates the same frames on both devices, from the same states, and compares images and tracks.
 
-Without a GPU, the GPU kernels run on the CPU device of NVIDIA Warp. The results are then comparable, but the times are
-not.
+Without a GPU, the GPU kernels run on the CPU device of NVIDIA Warp.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
+from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture
 from scas4d_core.engines.choose import WARP_DEVICE, Device, gpu_fault, warp_device
 from scas4d_core.metrics.evaluation import measure_pictures, measure_tracks
@@ -36,8 +36,6 @@ class DeviceRow:
         capture: capture name.
         index: frame index.
         psnr: mean PSNR on the test cameras in dB, keyed by device.
-        seconds: duration of the update in seconds, keyed by device.
-        gaussians: number of Gaussians present, keyed by device.
         distance: median distance between the positions of the same moving Gaussian on both devices, divided by the
             extent of the scene.
         tracks: median track error up to this frame, in percent of the extent, keyed by device; empty without ground
@@ -47,8 +45,6 @@ class DeviceRow:
     capture: str
     index: int
     psnr: dict[Device, float]
-    seconds: dict[Device, float]
-    gaussians: dict[Device, int]
     distance: float
     tracks: dict[Device, float]
 
@@ -73,7 +69,7 @@ def use_cpu_without_gpu() -> str:
 
 
 def compare(
-    folder: Path, scale: float, frames: int, iterations: int, static: int, seed: int = 0, apart: bool = False
+    folder: Path, scale: float = 0.25, frames: int = 5, iterations: int = 10, static: int = 600, apart: bool = False
 ) -> list[DeviceRow]:
     """Updates a capture on both devices and returns a row for each updated frame.
 
@@ -86,13 +82,12 @@ def compare(
         frames: number of updates.
         iterations: iterations per update.
         static: iterations of frame 0, which is fitted on the CPU.
-        seed: seed of the updates.
         apart: whether each device continues from its own states instead.
     """
     capture = open_measured(folder, image_scale=scale)
     changes = {
         "static": {"iterations": static, "seconds": None},
-        "update": {"iterations": iterations, "stop_gain": 0, "seed": seed},
+        "update": {"iterations": iterations, "stop_gain": 0},
     }
     settings: dict[Device, Settings] = {device: preset("scas4d", {**changes, "device": device}) for device in DEVICES}
     rows, last = list[DeviceRow](), min(frames, capture.frame_count - 1)
@@ -106,13 +101,12 @@ def compare(
         for index in range(1, last + 1):
             if index == 1 or not apart:
                 scenes["gpu"] = continued(folders["cpu"], folders["gpu"], capture.rig, settings["gpu"])
-            reports = {device: scene.step(capture.frame(index)) for device, scene in scenes.items()}
+            for scene in scenes.values():
+                scene.step(capture.frame(index))
             psnr = {device: measure_pictures(scene, capture, index)[0]["psnr"] for device, scene in scenes.items()}
             row = DeviceRow(
                 capture.name, index,
                 psnr={device: value if value is not None else float("nan") for device, value in psnr.items()},
-                seconds={device: sum(report.seconds.values()) for device, report in reports.items()},
-                gaussians={device: report.gaussians for device, report in reports.items()},
                 distance=float(np.median(distances(scenes, index))) / extent,
                 tracks=track_errors(scenes, capture, index),
             )  # fmt: skip
@@ -145,22 +139,33 @@ def distances(scenes: dict[Device, Reconstruction], index: int) -> NDArray[np.fl
     return away if len(away) else np.zeros(1)
 
 
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("updates", "updates", "d"),
+    Column("PSNR on the CPU, dB", "psnr"),
+    Column("GPU minus CPU, dB", "difference", "+.3f"),
+    Column("worst frame", "worst", "+.3f"),
+    Column("distance, % of the extent", "distance", ".4f"),
+    Column("track error, GPU minus CPU, worst frame", "tracks", "+.4f"),
+)
+
+
 def table(rows: Sequence[DeviceRow]) -> str:
     """Formats the rows of one or more captures as a Markdown table, with one line per capture."""
-    lines = [
-        "| capture | updates | PSNR on the CPU | GPU minus CPU: mean, worst frame | distance, % of the extent | "
-        "track error, % of the extent: GPU minus CPU, worst frame | seconds per update: CPU, GPU |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines: list[Row] = []
     for name in dict.fromkeys(row.capture for row in rows):
         own = [row for row in rows if row.capture == name]
-        differences = np.array([row.difference for row in own])
-        seconds = [np.median([row.seconds[device] for row in own]) for device in DEVICES]
-        errors = [row.tracks for row in own if len(row.tracks) == len(DEVICES)]
-        tracks = f"{max((each['gpu'] - each['cpu'] for each in errors), key=abs):+.4f}" if errors else "–"
+        differences = [row.difference for row in own]
+        tracks = [row.tracks["gpu"] - row.tracks["cpu"] for row in own if len(row.tracks) == len(DEVICES)]
         lines.append(
-            f"| {name} | {len(own)} | {np.mean([row.psnr['cpu'] for row in own]):.2f} dB | "
-            f"{differences.mean():+.3f} dB, {differences[np.argmax(abs(differences))]:+.3f} dB | "
-            f"{100 * max(row.distance for row in own):.4f} | {tracks} | {seconds[0]:.2f}, {seconds[1]:.2f} |"
+            {
+                "capture": name,
+                "updates": len(own),
+                "psnr": float(np.mean([row.psnr["cpu"] for row in own])),
+                "difference": float(np.mean(differences)),
+                "worst": max(differences, key=abs),
+                "distance": 100 * max(row.distance for row in own),
+                "tracks": max(tracks, key=abs, default=None),
+            }
         )
-    return "\n".join(lines)
+    return markdown(lines, COLUMNS)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Page, write_page
+from studies.options import Page, show
 
 
 def exports(
@@ -36,7 +36,6 @@ def exports(
     if asset := measure_asset(capture, states):
         text += f"\n\nArticulated asset against the true poses:\n\n{told_asset(asset)}"
         text += f"\n\nJoints against the true poses:\n\n{report(*measure_joints(capture, states))}"
-    print(text)
     if sheet is not None:
         sheet_of(figures).save(sheet)
-    write_page(page, text)
+    show(text, page)

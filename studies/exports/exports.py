@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from client import pictures
+from client.cli.scores import Column, markdown
 from client.importers.open_source import open_source
 from scas4d_core import metrics
 from scas4d_core.cameras import WorldFrame
@@ -26,10 +27,10 @@ from scas4d_core.query.parts import parts
 from scas4d_core.query.ply import SH_DEGREE_0
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
+from studies.exports.gltf import open_gltf
 
 Float = NDArray[np.float64]
 Y_UP = np.array([1.0, -1.0, -1.0])
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SPLAT = "KHR_gaussian_splatting"
 TITLE, GAP = 24, 12
 """Height of a title and gap between images on a contact sheet, in pixels."""
@@ -127,10 +128,17 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
     return figures
 
 
+COLUMNS = (
+    Column("format", "format"),
+    Column("file, MB", "megabytes"),
+    Column("dB against the state", "psnr", ".1f"),
+    Column("read by", "reader"),
+)
+
+
 def summarize(figures: list[ExportFigures]) -> str:
     """Formats the measurements as a Markdown table, with one row per format."""
-    rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
-    return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])
+    return markdown([vars(one) | {"megabytes": one.size / 1e6} for one in figures], COLUMNS)
 
 
 def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
@@ -201,19 +209,7 @@ def _by_gsply(file: Path) -> Found:
 
 def _by_pygltflib(file: Path) -> Found:
     """Returns the Gaussians of all nodes, at the end of the animation if there is one."""
-    from pygltflib import GLTF2
-
-    document = GLTF2().load(str(file))
-    blob = document.binary_blob()
-
-    def values(place: int) -> Float:
-        accessor = document.accessors[place]
-        view = document.bufferViews[accessor.bufferView]
-        width = WIDTHS[accessor.type]
-        begin = (view.byteOffset or 0) + (accessor.byteOffset or 0)
-        numbers = np.frombuffer(blob, "<f4", accessor.count * width, begin).astype(np.float64)
-        return numbers.reshape(-1, width) if width > 1 else numbers
-
+    document, values = open_gltf(file)
     ends: dict[tuple[int, str], Float] = {}
     for animation in document.animations:
         for channel in animation.channels:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from client.cli.scores import Column, markdown
 from client.importers.open_source import open_source
 from scas4d_core.captures.ground_truth import GroundTruth, TruePart
 from scas4d_core.gaussians import moving_extent
@@ -77,20 +78,21 @@ def measure_joints(folder: Path, states: Path) -> tuple[list[JointFigures], int]
     return figures, len(true)
 
 
+COLUMNS = (
+    Column("between", "between"),
+    Column("kind", "kind"),
+    Column("true", "true"),
+    Column("drift of the centre, %", "drift"),
+    Column("axis, °", "axis"),
+    Column("angle, RMS, °", "angle"),
+)
+
+
 def report(figures: list[JointFigures], count: int) -> str:
     """Formats the figures as a Markdown table, with the number of true joints found."""
     found = len({frozenset(one.between) for one in figures if one.true})
-    lines = [
-        f"{found} of {count} true joints; {len(figures)} joints between rigid parts.",
-        "",
-        "| between | kind | true | drift of the centre | axis | angle, RMS |",
-        "|---|---|---|---|---|---|",
-    ]
-    for one in figures:
-        axis, angle = ("–" if value is None else f"{value:.2f}°" for value in (one.axis, one.angle))
-        true = "yes" if one.true else "no"
-        lines.append(f"| {', '.join(one.between)} | {one.kind} | {true} | {one.drift:.2f}% | {axis} | {angle} |")
-    return "\n".join(lines)
+    rows = [vars(one) | {"between": ", ".join(one.between), "true": "yes" if one.true else "no"} for one in figures]
+    return f"{found} of {count} true joints; {len(figures)} joints between rigid parts.\n\n{markdown(rows, COLUMNS)}"
 
 
 def _owner(track: PartTrack, truth: GroundTruth) -> int:

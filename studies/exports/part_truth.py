@@ -24,6 +24,7 @@ from scas4d_core.exports.sequence import export_sequence
 from scas4d_core.query.parts import parts
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
+from studies.exports.gltf import open_gltf
 
 Float = NDArray[np.float64]
 
@@ -140,19 +141,8 @@ def read_asset(file: Path, seconds: Float) -> list[Node]:
         file: file in format `glb-parts`.
         seconds: [T] time of each frame in seconds, relative to the first.
     """
-    from pygltflib import GLTF2
-
-    document = GLTF2().load(str(file))
-    blob = document.binary_blob()
+    document, accessor = open_gltf(file)
     unit = document.asset.extras["metres_per_unit"]
-
-    def accessor(place: int) -> Float:
-        about = document.accessors[place]
-        view = document.bufferViews[about.bufferView]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[about.type]
-        begin = (view.byteOffset or 0) + (about.byteOffset or 0)
-        numbers = np.frombuffer(blob, "<f4", about.count * width, begin).astype(np.float64)
-        return numbers.reshape(-1, width) if width > 1 else numbers
 
     (animation,) = document.animations
     keyed: dict[int, dict[str, tuple[Float, Float]]] = {}

@@ -10,7 +10,7 @@ import typer
 
 from studies.options import FRONTIER, Captures
 
-STEPS = ("rows", "times", "convergence", "page")
+STEPS = ("rows", "times", "page")
 
 
 def frontier(
@@ -20,11 +20,9 @@ def frontier(
         list[str] | None, typer.Option(help="Measure only this axis, such as layers. May be repeated.")
     ] = None,
     updates: Annotated[int, typer.Option(min=1, help="Updates per row.")] = 5,
-    most_iterations: Annotated[int | None, typer.Option(min=1, help="Skip settings with more iterations.")] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Run only this step: rows, times, convergence or page. May be repeated.")
+        list[str] | None, typer.Option(help="Run only this step: rows, times or page. May be repeated.")
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Timing rounds; each times every setting once.")] = 5,
     page: Annotated[
         Path | None,
         typer.Option(help="Markdown page to write; its plots go into a folder with the same name. [OUT/frontier.md]"),
@@ -43,20 +41,17 @@ def frontier(
     steps = only or STEPS
     if "page" in steps:
         import_module("matplotlib")  # if missing, fail now and not after hours of measuring
-    from studies.frontier.convergence import measure_convergence
-    from studies.frontier.frontier import measure_frontier, variants
+    from studies.frontier.frontier import measure_variants, variants
     from studies.frontier.page import write_page
     from studies.frontier.timing import measure_times
 
     if "rows" in steps:
-        rows = measure_frontier(captures, out, axes or (), updates=updates, most_iterations=most_iterations)
+        rows = measure_variants(captures, variants(axes or ()), out, updates=updates)
         if any("error" in row for row in rows):
             raise typer.Exit(1)
     for capture in captures:
         if "times" in steps:
-            measure_times(capture, variants(axes or (), most_iterations), out, rounds=rounds)
-        if "convergence" in steps:
-            measure_convergence(capture, out, updates=updates)
+            measure_times(capture, variants(axes or ()), out)
     if "page" in steps:
         file = page or out / "frontier.md"
         write_page(out, [capture.resolve().name for capture in captures], file, updates)

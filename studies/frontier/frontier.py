@@ -27,10 +27,6 @@ ITERATIONS = (10, 25, 50, 100, 200, 300, 500, 1000, 2000)
 DEFAULT_ITERATIONS = 100
 UPDATES = 5
 """Updates per row."""
-SEEDS = (0, 1, 2)
-"""Seeds of the updates on the axis "seeds". All other rows use the first seed."""
-DRIFT = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
-"""Preset and number of iterations of the rows that cover a whole capture."""
 MAX_SCALE = "scas4d_core.engines.plan.MAX_SCALE"
 """Constant that the axis "max-scale" varies."""
 
@@ -44,8 +40,6 @@ class Variant:
         preset: preset name.
         iterations: iterations per update.
         changes: further settings, such as ``"update.clusters=[64]"``.
-        seed: seed of the updates; frame 0 is the same for all seeds.
-        whole: whether to process all frames of the capture.
         constants: overridden constants of the method, as pairs of dotted name and value (``studies.constants``).
     """
 
@@ -53,19 +47,16 @@ class Variant:
     preset: str = "scas4d"
     iterations: int = DEFAULT_ITERATIONS
     changes: tuple[str, ...] = ()
-    seed: int = 0
-    whole: bool = False
     constants: tuple[tuple[str, Any], ...] = ()
 
     @property
     def settings(self) -> Settings:
         """The complete settings."""
-        return settings_of(self.preset, self.iterations, changes=[f"update.seed={self.seed}", *self.changes])
+        return settings_of(self.preset, self.iterations, changes=self.changes)
 
     def job(self, capture: Path, updates: int) -> Job:
-        """Returns the job that measures a capture with this setting, over ``updates`` updates or all frames."""
-        frames = None if self.whole else updates + 1
-        return Job(capture, self.preset, self.settings, frames, pictures=(-1,), constants=self.constants)
+        """Returns the job that measures the first ``updates`` updates of a capture with this setting."""
+        return Job(capture, self.preset, self.settings, updates + 1, pictures=(-1,), constants=self.constants)
 
     @property
     def record(self) -> Row:
@@ -104,15 +95,8 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
             for views, count in ((2, 50), (4, 50), (4, 25))
         ),
     ),
-    "gaussians": tuple(
-        _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
-    ),
     "max-scale": (Variant("max_scale 2 m", constants=((MAX_SCALE, 2.0),)),),
     "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.deltas_start=0"),),
-    "seeds": tuple(
-        Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
-    ),
-    "drift": tuple(Variant(f"{name} {count}", name, count, whole=True) for name, count in DRIFT),
 }
 """Axes of the study. Each axis varies one aspect of the default.
 
@@ -121,12 +105,8 @@ each Gaussian start immediately, with the first layer.
 """
 
 
-def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
-    """Returns the default, followed by the other distinct settings of the given axes.
-
-    Args:
-        axes: names from ``AXES``; all axes if empty.
-        most_iterations: settings with more iterations are left out; no limit if None.
+def variants(axes: Sequence[str] = ()) -> list[Variant]:
+    """Returns the default, followed by the other distinct settings of the given axes; all axes if empty.
 
     Raises:
         ValueError: an axis is unknown.
@@ -134,50 +114,29 @@ def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> li
     for name in axes:
         if name not in AXES:
             raise ValueError(f"unknown axis {name!r}; choose from {', '.join(AXES)}")
-    asked = [variant for name in axes or AXES for variant in AXES[name]]
-    return list(
-        dict.fromkeys([DEFAULT, *(v for v in asked if most_iterations is None or v.iterations <= most_iterations)])
-    )
-
-
-def measure_frontier(
-    captures: Sequence[Path],
-    out: Path,
-    axes: Sequence[str] = (),
-    *,
-    updates: int = UPDATES,
-    most_iterations: int | None = None,
-    report: Report = print,
-) -> list[Row]:
-    """Measures the missing rows of all captures, cheapest first.
-
-    Args:
-        captures: folders of captures with test cameras.
-        out: study folder.
-        axes: names from ``AXES``; all axes if empty.
-        updates: updates per row, except on the axis "drift", which covers whole captures.
-        most_iterations: settings with more iterations are left out; no limit if None.
-        report: callback that prints progress messages.
-
-    Returns:
-        The rows measured by this call; failed rows have an ``error`` and are retried on the next call.
-
-    Raises:
-        ValueError: an axis is unknown.
-    """
-    chosen = variants(axes, most_iterations)
-    return measure_variants(captures, chosen, out, updates=updates, report=report)
+    return list(dict.fromkeys([DEFAULT, *(variant for name in axes or AXES for variant in AXES[name])]))
 
 
 def measure_variants(
     captures: Sequence[Path], chosen: Sequence[Variant], out: Path, *, updates: int = UPDATES, report: Report = print
 ) -> list[Row]:
-    """Measures the missing rows of the given settings; see ``measure_frontier``."""
+    """Measures the missing rows of settings on captures, cheapest first.
+
+    Args:
+        captures: folders of captures with test cameras.
+        chosen: settings to measure.
+        out: study folder.
+        updates: updates per row.
+        report: callback that prints progress messages.
+
+    Returns:
+        The rows measured by this call; failed rows have an ``error`` and are retried on the next call.
+    """
     known = list(Store(out).rows())
     wanted = [(variant, capture) for variant in chosen for capture in captures]
     jobs = [
         variant.job(capture, updates)
-        for variant, capture in sorted(wanted, key=lambda pair: pair[0].iterations * (5 if pair[0].whole else 1))
+        for variant, capture in sorted(wanted, key=lambda pair: pair[0].iterations)
         if row_of(known, variant, capture.resolve().name, updates) is None
     ]
     report(f"{len(wanted)} rows, {len(wanted) - len(jobs)} of them already measured")
@@ -187,15 +146,15 @@ def measure_variants(
 def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) -> Row | None:
     """Returns the row of a setting on a capture, or None if it was not measured.
 
-    A row belongs to a setting if its stored settings equal the current ones exactly. The row must also cover exactly
-    the given number of updates, or the whole capture.
+    A row belongs to a setting if its stored settings equal the current ones exactly, and if it covers exactly the given
+    number of updates, or the whole capture if it is shorter.
     """
     settings = variant.record
     for row in rows:
         if "error" in row or row["capture"] != capture or row["preset"] != variant.preset:
             continue
         given = row["given"]
-        frames = row["capture_frames"] if variant.whole else min(updates + 1, row["capture_frames"])
+        frames = min(updates + 1, row["capture_frames"])
         if given == {"frames": frames, "masks": True, "points": True} and row["settings"] == settings:
             return row
     return None

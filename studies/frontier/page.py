@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from math import log2
 from pathlib import Path
 
-from client.cli.scores import Store
+from client.cli.scores import Column, Row, Store, markdown
 from studies.frontier import plots
-from studies.frontier.convergence import read_convergence
 from studies.frontier.frontier import AXES, DEFAULT, METHODS, UPDATES, Variant
 from studies.frontier.timing import read_times
 from studies.frontier.tradeoff import (
@@ -19,10 +18,9 @@ from studies.frontier.tradeoff import (
     mean_points,
     of_axis,
     read_points,
-    spread,
     undominated,
 )
-from studies.machine import in_words
+from studies.machine import provenance
 
 PREVIEW_LOSS_DB = 4.0
 """Largest PSNR loss allowed for a preview, relative to the default."""
@@ -37,20 +35,29 @@ AXIS_WORDS: Mapping[str, str] = {
     "layers": "Number of layers (K)",
     "clusters": "First-layer clusters",
     "views": "Views per iteration",
-    "gaussians": "Gaussian budget",
     "max-scale": "Maximum scale",
     "covariance": "Covariance",
 }
 COLUMNS = (
-    ("PSNR dB", "psnr", ".2f"),
-    ("fg dB", "psnr_foreground", ".2f"),
-    ("SSIM", "ssim", ".4f"),
-    ("FLIP", "flip", ".4f"),
-    ("3D %", "track_3d_median", ".2f"),
-    ("2D %", "mte_2d", ".2f"),
-    ("parts ARI", "parts_ari", ".3f"),
+    Column("PSNR dB", "psnr", ".2f"),
+    Column("fg dB", "psnr_foreground", ".2f"),
+    Column("SSIM", "ssim", ".4f"),
+    Column("FLIP", "flip", ".4f"),
+    Column("3D %", "track_3d_median", ".2f"),
+    Column("2D %", "mte_2d", ".2f"),
+    Column("parts ARI", "parts_ari", ".3f"),
 )
-"""Columns of the score table, each with a heading, a name in ``Point.scores``, and a number format."""
+"""Columns of the score table that show scores."""
+CHOICE = (
+    Column("use", "use"),
+    Column("setting", "setting"),
+    Column("s/frame", "seconds"),
+    Column("PSNR dB", "psnr"),
+    Column("vs. default", "against"),
+    Column("3D %", "track_3d_median"),
+    Column("parts ARI", "parts_ari", ".3f"),
+)
+"""Columns of the table of recommended settings."""
 
 
 class NothingMeasured(ValueError):
@@ -77,8 +84,8 @@ def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UP
     if not there:
         raise NothingMeasured(f"{out} has no rows of {', '.join(captures)}; run scripts/bench frontier on them first")
     means = mean_points(points, there)
-    pictures = _draw(out, points, means, there, page.with_suffix(""), updates)
-    text = _text(out, points, means, there, pictures, page.stem, updates)
+    _draw(points, means, there, page.with_suffix(""), updates)
+    text = _text(out, points, means, there, page.stem, updates)
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text)
     return text
@@ -90,7 +97,7 @@ def chosen(means: Sequence[Point]) -> dict[str, Point]:
     Args:
         means: points of every setting, on one capture or averaged; the default must be among them.
     """
-    best = undominated([p for p in means if p.variant.seed == DEFAULT.seed and not p.variant.whole])
+    best = undominated(means)
     default = next(point for point in means if point.variant == DEFAULT)
     preview = next(point for point in best if point.psnr >= default.psnr - PREVIEW_LOSS_DB)
     live = preview
@@ -102,40 +109,28 @@ def chosen(means: Sequence[Point]) -> dict[str, Point]:
     return {"preview": preview, "live show": live, "archive": archive}
 
 
-def score_table(points: Sequence[Point], default: Point | None = None, counts: bool = False) -> str:
+def score_table(points: Sequence[Point], default: Point | None = None) -> str:
     """Returns a Markdown table with one row per point.
 
     Args:
         points: points in the order of the rows.
         default: point to which times are relative; if None, no relative times are shown.
-        counts: whether to add a column with the number of Gaussians.
     """
-    head = ["setting", *(["Gaussians"] if counts else []), "s/frame", "× default", *(h for h, _, _ in COLUMNS)]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows: list[Row] = []
     for point in points:
-        ratio = "–" if default is None else f"{point.seconds / default.seconds:.2f}"
-        cells = [
-            point.variant.label,
-            *([f"{point.gaussians:,.0f}"] if counts else []),
-            f"{point.seconds:.2f}",
-            ratio,
-        ]
-        for _, name, form in COLUMNS:
-            value = point.scores[name]
-            cells.append("–" if value is None else format(value, form))
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        ratio = None if default is None else point.seconds / default.seconds
+        rows.append({"setting": point.variant.label, "seconds": point.seconds, "ratio": ratio, **point.scores})
+    head = (Column("setting", "setting"), Column("s/frame", "seconds"), Column("× default", "ratio"))
+    return markdown(rows, (*head, *COLUMNS))
 
 
 def equal_table(compared: Sequence[EqualSeconds]) -> str:
     """Returns a Markdown table of captures by budgets, whose cells show the lead and the PSNR of both methods."""
-    budgets = sorted({one.iterations for one in compared})
-    head = ["capture", *(f"{count} iterations" for count in budgets)]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for capture in dict.fromkeys(one.capture for one in compared):
-        by_budget = {one.iterations: one for one in compared if one.capture == capture}
-        lines.append("| " + " | ".join([capture, *(_equal_cell(by_budget.get(count)) for count in budgets)]) + " |")
-    return "\n".join(lines)
+    rows: dict[str, Row] = {}
+    for one in compared:
+        rows.setdefault(one.capture, {"capture": one.capture})[str(one.iterations)] = _equal_cell(one)
+    budgets = [Column(f"{count} iterations", str(count)) for count in sorted({one.iterations for one in compared})]
+    return markdown(rows.values(), (Column("capture", "capture"), *budgets))
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
@@ -149,35 +144,13 @@ def equal_words(compared: Sequence[EqualSeconds]) -> str:
     return words + (f" The measured range does not include the other {missing}." if missing else "")
 
 
-def _draw(
-    out: Path, points: Sequence[Point], means: Sequence[Point], captures: Sequence[str], folder: Path, updates: int
-) -> list[str]:
-    """Draws the plots for which rows exist and returns their file names."""
+def _draw(points: Sequence[Point], means: Sequence[Point], captures: Sequence[str], folder: Path, updates: int) -> None:
+    """Draws the plots into a folder."""
     words = f"mean of {', '.join(captures)}; first {updates} updates"
-    plots.draw_frontier(means, words, folder / "frontier.png", _deviations(points, captures))
+    plots.draw_frontier(means, words, folder / "frontier.png")
     plots.draw_captures(points, captures, folder / "captures.png")
-    drawn = ["frontier.png", "captures.png"]
-    watched = next((row for name in captures if (row := read_convergence(out, name))), None)
-    if watched is not None:
-        plots.draw_convergence(watched, folder / "convergence.png")
-        drawn.append("convergence.png")
-    whole = next((name for name in captures if of_axis(points, "drift", name)), None)
-    if whole is not None:
-        plots.draw_drift(points, whole, folder / "drift.png")
-        drawn.append("drift.png")
-    bars = [p for label in STAGE_ROWS for p in means if p.variant.label == label and not p.variant.whole]
+    bars = [p for label in STAGE_ROWS for p in means if p.variant.label == label]
     plots.draw_stages(bars, words, folder / "stages.png")
-    return [*drawn, "stages.png"]
-
-
-def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
-    """Returns the standard deviation of each method's mean over captures in dB, assuming independent seeds."""
-    deviations = {method: [spread(points, method, name) for name in captures] for method in METHODS}
-    return {
-        method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)
-        for method, each in deviations.items()
-        if None not in each
-    }
 
 
 def _text(
@@ -185,23 +158,21 @@ def _text(
     points: Sequence[Point],
     means: Sequence[Point],
     captures: Sequence[str],
-    pictures: Sequence[str],
     stem: str,
     updates: int,
 ) -> str:
     default = next(point for point in means if point.variant == DEFAULT)
     iterations = [point for method in METHODS for point in curve(means, method)]
-    images = {name.removesuffix(".png"): f"![{name.removesuffix('.png')}]({stem}/{name})" for name in pictures}
     compared = equal_seconds(points, captures)
     others = "\n\n".join(
-        f"**{words}**{_over(points, axis, captures)}\n\n" + score_table(axis_means, base, counts=axis == "gaussians")
+        f"**{words}**{_over(points, axis, captures)}\n\n" + score_table(axis_means, base)
         for axis, words in AXIS_WORDS.items()
         for axis_means, base in [_axis_means(points, axis, captures)]
         if axis_means
     )
     return f"""# Accuracy against time
 
-{images["frontier"]}
+![frontier]({stem}/frontier.png)
 
 {_provenance(out, captures)}
 
@@ -230,7 +201,7 @@ than another are omitted. Cells show the lead of `scas4d` in dB and both PSNR va
 
 {equal_table(compared)}
 
-{images["captures"]}
+![captures]({stem}/captures.png)
 
 ## Iterations
 
@@ -239,28 +210,17 @@ than another are omitted. Cells show the lead of `scas4d` in dB and both PSNR va
 With 10 iterations, updates miss motion. Fitting the missed motion as new objects takes longer than the saved iterations
 (*rest* in the stage plot; confirmed on *robot* on 2026-11-27).
 
-{_spreads(points, captures)}
-
 ## One setting at a time
 
 Each row changes one setting of the default (`scas4d`, 100 iterations).
 
 {others}
 
-## Convergence, drift and stages
+## Stages
 
-{
-        _picture(
-            images,
-            "convergence",
-            "PSNR on the test cameras during an update. Learning rates and layers are scheduled as fractions of the "
-            "iteration count, so a curve does not pass through the end points of shorter updates.",
-        )
-    }
+Time per frame, by stage.
 
-{_picture(images, "drift", "PSNR over a whole capture. Each update inherits the errors of previous updates.")}
-
-{_picture(images, "stages", "Time per frame, by stage.")}
+![stages]({stem}/stages.png)
 
 ## How it was measured
 
@@ -273,23 +233,12 @@ Times come from a separate pass (`--only times`) that alternates between all set
 
 
 def _choice(means: Sequence[Point], default: Point) -> str:
-    lines = [
-        "| use | setting | s/frame | PSNR dB | vs. default | 3D % | parts ARI |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows: list[Row] = []
     for purpose, point in chosen(means).items():
-        track, parts = point.scores["track_3d_median"], point.scores["parts_ari"]
-        cells = [
-            purpose,
-            point.variant.label,
-            f"{point.seconds:.2f}",
-            f"{point.psnr:.2f}",
-            f"{point.psnr - default.psnr:+.2f} dB, {point.seconds / default.seconds:.2f}× the time",
-            "–" if track is None else f"{track:.2f}",
-            "–" if parts is None else f"{parts:.3f}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        gain, ratio = point.psnr - default.psnr, point.seconds / default.seconds
+        words = {"use": purpose, "setting": point.variant.label, "against": f"{gain:+.2f} dB, {ratio:.2f}× the time"}
+        rows.append({**words, "seconds": point.seconds, **point.scores})
+    return markdown(rows, CHOICE)
 
 
 def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> tuple[list[Point], Point | None]:
@@ -317,41 +266,18 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
     return "" if len(on) == len(captures) else f" (mean of {', '.join(on)})"
 
 
-def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
-    """Returns a sentence with the standard deviation of the PSNR over the seeds of the updates."""
-    spreads = []
-    for method in METHODS:
-        by_capture = {name: spread(points, method, name) for name in captures}
-        present = {name: value for name, value in by_capture.items() if value is not None}
-        if present:
-            count = max(seeds for _, seeds in present.values())
-            words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in present.items())
-            spreads.append(f"`{method}` {words} ({count} seeds)")
-    return f"Standard deviation of PSNR across update seeds, in dB: {'; '.join(spreads)}." if spreads else ""
-
-
 def _provenance(out: Path, captures: Sequence[str]) -> str:
     rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
     times = [row for name in captures if (row := read_times(out, name)) is not None]
-    days = sorted({str(row["measured"])[:10] for row in [*rows, *times]})
-    when = " to ".join(dict.fromkeys((days[0], days[-1])))
-    cores = sorted({str(row["core"]) for row in [*rows, *times]})
-    where = (
-        "; ".join(sorted({in_words(row["machine"]) for row in times}))
-        or "not timed separately; CPU seconds of single-threaded rows"
-    )
-    accuracy = "; ".join(sorted({in_words(row["machine"]) for row in rows}))
+    when, _, cores = provenance([*rows, *times])
+    where = provenance(times)[1] if times else "not timed separately; CPU seconds of single-threaded rows"
     return (
-        f"- Measured: {when}.\n- Machine for times: {where}.\n- Machine for accuracy: {accuracy}.\n"
-        f"- Source versions of the core: {', '.join(cores)}."
+        f"- Measured: {when}.\n- Machine for times: {where}.\n- Machine for accuracy: {provenance(rows)[1]}.\n"
+        f"- Source versions of the core: {cores}."
     )
 
 
-def _picture(images: Mapping[str, str], name: str, words: str) -> str:
-    return f"{words}\n\n{images[name]}" if name in images else ""
-
-
-def _equal_cell(one: EqualSeconds | None) -> str:
-    if one is None or one.psnr is None or one.lead is None:
+def _equal_cell(one: EqualSeconds) -> str:
+    if one.psnr is None or one.lead is None:
         return "–"
     return f"{one.lead:+.2f} ({one.psnr:.2f} : {one.baseline_psnr:.2f}) at {one.seconds:.2f} s"

@@ -1,9 +1,8 @@
-"""Plots of the frontier as PNG files: accuracy against time, within an update and over frames, and time per stage.
+"""Plots of the frontier as PNG files: accuracy against time, and time per stage.
 
 Each plot is as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that
 width. The palette of Okabe and Ito is distinguishable with any colour vision, and shapes and labels carry the same
-information. In all plots, a colour denotes the same method, axis or stage, and a dash pattern denotes the same number
-of iterations.
+information. In all plots, a colour denotes the same method, axis or stage.
 """
 
 from __future__ import annotations
@@ -15,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from client.cli.scores import Row
 from scas4d_core.engines.engine import REPORT
 from studies.frontier.frontier import DEFAULT, METHODS
-from studies.frontier.tradeoff import Point, curve, of_axis, spread, undominated
+from studies.frontier.tradeoff import Point, curve, of_axis, undominated
 
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#000000")
 COLOURS = dict(zip(METHODS, OKABE_ITO, strict=False))
@@ -28,7 +26,6 @@ OTHER_AXES = {
     "clusters": ("first-layer clusters N", "D", OKABE_ITO[3]),
     "views": ("views per iteration", "X", "#882255"),
     "covariance": ("covariance", "P", "#661100"),
-    "gaussians": ("Gaussian budget", "v", OKABE_ITO[4]),
     "adaptive": ("other presets", "*", OKABE_ITO[7]),
 }
 """Name, marker and colour of each axis."""
@@ -77,11 +74,8 @@ STYLE = {
 }
 SECONDS = "seconds per frame"
 PSNR = "PSNR on the test cameras (dB)"
-DASHES = {25: ":", 100: "-", 300: "--"}
-"""Line style of each number of iterations."""
 SMALL_STAGES = 0.02
 """Fraction of the longest bar. Stages that are shorter than this in every bar are combined, except the report."""
-DEVIATION = "± 1 standard deviation over seeds"
 SIDES = (
     *((5, 0, "left", "center"), (-5, 0, "right", "center"), (0, 4, "center", "bottom"), (0, -4, "center", "top")),
     *((5, 5, "left", "bottom"), (5, -5, "left", "top"), (-5, 5, "right", "bottom"), (-5, -5, "right", "top")),
@@ -94,14 +88,13 @@ LABEL_GAP = 8.5
 """Vertical distance between the centres of stacked labels, in points."""
 
 
-def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: Mapping[str, float]) -> None:
+def draw_frontier(points: Sequence[Point], title: str, file: Path) -> None:
     """Plots accuracy against time: both methods by iterations, and variations of the default settings.
 
     Args:
         points: points of one capture, or means over several.
         title: description of what was measured.
         file: PNG file to write.
-        deviations: standard deviation of ``points`` over seeds in dB, keyed by method, where known.
     """
     plt = _pyplot()
     default = next((point for point in points if point.variant == DEFAULT), None)
@@ -121,7 +114,7 @@ def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: M
     axes = grid[0, 0]
     best = undominated([point for axis in ("iterations", *OTHER_AXES) for point in of_axis(points, axis)])
     shown = [_steps(axes, best)]
-    shown += [_curve(axes, points, method, best, deviations.get(method)) for method in METHODS]
+    shown += [_curve(axes, points, method, best) for method in METHODS]
     for method in METHODS:
         for point in curve(points, method):
             where, side = ((-3, 4), "right") if method == METHODS[0] else ((4, -8), "left")
@@ -139,20 +132,18 @@ def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: M
     axes.legend(handles=shown, loc="lower right", handletextpad=0.5, borderaxespad=0.2)
     _name(axes, [(p.seconds, p.psnr, p.variant.label, c) for p, _, c in far], [one.get_data() for one in axes.lines])
     if others:
-        _draw_about_default(plt, grid[0, 1], points, others, best, deviations.get(METHODS[0]))
-    words = f"{title}; hollow: dominated" + (f"; bars: {DEVIATION}" if deviations else "")
-    figure.suptitle(words, fontsize=7.5, color="#555555")
+        _draw_about_default(plt, grid[0, 1], points, others, best)
+    figure.suptitle(f"{title}; hollow: dominated", fontsize=7.5, color="#555555")
     _save(plt, figure, file)
 
 
 def _draw_about_default(
-    plt: Any, axes: Any, points: Sequence[Point], others: Mapping[str, list[Point]], best: Sequence[Point],
-    deviation: float | None,
-) -> None:  # fmt: skip
+    plt: Any, axes: Any, points: Sequence[Point], others: Mapping[str, list[Point]], best: Sequence[Point]
+) -> None:
     """Plots the variations of one setting at a time with labels, and the curve through the default."""
     method = METHODS[0]
     _steps(axes, best)
-    _curve(axes, points, method, best, deviation)
+    _curve(axes, points, method, best)
     default = next((point for point in points if point.variant == DEFAULT), None)
     named = [(point, OTHER_AXES[axis][2]) for axis, rows in others.items() for point in rows]
     for axis, rows in others.items():
@@ -173,27 +164,22 @@ def _draw_about_default(
     ]
     axes.legend(handles=keys, loc="lower right", handletextpad=0.3, borderaxespad=0.2, labelspacing=0.3)
     avoided = [line.get_data() for line in axes.lines]
-    if default is not None and deviation is not None:
-        avoided.append(([default.seconds] * 2, [default.psnr - deviation, default.psnr + deviation]))
     words = {DEFAULT: f"{DEFAULT.iterations}"}
     _name(axes, [(p.seconds, p.psnr, words.get(p.variant, p.variant.label), colour) for p, colour in named], avoided)
 
 
 def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) -> None:
-    """Plots both methods by iterations, with one panel per capture and error bars over seeds."""
+    """Plots both methods by iterations, with one panel per capture."""
     plt = _pyplot()
     columns = min(3, len(captures))
     rows = -(-len(captures) // columns)
     figure, grid = plt.subplots(
         rows, columns, figsize=(max(COLUMN, PAGE * columns / 3), 1.75 * rows + 0.2), squeeze=False, sharex=True
     )
-    known = False
     for capture, axes in zip(captures, grid.flat, strict=False):
         here = [point for point in points if point.capture == capture]
         for method in METHODS:
-            deviation = spread(here, method, capture)
-            known |= deviation is not None
-            _curve(axes, here, method, here, None if deviation is None else deviation[0], size=12)
+            _curve(axes, here, method, here, size=12)
         axes.set_title(capture, loc="left")
         _whole_decibels(axes)
         _log_seconds(axes, label=False)
@@ -201,8 +187,6 @@ def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) 
     for axes in spare:
         axes.axis("off")
     handles = [_key(plt, MARKERS[m], COLOURS[m], f"{m}, by iterations", line=True) for m in METHODS]
-    if known:
-        handles.append(plt.Line2D([], [], linestyle="none", marker="|", color="#555555", markersize=8, label=DEVIATION))
     if spare:
         spare[0].legend(handles=handles, loc="center", borderaxespad=0)
     else:
@@ -212,50 +196,6 @@ def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) 
         grid[last, column].set_xlabel(SECONDS)
         grid[last, column].tick_params(labelbottom=True)
     figure.supylabel(PSNR, fontsize=8)
-    _save(plt, figure, file)
-
-
-def draw_convergence(row: Row, file: Path) -> None:
-    """Plots the PSNR of the test cameras within an update, from the result of ``measure_convergence``."""
-    plt = _pyplot()
-    figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
-    longest = max(drawn["iterations"][-1] for drawn in row["curves"])
-    lines, short = [], []
-    for drawn in row["curves"]:
-        colour, end = _colour(drawn["preset"]), drawn["iterations"][-1]
-        lines += axes.plot(
-            drawn["iterations"], drawn["psnr"], DASHES.get(end, "-."), color=colour, linewidth=1.3, clip_on=False
-        )
-        axes.plot(end, drawn["psnr"][-1], "o", color=colour, markersize=3.5, clip_on=False)
-        if end < longest:
-            short.append((end, drawn["psnr"][-1], drawn["label"], colour))
-    axes.set_xlabel("iterations done")
-    axes.set_ylabel(PSNR)
-    axes.set_title(f"{row['capture']}, mean of the first {row['updates']} updates", loc="left")
-    _whole_decibels(axes)
-    _up_to(axes, longest)
-    whole = [one for one in row["curves"] if one["iterations"][-1] == longest]
-    _beside(axes, [(longest, one["psnr"][-1], one["label"], _colour(one["preset"])) for one in whole])
-    _name(axes, short, [line.get_data() for line in lines])
-    _save(plt, figure, file)
-
-
-def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
-    """Plots the PSNR per frame for a whole capture."""
-    plt = _pyplot()
-    figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
-    ends = []
-    for point in of_axis(points, "drift", capture):
-        colour, last = _colour(point.variant.preset), len(point.psnr_by_frame) - 1
-        dashes = DASHES.get(point.variant.iterations, "-.")
-        axes.plot(range(last + 1), point.psnr_by_frame, dashes, color=colour, linewidth=1.3)
-        ends.append((last, point.psnr_by_frame[-1], point.variant.label, colour))
-    axes.set_xlabel("frame")
-    axes.set_ylabel(PSNR)
-    axes.set_title(capture, loc="left")
-    _whole_decibels(axes)
-    _up_to(axes, max(end for end, *_ in ends))
-    _beside(axes, ends)
     _save(plt, figure, file)
 
 
@@ -310,10 +250,6 @@ def _save(plt: Any, figure: Any, file: Path) -> None:
     plt.close(figure)
 
 
-def _colour(preset: str) -> str:
-    return COLOURS.get(preset, OKABE_ITO[7])
-
-
 def _steps(axes: Any, best: Sequence[Point]) -> Any:
     """Draws the frontier in the background and returns its line."""
     (line,) = axes.step(
@@ -323,16 +259,11 @@ def _steps(axes: Any, best: Sequence[Point]) -> Any:
     return line
 
 
-def _curve(
-    axes: Any, points: Sequence[Point], method: str, best: Sequence[Point], deviation: float | None, size: float = 24
-) -> Any:
-    """Draws a method's curve over iterations, with an error bar at the default, and returns its legend entry."""
+def _curve(axes: Any, points: Sequence[Point], method: str, best: Sequence[Point], size: float = 24) -> Any:
+    """Draws a method's curve over iterations and returns its legend entry."""
     line, colour = curve(points, method), COLOURS[method]
     axes.plot([p.seconds for p in line], [p.psnr for p in line], color=colour, linewidth=1.2, zorder=2)
     _markers(axes, line, best, MARKERS[method], colour, size)
-    for point in line:
-        if deviation is not None and point.variant.iterations == DEFAULT.iterations:
-            axes.errorbar(point.seconds, point.psnr, deviation, color=colour, linewidth=1.0, capsize=2.2, zorder=4)
     from matplotlib.lines import Line2D
 
     return Line2D([], [], color=colour, marker=MARKERS[method], markersize=4, linewidth=1.2, label=method)
@@ -369,30 +300,6 @@ def _whole_decibels(axes: Any) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10], integer=True))
-
-
-def _up_to(axes: Any, last: float) -> None:
-    """Ends the x axis at the last value, because labels follow to its right."""
-    from matplotlib.ticker import MaxNLocator
-
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
-    axes.set_xlim(0, last)
-
-
-def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
-    """Labels curves at their ends (x, y, name, colour), without overlaps."""
-    axes.figure.draw_without_rendering()
-    scale = 72 / axes.figure.dpi
-    heights = {end: scale * axes.transData.transform(end[:2])[1] for end in ends}
-    free = -float("inf")
-    for end in sorted(ends, key=lambda one: heights[one]):
-        x, y, words, colour = end
-        at = max(heights[end], free + LABEL_GAP)
-        free = at
-        axes.annotate(
-            words, (x, y), xytext=(5, at - heights[end]), textcoords="offset points", va="center", fontsize=7,
-            color=colour, annotation_clip=False,
-        )  # fmt: skip
 
 
 def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Sequence[Any] = ()) -> None:

@@ -3,12 +3,11 @@
 Each setting has its own reconstruction. All of them run in one process and start from the frame 0 that the rows of the
 study share. In each round, every setting processes the next frame, in an order that rotates from round to round. The
 first round is not counted, because it loads kernels and has no motion to start from. Settings with many iterations are
-timed only once. The result is the median time, and the median over the rounds of the ratio to the first setting.
+timed only once. The result is the median time.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -35,30 +34,37 @@ MANY_ITERATIONS = 500
 
 @dataclass
 class TimedVariant:
-    """A setting that is being timed: its reconstruction, and the seconds of each counted update."""
+    """A setting that is being timed: its reconstruction, and the seconds and stages of each counted update."""
 
     variant: Variant
     reconstruction: Any
     seconds: list[float] = field(default_factory=list)
-    cpu_seconds: list[float] = field(default_factory=list)
     stages: list[dict[str, float]] = field(default_factory=list)
 
     def step(self, capture: Capture, index: int, *, counts: bool) -> float:
         """Reads a frame, updates the reconstruction and returns the seconds. Records them if ``counts`` is True."""
-        started, cpu = time.perf_counter(), time.process_time()
+        started = time.perf_counter()
         with all_varied(self.variant.constants):
             done = self.reconstruction.step(capture.frame(index))
         seconds = time.perf_counter() - started
         if counts:
             self.seconds.append(seconds)
-            self.cpu_seconds.append(time.process_time() - cpu)
             self.stages.append({name: float(value) for name, value in done.seconds.items()})
         return seconds
 
+    @property
+    def medians(self) -> Row:
+        """The settings, and the median seconds of an update and of its stages."""
+        names = dict.fromkeys(name for stages in self.stages for name in stages)
+        return {
+            "label": self.variant.label,
+            "settings": self.variant.record,
+            "seconds": float(np.median(self.seconds)),
+            "stages": {name: float(np.median([stages.get(name, 0.0) for stages in self.stages])) for name in names},
+        }
 
-def measure_times(
-    folder: Path, variants: Sequence[Variant], out: Path, *, rounds: int = ROUNDS, report: Report = print
-) -> Row:
+
+def measure_times(folder: Path, variants: Sequence[Variant], out: Path, *, report: Report = print) -> Row:
     """Times settings on a capture and writes the result to ``out/timing/<capture>.json``.
 
     Results that only an earlier run measured are kept. Their times are scaled by the change in the first setting's
@@ -68,49 +74,40 @@ def measure_times(
         folder: capture folder.
         variants: settings to time; the first is the baseline. A missing frame 0 is fitted.
         out: study folder.
-        rounds: number of counted rounds.
         report: callback that prints progress messages.
 
     Raises:
-        ValueError: no settings were given, there is less than one round, or the capture has fewer than 3 frames.
+        ValueError: the capture has fewer than 3 frames.
     """
-    if not variants:
-        raise ValueError("variants is empty; pass at least one setting to time")
-    if rounds < 1:
-        raise ValueError(f"rounds must be at least 1; got {rounds}")
     compile_in_processes()
     # These imports load the kernels.
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import started
 
     capture = open_source(folder)
-    turns = min(rounds + 1, capture.frame_count - 1)
+    turns = min(ROUNDS + 1, capture.frame_count - 1)
     if turns < 2:
         raise ValueError(f"{folder} has {capture.frame_count} frame(s); timing requires at least 3")
     timed = []
-    for variant in _distinct(variants):
+    for variant in variants:
         with all_varied(variant.constants):
             timed.append(TimedVariant(variant, started(capture, variant.settings, out)))
-    ratios: list[list[float]] = [[] for _ in timed]
     for turn in range(turns):
-        taken: dict[int, float] = {}
+        seconds = 0.0
         for place in range(len(timed)):
-            number = (turn + place) % len(timed)
-            if turn < 2 or number == 0 or timed[number].variant.iterations <= MANY_ITERATIONS:
-                taken[number] = timed[number].step(capture, turn + 1, counts=turn > 0)
-        if turn:
-            for number, seconds in taken.items():
-                ratios[number].append(seconds / taken[0])
-        report(f"    {capture.name}: round {turn} of {turns - 1}, {sum(taken.values()):.1f} s")
+            one = timed[(turn + place) % len(timed)]
+            if turn < 2 or one.variant.iterations <= MANY_ITERATIONS:
+                seconds += one.step(capture, turn + 1, counts=turn > 0)
+        report(f"    {capture.name}: round {turn} of {turns - 1}, {seconds:.1f} s")
+    now = [one.medians for one in timed]
     row: Row = {
         "capture": capture.name,
         "measured": datetime.now(UTC).isoformat(timespec="seconds"),
         "core": core_version(),
         "machine": {**machine(), "threads": threads()},
         "rounds": turns - 1,
-        "settings": [_answer(one, ratios[number]) for number, one in enumerate(timed)],
+        "settings": now + _timed_before(read_times(out, capture.name), now),
     }
-    row["settings"] += _timed_before(read_times(out, capture.name), row["settings"])
     write_row(out / "timing" / f"{capture.name}.json", row)
     return row
 
@@ -125,58 +122,22 @@ def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
 
     The result is empty if the two runs have different baselines.
     """
-    if before is None:
+    if before is None or before["settings"][0]["settings"] != now[0]["settings"]:
         return []
-    first, *others = before["settings"]
-    if _unseeded(first["settings"]) != _unseeded(now[0]["settings"]):
-        return []
-    scale = now[0]["seconds"] / first["seconds"]
-    have = [_unseeded(answer["settings"]) for answer in now]
-    kept = [answer for answer in others if _unseeded(answer["settings"]) not in have]
+    scale = now[0]["seconds"] / before["settings"][0]["seconds"]
+    have = [answer["settings"] for answer in now]
     return [
-        {
-            **answer,
+        answer
+        | {
             "seconds": scale * answer["seconds"],
-            "seconds_each": [round(scale * value, 4) for value in answer["seconds_each"]],
-            "cpu_seconds": scale * answer["cpu_seconds"],
             "stages": {name: scale * value for name, value in answer["stages"].items()},
         }
-        for answer in kept
+        for answer in before["settings"]
+        if answer["settings"] not in have
     ]
 
 
 def time_of(times: Row | None, variant: Variant) -> Row | None:
-    """Returns the entry of a setting, regardless of its seeds, or None if it was not timed."""
-    today = variant.record
-    for entry in times["settings"] if times else ():
-        if _unseeded(entry["settings"]) == _unseeded(today):
-            timing: Row = entry
-            return timing
-    return None
-
-
-def _distinct(variants: Sequence[Variant]) -> list[Variant]:
-    """Returns one of all settings that differ only in seed and frame count, which do not affect the time."""
-    by_settings = {json.dumps(_unseeded(v.record), sort_keys=True): v for v in variants[::-1]}
-    chosen = set(by_settings.values())
-    return [variant for variant in variants if variant in chosen]
-
-
-def _unseeded(settings: Row) -> Row:
-    return settings | {"update": {**settings["update"], "seed": 0}}
-
-
-def _answer(one: TimedVariant, ratios: Sequence[float]) -> Row:
-    names = dict.fromkeys(name for stages in one.stages for name in stages)
-    return {
-        "label": one.variant.label,
-        "preset": one.variant.preset,
-        "iterations": one.variant.iterations,
-        "settings": one.variant.record,
-        "gaussians": len(one.reconstruction.history.gaussians(0)),
-        "seconds": float(np.median(one.seconds)),
-        "seconds_each": [round(value, 4) for value in one.seconds],
-        "cpu_seconds": float(np.median(one.cpu_seconds)),
-        "ratio": float(np.median(ratios)),
-        "stages": {name: float(np.median([stages.get(name, 0.0) for stages in one.stages])) for name in names},
-    }
+    """Returns the entry of a setting, or None if it was not timed."""
+    wanted = variant.record
+    return next((entry for entry in times["settings"] if entry["settings"] == wanted), None) if times else None

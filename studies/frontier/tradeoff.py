@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,6 @@ SCORES = (
     "mte_2d",
     "mte_2d_oracle",
     "parts_ari",
-    "flicker",
 )
 """Names of the scores in a row."""
 BUDGETS = (25, 50, 100, 200, 300)
@@ -43,26 +41,16 @@ class Point:
     Attributes:
         variant: the setting.
         capture: capture name, or the names of the averaged captures.
-        updates: number of updates that the scores cover.
         seconds: seconds per update; see the module docstring.
-        cpu_seconds: CPU seconds per update over all threads; None if not measured.
-        timed: whether the seconds were measured by alternating between settings.
         stages: median seconds of each stage.
-        gaussians: number of Gaussians in the scene.
         scores: value of each of ``SCORES``; None if the capture has no ground truth for it.
-        psnr_by_frame: PSNR of each frame in dB, starting at frame 0; empty for a mean.
     """
 
     variant: Variant
     capture: str
-    updates: int
     seconds: float
-    cpu_seconds: float | None
-    timed: bool
     stages: Mapping[str, float]
-    gaussians: float
     scores: Mapping[str, float | None]
-    psnr_by_frame: tuple[float, ...] = ()
 
     @property
     def psnr(self) -> float:
@@ -171,15 +159,6 @@ def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[Equa
     return pairs
 
 
-def spread(points: Iterable[Point], method: str, capture: str, score: str = "psnr") -> tuple[float, int] | None:
-    """Returns a score's standard deviation over a method's seeds at the default's iterations, and the seed count."""
-    of_seeds = [p for p in of_axis(points, "seeds", capture) if p.variant.preset == method]
-    first = [p for p in curve(points, method, capture) if p.variant.iterations == DEFAULT.iterations]
-    values = [p.scores[score] for p in first + of_seeds]
-    known = [value for value in values if value is not None]
-    return (float(np.std(known, ddof=1)), len(known)) if len(known) > 1 else None
-
-
 def _own_seconds(row: Row) -> float:
     """Returns the seconds of an update as stored in the row."""
     alone = row["machine"].get("threads") == 1 and "cpu_seconds_update" in row
@@ -188,40 +167,21 @@ def _own_seconds(row: Row) -> float:
 
 def _point(variant: Variant, row: Row, timed: Row | None, scale: float) -> Point:
     seconds = scale * _own_seconds(row)
-    known: Any = timed or {
-        "seconds": seconds,
-        "cpu_seconds": row.get("cpu_seconds_update"),
-        "stages": {name: seconds * part / row["seconds_update"] for name, part in row["seconds_stages"].items()},
-    }
-    return Point(
-        variant=variant,
-        capture=row["capture"],
-        updates=row["updates"],
-        seconds=known["seconds"],
-        cpu_seconds=known["cpu_seconds"],
-        timed=timed is not None,
-        stages=known["stages"],
-        gaussians=row["gaussians"],
-        scores={name: row.get(name) for name in SCORES},
-        psnr_by_frame=tuple(row["psnr_by_frame"]),
-    )
+    stages = {name: seconds * part / row["seconds_update"] for name, part in row["seconds_stages"].items()}
+    known = timed or {"seconds": seconds, "stages": stages}
+    scores = {name: row.get(name) for name in SCORES}
+    return Point(variant, row["capture"], known["seconds"], known["stages"], scores)
 
 
 def _mean(variant: Variant, points: Sequence[Point]) -> Point:
     """Returns the mean of points of one setting. Each score is averaged over the captures that have it."""
-    cpu = [point.cpu_seconds for point in points]
     names = dict.fromkeys(name for point in points for name in point.stages)
-    scores = {name: [p.scores[name] for p in points] for name in SCORES}
     return Point(
-        variant=variant,
-        capture="mean of " + ", ".join(point.capture for point in points),
-        updates=min(point.updates for point in points),
+        variant,
+        "mean of " + ", ".join(point.capture for point in points),
         seconds=float(np.mean([point.seconds for point in points])),
-        cpu_seconds=None if None in cpu else float(np.mean([value for value in cpu if value is not None])),
-        timed=all(point.timed for point in points),
         stages={name: float(np.mean([point.stages.get(name, 0.0) for point in points])) for name in names},
-        gaussians=float(np.mean([point.gaussians for point in points])),
-        scores={name: _known_mean(values) for name, values in scores.items()},
+        scores={name: _known_mean([p.scores[name] for p in points]) for name in SCORES},
     )
 
 

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.engines.choose import WARP_DEVICE, warp_device
 from scas4d_core.metrics.evaluation import measure_pictures
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
-from studies.synthetic.wall import Size, known, rig, shown, wall
+from studies.wall import Size, known, rig, shown, wall
 
 TESTS = (
     "tests/core/engines/warp", "tests/core/engines/test_contract.py", "tests/core/engines/test_renderers.py",
@@ -35,8 +36,6 @@ SIZES = (
 VIEWS = (1, 2, 4)
 """Numbers of views per iteration."""
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}
-
-Row = dict[str, Any]
 
 
 def graphics_card() -> Row:
@@ -203,12 +202,8 @@ def page(found: Row) -> str:
     if found.get("sizes"):
         lines += _sizes(found["sizes"])
     if found.get("views"):
-        lines += ["| Gaussians | view | ms |", "|---|---|---|"]
-        lines += [
-            f"| {row['gaussians']:,} | {row['width']}×{row['height']} | {row['view_ms']:.1f} |"
-            for row in found["views"]
-        ]
-        lines.append("")
+        views = [row | {"images": f"{row['width']}×{row['height']}"} for row in found["views"]]
+        lines += [markdown(views, (*SIZE_COLUMNS, Column("view, ms", "view_ms", ".1f"))), ""]
     if "spread" in found:
         row = found["spread"]
         same = "bit-identical" if row["same_bits"] else "not bit-identical"
@@ -220,28 +215,32 @@ def page(found: Row) -> str:
 
 
 def _captures(rows: Sequence[Row]) -> list[str]:
-    lines = ["| capture | device | Gaussians | frame 0, s | PSNR | update, s | PSNR |", "|---|---|---|---|---|---|---|"]
-    for row in rows:
-        lines.append(
-            f"| {row['capture']} | {row['device']} | {row['gaussians']:,} | {row['frame_0']:.2f} | "
-            f"{row['psnr_0']:.2f} | {row['update']:.3f} | {row['psnr']:.2f} |"
-        )
+    columns = (
+        Column("capture", "capture"),
+        Column("device", "device"),
+        Column("Gaussians", "gaussians", ",d"),
+        Column("frame 0, s", "frame_0"),
+        Column("PSNR", "psnr_0"),
+        Column("update, s", "update", ".3f"),
+        Column("PSNR", "psnr"),
+    )
     stages = [f"{row['capture']} on the {row['device']}: " + ", ".join(
         f"{stage} {1e3 * seconds:.1f}" for stage, seconds in row["stages"].items()
     ) for row in rows]  # fmt: skip
-    return [*lines, "", "Median milliseconds by stage. " + ". ".join(stages) + ".", ""]
+    return [markdown(rows, columns), "", "Median milliseconds by stage. " + ". ".join(stages) + ".", ""]
 
 
 def _sizes(rows: Sequence[Row]) -> list[str]:
-    lines = ["| Gaussians | images | views | update of 100 iterations, s |", "|---|---|---|---|"]
     for row in rows:
-        lines.append(
-            f"| {row['gaussians']:,} | {row['width']}×{row['height']} | {row['views']} | {row['update']:.3f} |"
-        )
-    names = list(dict.fromkeys(name for row in rows for name in row["kernels"]))
-    titles = [f"{row['gaussians']:,}, {row['views']} views" for row in rows]
-    lines += ["", f"| microseconds per launch | {' | '.join(titles)} |", "|---" * (1 + len(rows)) + "|"]
-    for name in names:
-        cells = [f"{row['kernels'][name]['microseconds']:.0f}" if name in row["kernels"] else "–" for row in rows]
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return [*lines, ""]
+        row |= {"images": f"{row['width']}×{row['height']}"}
+    update = Column("update of 100 iterations, s", "update", ".3f")
+    sizes = markdown(rows, (*SIZE_COLUMNS, Column("views", "views", "d"), update))
+    titles = [Column(f"{row['gaussians']:,}, {row['views']} views", str(k), ".0f") for k, row in enumerate(rows)]
+    kernels: dict[str, Row] = {}
+    for number, row in enumerate(rows):
+        for name, times in row["kernels"].items():
+            kernels.setdefault(name, {"name": f"`{name}`"})[str(number)] = times["microseconds"]
+    return [sizes, "", markdown(kernels.values(), (Column("microseconds per launch", "name"), *titles)), ""]
+
+
+SIZE_COLUMNS = (Column("Gaussians", "gaussians", ",d"), Column("images", "images"))

@@ -33,7 +33,7 @@ def gpu_check(
     """
     from studies.devices.devices import use_cpu_without_gpu
     from studies.gpu import check
-    from studies.synthetic.wall import Size
+    from studies.wall import Size
 
     stands_for, began = use_cpu_without_gpu(), perf_counter()
     sample, frames = ROOT / "samples" / "robot", 3 if quick else None
@@ -41,7 +41,7 @@ def gpu_check(
     if quick:
         changes = {"scene": {"image_scale": 0.25}, "static": {"iterations": 50}, "update": {"iterations": 10}}
     sizes = (Size(gaussians=900, width=64, height=64, cameras=6, moving=1.0),) if quick else check.SIZES
-    found: check.Row = {
+    found: dict[str, Any] = {
         "card": {"device": stands_for, **check.graphics_card()},
         "captures": [],
         "sizes": [],

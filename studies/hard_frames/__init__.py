@@ -1,1 +1,1 @@
-"""Studies of faulty images and cameras, and of long runs."""
+"""Studies of faulty and unsynchronized cameras."""

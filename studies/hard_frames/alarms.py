@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.settings import Settings
 from studies.captures import open_measured
-from studies.hard_frames.camera_faults import FRAMES, blurred, dirty, noisy, scaled
-from studies.hard_frames.frames import Picture
-from studies.machine import core_version, machine
+from studies.hard_frames.camera_faults import FRAMES, Picture, blurred, dirty, noisy, scaled
+from studies.machine import core_version
 from studies.quality.first_frame import continued, started
 from studies.quality.settings import settings_of
+from studies.rows import RowStudy
 from studies.variants.variants import VARIANTS
 
 AFTER = 5
@@ -125,7 +125,6 @@ def run(
     out: Path,
     *,
     variants: Sequence[str] = (),
-    seeds: Sequence[int] = (0,),
     frames: int | None = None,
     faults: Sequence[str] = ("",),
     changes: Sequence[str] = (),
@@ -135,20 +134,10 @@ def run(
 ) -> list[Row]:
     """Measures every variant of every capture, and writes the tables to ``out/alarms.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished variant; a second call resumes the study.
-        variants: names from ``VARIANTS``; all if empty.
-        seeds: seeds of the updates.
-        frames: maximum number of frames without faults per variant; at least those before the faults are updated.
-        faults: parts of the names of faults to plant; none if empty.
-        changes: changes to the settings, such as ``"scene.image_scale=0.5"``.
-        again: whether to repeat finished variants.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench alarms --help``. A second call for the same folder resumes the study.
 
     Returns:
-        One row per capture, variant and seed.
+        One row per capture and variant.
 
     Raises:
         ValueError: a variant or fault is unknown.
@@ -161,23 +150,18 @@ def run(
             raise ValueError(
                 f"no fault contains {part!r}; choose from {', '.join({fault.kind: 0 for fault in FAULTS})}"
             )
-    rows = []
+    study = RowStudy(out, "alarms", (), again=again, report=report)
     for folder in captures:
         for variant in variants or VARIANTS:
-            for seed in seeds:
-                settings = settings_of("scas4d", None, seed, (*VARIANTS[variant].changes, *changes))
-                key = digest(
-                    settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()
-                )
-                path = out / "alarms" / f"{folder.resolve().name}-{variant.replace(' ', '-')}-{key}.json"
-                measured = partial(_row, folder, variant, settings, out, frames, faults, options)
-                row = kept_row(path, measured, again=again)
-                report(_line(row))
-                rows.append(row)
-    text = page(rows)
-    (out / "alarms.md").write_text(text + "\n")
-    report(text)
-    return rows
+            settings = settings_of("scas4d", None, 0, (*VARIANTS[variant].changes, *changes))
+            study.add(
+                f"{folder.resolve().name}-{variant.replace(' ', '-')}",
+                (settings_record(settings, ()), variant, frames, tuple(faults), options.changed, core_version()),
+                partial(_row, folder, variant, settings, out, frames, faults, options),
+                _line,
+            )
+    study.write(page(study.rows))
+    return study.rows
 
 
 def _row(
@@ -206,8 +190,8 @@ def _row(
             scene = continued(Path(place) / "before", Path(place) / "fault", capture.full_rig, settings)
             reports = [scene.step(_with(capture, first + n, name, fault)) for n in range(FRAMES)]
             found.append({"kind": fault.kind, "strength": fault.strength, "camera": name, **_found(reports, name)})
-    identity = {"capture": capture.name, "variant": variant, "seed": settings.update.seed, "cameras": len(names)}
-    return {**identity, "clean": clean, "faults": found, "core": core_version(), "machine": machine()}
+    identity = {"capture": capture.name, "variant": variant, "cameras": len(names)}
+    return {**identity, "clean": clean, "faults": found}
 
 
 def _with(capture: Capture, index: int, name: str, fault: Fault) -> Frame:
@@ -247,7 +231,7 @@ def _found(reports: Sequence[FrameReport], name: str) -> dict[str, Any]:
 def _line(row: Row) -> str:
     clean, missed = row["clean"], [fault for fault in row["faults"] if fault["by"] is None]
     lines = [
-        f"{row['capture']}, {row['variant']}, seed {row['seed']}: {len(clean)} clean updates, "
+        f"{row['capture']}, {row['variant']}: {len(clean)} clean updates, "
         f"{len(_camera_alarms(row))} false alarms, {sum(frame['rejected'] for frame in clean)} rejected; "
         f"{len(row['faults']) - len(missed)} of {len(row['faults'])} faults found"
     ]

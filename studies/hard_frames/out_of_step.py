@@ -2,8 +2,7 @@
 
 A capture is played back and forth, as a stream of all its frames or of every second, third or fourth frame. Two cameras
 may get images from the frames in between, one later and one earlier than the others, so their offsets are known
-exactly. Such a stream is at least twice as fast as the capture. The synthetic footage can be rendered at any moment and
-for any duration.
+exactly. Such a stream is at least twice as fast as the capture.
 """
 
 from __future__ import annotations
@@ -20,21 +19,17 @@ from unittest import mock
 import numpy as np
 
 from client.cli.evaluate import Report, settings_record
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row
 from client.importers.open_source import open_source
 from client.rig.sequence import ping_pong
-from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.robust import timing
 from scas4d_core.settings import Settings
-from studies.hard_frames.footage import ANGLE, NOISE, SyntheticFootage
-from studies.hard_frames.scene import first_state, gone
-from studies.machine import core_version, machine
 from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
-from studies.synthetic.ball import photograph
+from studies.rows import RowStudy
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -49,10 +44,6 @@ COLUMNS = (
     Column("ms an update", "milliseconds", ".1f"),
     Column("of it", "share", ".1%"),
 )
-
-
-_TRUE = first_state(resting_may_move=False)
-"""State of frame 0 of the synthetic footage."""
 
 
 class Case(NamedTuple):
@@ -75,43 +66,35 @@ def run(
     out: Path,
     *,
     updates: int = 24,
-    masks: bool = True,
     changes: Sequence[str] = (),
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
     """Runs every case on each capture, prints the table and writes it to ``out/timing.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished run; a second call resumes the study.
-        updates: updates per capture.
-        masks: whether the masks are used.
-        changes: changes to the settings.
-        again: whether to repeat finished runs.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench timing --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture and case.
     """
-    settings, rows = settings_of("scas4d", None, 0, changes), []
+    settings = settings_of("scas4d", None, 0, changes)
+    study = RowStudy(out, "timing", COLUMNS, again=again, report=report)
     for folder in captures:
         for case in CASES:
-            key = digest(settings_record(settings, ()), updates, case, masks)
-            path = out / "timing" / f"{folder.resolve().name}-{case.step}-{case.shift}-{key}.json"
-            row = kept_row(path, partial(_row, path.stem, folder, out, settings, updates, case, masks), again=again)
-            report(
-                f"{row['capture']}, every {case.step}: {row['true'] or 'in step'}, found {row['found'] or 'none off'}"
+            study.add(
+                f"{folder.resolve().name}-{case.step}-{case.shift}",
+                (settings_record(settings, ()), updates, case),
+                partial(_row, folder, out, settings, updates, case),
+                lambda row: (
+                    f"{row['capture']}, every {row['step']}: {row['true'] or 'in step'}, "
+                    f"found {row['found'] or 'none off'}"
+                ),
             )
-            rows.append(row)
-    table = markdown(rows, COLUMNS)
-    (out / "timing.md").write_text(table + "\n")
-    report(table)
-    return rows
+    return study.finish()
 
 
-def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, case: Case, masks: bool) -> Row:
-    capture = open_source(folder, use_masks=masks)
+def _row(folder: Path, out: Path, settings: Settings, updates: int, case: Case) -> Row:
+    capture = open_source(folder)
     names = capture.rig.names
     shifts = {names[2]: case.shift, names[len(names) // 2 - 1]: -case.shift} if case.shift else {}
     scene = started(capture, settings, out)
@@ -120,8 +103,8 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
     row = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
     whole = float(np.median([sum(report.seconds.values()) for report in reports]))
     row |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
-    identity = {"capture": capture.name, "step": case.step, "settings": settings_record(settings, ()), "masks": masks}
-    return {"key": key, **identity, **row, "core": core_version(), "machine": machine()}
+    identity = {"capture": capture.name, "step": case.step, "settings": settings_record(settings, ())}
+    return {**identity, **row}
 
 
 def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -> Frame:
@@ -156,17 +139,6 @@ def clocked() -> Iterator[list[float]]:
 
     with mock.patch.object(timing, "record_timing", record_timing):
         yield spent
-
-
-def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[str, float]) -> Frame:
-    """Returns a synthetic frame in which some cameras are a number of frames ahead (+) or behind (−)."""
-    frame, rng = footage.frame(index), np.random.default_rng([index, 1])
-    images, masks = dict(frame.images), dict(frame.masks)
-    for name, offset in offsets.items():
-        shown = photograph(gone(_TRUE, ANGLE * (index + offset)), Rig((footage.rig[name],)))
-        noisy = shown.images[name] + rng.normal(0, NOISE, shown.images[name].shape)
-        images[name], masks[name] = noisy.round().clip(0, 255).astype(np.uint8), shown.masks[name]
-    return replace(frame, images=images, masks=masks)
 
 
 def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:

@@ -42,6 +42,8 @@ from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 from studies.quality.targets import KERNELS, TARGETS
 
+FRAMES, REPEATS = 8, 9
+"""Number of frames of the timed run, whose first update is not counted, and of runs of the rasterizer."""
 PASSES = ("render", "render backward")
 """Stages of an update that belong to the rasterizer."""
 CLOUD_GAUSSIANS, CLOUD_SIZE = 20_000, 256
@@ -53,42 +55,35 @@ With this width, there are about 145 pixels per Gaussian and 2.9 million pairs p
 """
 
 
-def study(
-    folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
-) -> Row:
+def study(folder: Path, settings: Settings, store: Path, *, report: Report = print) -> Row:
     """Makes all measurements on a capture, prints them, writes them to ``store/kernels.json``, and returns them.
 
     Args:
         folder: capture folder.
         settings: settings of frame 0 and the updates.
         store: study folder.
-        frames: number of frames, at least 3. The first update compiles or loads kernels and is not counted.
-        repeats: repetitions of the rasterizer and the micro-kernel.
         report: callback that prints progress messages.
 
     Raises:
-        ValueError: fewer than 3 frames were requested.
         BrokenProcessPool: the process that runs the updates ended early.
     """
-    if frames < 3:
-        raise ValueError(f"frames must be at least 3, because the first update is not counted; got {frames}")
     capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
-    report(f"running {min(frames, capture.frame_count)} frames, starting with frame 0, in a separate process")
+    report(f"running {min(FRAMES, capture.frame_count)} frames, starting with frame 0, in a separate process")
     compile_in_processes()
-    timed = in_a_process(run_and_time, folder, settings, frames, first_file)
+    timed = in_a_process(run_and_time, folder, settings, FRAMES, first_file)
     report("counting parallel regions, and comparing one thread with all threads")
     entered = in_a_process(regions.count_regions, folder, settings, 3, first_file)
-    by_threads = in_a_process(regions.compare_threads, folder, settings, frames, first_file)
+    by_threads = in_a_process(regions.compare_threads, folder, settings, FRAMES, first_file)
     kept = load_first_frame(first_file)
     assert kept is not None  # stored by the run
     world = capture.rig.world_frame(settings.scene.metres_per_unit)
     rig = rig_inside(world, capture.rig.scaled(settings.scene.image_scale).cameras)
-    report(f"running the rasterizer and the micro-kernel {repeats} times, in alternation")
+    report(f"running the rasterizer and the micro-kernel {REPEATS} times, in alternation")
     limits = scene_limits(settings.scene.near, rig.radius)
-    on_frame_0 = measure_rasterizer(kept[0].gaussians, rig.cameras, repeats, limits)
+    on_frame_0 = measure_rasterizer(kept[0].gaussians, rig.cameras, REPEATS, limits)
     cloud, camera = make_cloud()
-    on_cloud = measure_rasterizer(cloud, [camera] * 4, repeats)
+    on_cloud = measure_rasterizer(cloud, [camera] * 4, REPEATS)
     row: Row = {
         "capture": capture.name,
         "measured": datetime.now(UTC).isoformat(timespec="seconds"),

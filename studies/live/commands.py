@@ -1,4 +1,4 @@
-"""The commands `scripts/bench live`, `soak` and `viewer`."""
+"""The commands `scripts/bench live` and `viewer`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Page, Repeated, write_page
+from studies.options import Page, Repeated, show
 
 
 def live(
     capture: Repeated,
-    cameras: Annotated[
-        int, typer.Option(min=1, help="Number of cameras; the first ones of the capture, and copies if it has fewer.")
-    ] = 24,
+    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras; the first ones of the capture.")] = 24,
     frames: Annotated[int, typer.Option(min=10, help="Number of frames for each of the two measurements.")] = 200,
     work: Annotated[Path, typer.Option(help="Folder for the data folder and log; its contents are deleted.")] = Path(
         "out/live"
@@ -27,52 +25,14 @@ def live(
     """
     from client.cli.extras import need_server
     from client.importers.open_source import open_source
-    from studies.live.live import report, rig_with, run
-
-    need_server()
-    source = open_source(capture)
-    rig = rig_with(source, cameras)
-    text = report(rig, run(source, rig, frames, work))
-    typer.echo(text)
-    write_page(out, text)
-
-
-def soak(
-    capture: Repeated,
-    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras; the first ones of the capture.")] = 4,
-    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Scale of the images.")] = 0.25,
-    frames: Annotated[int, typer.Option(min=100, help="Number of frames.")] = 20_000,
-    work: Annotated[Path, typer.Option(help="Folder for data folder, rows and log; its contents are deleted.")] = Path(
-        "out/soak"
-    ),
-    out: Page = None,
-) -> None:
-    """Sends thousands of frames at full rate, and checks that the memory of service and worker does not grow.
-
-    The updates run on an engine whose iterations take no time. Fails if memory grows by more than 2%.
-
-    Example: scripts/bench soak samples/robot
-    """
-    from client.cli.extras import need_server
-    from client.importers.open_source import open_source
     from scas4d_core.cameras import Rig
-    from studies.live.soak import TARGET, growth, report, run
+    from studies.live.live import report, run
 
     need_server()
     source = open_source(capture)
-    rig = Rig(source.full_rig.cameras[:cameras]).scaled(scale)
-    rows = run(
-        source,
-        rig,
-        frames,
-        work,
-        echo=lambda row: typer.echo(f"frame {row.frame}: service {row.service:.1f} MB, worker {row.worker:.1f} MB"),
-    )
-    text = report(rig, rows)
-    typer.echo(text)
-    write_page(out, text)
-    if growth(rows) > TARGET:
-        raise typer.Exit(1)
+    rig = Rig(source.full_rig.cameras[:cameras])
+    text = report(rig, run(source, rig, frames, work))
+    show(text, out)
 
 
 def viewer(
@@ -93,5 +53,4 @@ def viewer(
 
     need_server()
     text = report(run(folder, frames, fps, work), fps)
-    typer.echo(text)
-    write_page(out, text)
+    show(text, out)

@@ -12,7 +12,7 @@ import statistics
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,6 @@ SETTINGS = {"static": {"iterations": 2000}, "update": {"skip_tolerance": -1}}
 """Settings of the scene: a short fit of frame 0, and no skipped updates, because the scene is still."""
 SHORTEST_WAIT_S = 0.005
 """Minimum time between two attempts to send a frame. A sender that asks more often takes time from the service."""
-COPY = "-copy"
 FIRST = 2
 """Number of frames before the measurement: the first frame and the first update, which are slower."""
 
@@ -61,13 +60,6 @@ class LiveResult:
         return float(np.quantile(self.latency_ms, share))
 
 
-def rig_with(capture: Capture, count: int) -> Rig:
-    """Returns the first training cameras of a capture. Further ones are copies of the first, named with ``COPY``."""
-    cameras = capture.full_rig.cameras
-    copies = [replace(camera, name=camera.name + COPY) for camera in cameras[: max(0, count - len(cameras))]]
-    return Rig((*cameras[:count], *copies))
-
-
 def noisy_frames(capture: Capture, rig: Rig, count: int, seed: int = 0) -> list[dict[str, bytes]]:
     """Returns `count` frames as JPEG files, keyed by camera: the first frame of a capture with sensor noise.
 
@@ -76,7 +68,7 @@ def noisy_frames(capture: Capture, rig: Rig, count: int, seed: int = 0) -> list[
     rng = np.random.default_rng(seed)
     images = {}
     for camera in rig.cameras:
-        with Image.open(io.BytesIO(capture.encoded_image(0, camera.name.removesuffix(COPY)))) as picture:
+        with Image.open(io.BytesIO(capture.encoded_image(0, camera.name))) as picture:
             images[camera.name] = np.asarray(picture.convert("RGB").resize((camera.width, camera.height)), np.float32)
     return [
         {name: _jpeg(image + rng.normal(0, NOISE, image.shape)) for name, image in images.items()} for _ in range(count)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from client.cli.scores import Store
+from client.cli.scores import Column, Row, Store, markdown
 from studies.frontier.frontier import UPDATES, Variant
 from studies.frontier.tradeoff import read_points
-from studies.machine import core_version, in_words
+from studies.machine import core_version, provenance
 from studies.paper.figures import SCENES
 from studies.paper.paper import (
     EXPERIMENTS,
@@ -110,24 +110,27 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
     """Returns the numbers of claims that agree, disagree or are not measured, and a Markdown table of all claims."""
     known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
     counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
-    lines = [
-        f"Of {len(outcomes)} comparisons, {counts['sign and size']} agree in sign and size, {counts['sign']} only in "
-        f"sign, {counts['no']} disagree, and {len(outcomes) - len(known)} are not measured.",
-        "",
-        "| experiment | claim | comparison | ours | paper | agreement | agreeing captures |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows: list[Row] = []
     for experiment in EXPERIMENTS:
-        digits = DIGITS[experiment.score]
+        form = f"+.{DIGITS[experiment.score]}f"
         for outcome in by_title[experiment.title]:
-            own = "–" if outcome.own is None else f"{outcome.own:+.{digits}f}"
-            paper = "–" if outcome.paper is None else f"{outcome.paper:+.{digits}f}"
-            comparison = f"{outcome.claim.first} – {outcome.claim.second}"
-            word = outcome.agrees if outcome.agrees != "no" else "**none**"
-            same = "–" if outcome.own is None else f"{outcome.same_sign} of {len(outcome.captures)}"
-            cells = [experiment.title, outcome.claim.what, comparison, own, paper, word, same]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            claim, measured = outcome.claim, outcome.own is not None
+            rows.append(
+                {
+                    "experiment": experiment.title,
+                    "claim": claim.what,
+                    "comparison": f"{claim.first} – {claim.second}",
+                    "ours": None if outcome.own is None else format(outcome.own, form),
+                    "paper": None if outcome.paper is None else format(outcome.paper, form),
+                    "agreement": "**none**" if outcome.agrees == "no" else outcome.agrees,
+                    "agreeing captures": f"{outcome.same_sign} of {len(outcome.captures)}" if measured else None,
+                }
+            )
+    return (
+        f"Of {len(outcomes)} comparisons, {counts['sign and size']} agree in sign and size, {counts['sign']} only in "
+        f"sign, {counts['no']} disagree, and {len(outcomes) - len(known)} are not measured.\n\n"
+        + markdown(rows, [Column(name, name) for name in rows[0]])
+    )
 
 
 def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
@@ -164,9 +167,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def _provenance(out: Path, captures: Sequence[str]) -> str:
     rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
-    days = sorted({str(row["measured"])[:10] for row in rows})
-    when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "never"
-    if any(row.get("core") != core_version() for row in rows):
+    when, machines, cores = provenance(rows)
+    if cores != core_version():
         when += ", with earlier versions of the method ([accuracy-and-time.md](accuracy-and-time.md) has newer figures)"
-    machines = "; ".join(sorted({in_words(row["machine"]) for row in rows})) or "–"
     return f"Measured: {when}. Machine: {machines}."

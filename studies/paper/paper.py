@@ -24,7 +24,6 @@ FACTOR = 2.0
 SMALL: Mapping[str, float] = {
     "psnr": 0.3,
     "ssim": 0.005,
-    "mte_2d": 0.1,
     "mte_2d_oracle": 0.1,
     "parts_ari": 0.05,
 }
@@ -32,8 +31,8 @@ SMALL: Mapping[str, float] = {
 
 
 def variant(label: str) -> Variant:
-    """Returns the frontier setting with the given label, excluding settings that cover whole captures."""
-    return next(v for axis in AXES.values() for v in axis if v.label == label and not v.whole)
+    """Returns the frontier setting with the given label."""
+    return next(v for axis in AXES.values() for v in axis if v.label == label)
 
 
 @dataclass(frozen=True)
@@ -238,7 +237,7 @@ def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | N
     for point in read_points(out, captures, updates):
         for score in SMALL:
             value = point.scores[score]
-            if value is not None and not point.variant.whole:
+            if value is not None:
                 by_variant.setdefault((point.variant, score), {})[point.capture] = value
     if quality is not None and quality.is_dir():
         rows = measured_runs(Store(quality))

@@ -1,4 +1,4 @@
-"""The quality studies as commands of `scripts/bench`: `quality`, `refit`, `effects`, and others."""
+"""The commands `scripts/bench refit`, `effects`, `targets` and `table`."""
 
 from __future__ import annotations
 
@@ -9,61 +9,7 @@ import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import QUALITY, Again, Captures, Changes, write_page
-
-Study = Annotated[
-    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
-]
-
-
-@with_capture_options
-def quality(
-    captures: Captures,
-    options: CaptureOptions,
-    out: Study = QUALITY,
-    preset: Annotated[
-        list[str] | None, typer.Option(help="Preset: scas4d (the default), adaptive or dynamic3dgs. May be repeated.")
-    ] = None,
-    iterations: Annotated[
-        list[int] | None,
-        typer.Option(min=1, help="Iterations per update; default: the preset's. May be repeated."),
-    ] = None,
-    seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates; default: 0. May be repeated.")
-    ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames; 1 measures only frame 0.")] = None,
-    masks: Annotated[bool, typer.Option(help="Provide the masks to the method; the scores always use them.")] = True,
-    points: Annotated[bool, typer.Option(help="Provide the initial point cloud to the method.")] = True,
-    lpips: Annotated[bool, typer.Option("--lpips", help="Also measure LPIPS, if its weights are installed.")] = False,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Measures the images, tracks, parts and update times of captures, and prints a table.
-
-    Reconstructs every capture with every preset, number of iterations and seed, each combination in a separate process.
-    The results are measured on the capture's test cameras and ground truth. Rows on disk are not measured again. Writes
-    table.md, a JSON file per row, a line per frame, and images (truth | render | difference) to the study's folder.
-
-    Example: scripts/bench quality captures/robot --preset scas4d --preset dynamic3dgs --iterations 100
-    """
-    from studies.quality.quality import run
-
-    rows = run(
-        captures,
-        out,
-        preset or ["scas4d"],
-        iterations=iterations or (),
-        seeds=seed or (0,),
-        changes=changes or (),
-        frames=frames,
-        masks=masks,
-        points=points,
-        lpips=lpips,
-        again=again,
-        options=options,
-    )
-    if any("error" in row for row in rows):
-        raise typer.Exit(1)
+from studies.options import QUALITY, Again, Captures, Changes, Study
 
 
 @with_capture_options
@@ -72,16 +18,13 @@ def refit(
     options: CaptureOptions,
     out: Study = QUALITY,
     frame: Annotated[int, typer.Option(help="Frame to fit; negative numbers count from the end.")] = -1,
-    preset: Annotated[str, typer.Option(help="Settings preset.")] = "scas4d",
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
-    points: Annotated[bool, typer.Option(help="Start from the point cloud of the capture's first frame.")] = False,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
     """Fits a later frame from scratch, as an upper bound for the updates, and reports how far they fall short of it.
 
-    The figures for the updates come from `scripts/bench quality` in the same folder, with the same settings. Writes
-    refit.md and a JSON file per row to the study's folder.
+    The figures for the updates come from `scripts/bench targets` in the same folder. Writes refit.md and a JSON file
+    per row to the study's folder.
 
     Example: scripts/bench refit captures/visit --frame -1
     """
@@ -91,9 +34,6 @@ def refit(
         captures,
         out,
         frame=frame,
-        preset=preset,
-        seeds=seed or (0,),
-        points=points,
         changes=changes or (),
         again=again,
         options=options,
@@ -112,17 +52,14 @@ def effects(
         list[str] | None,
         typer.Option(metavar="NAME=MODE,NAME=MODE", help="Effects to pin together. May be repeated."),
     ] = None,
-    preset: Annotated[str, typer.Option(help="Settings preset.")] = "scas4d",
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
     frames: Annotated[int | None, typer.Option(min=2, help="Number of frames; default: all.")] = None,
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Compares pinning or removing each effect with mode auto, by PSNR, update time and bit identity.
+    """Compares pinning each effect with mode auto, by PSNR, update time and bit identity.
 
     The two reconstructions start from the same frame 0 and are updated alternately. Each finished run is stored in a
-    file. Effects that are on in every scene are tested only in mode "off". Mode "removed" shows what an effect costs
-    while it is off. Writes effects.md to the study's folder.
+    file. Effects that are on in every scene are tested only in mode "off". Writes effects.md to the study's folder.
 
     Example: scripts/bench effects captures/robot --name entering --name leaving --frames 8
     """
@@ -134,30 +71,11 @@ def effects(
         out,
         names=name or (),
         pins=pins,
-        preset=preset,
-        seeds=seed or (0,),
         frames=frames,
         changes=changes or (),
         again=again,
         options=options,
     )
-
-
-def switches(
-    captures: Captures,
-    out: Study = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Updates per capture, played back and forth.")] = 50,
-    seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed; default: 0. May be repeated.")] = None,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Plays captures and reports which effects are switched on and off, and when.
-
-    Writes switches.md to the study's folder. Captures that were already played are not played again.
-    """
-    from studies.quality.switches import run
-
-    run(captures, out, updates=updates, seeds=seed or (0,), changes=changes or (), again=again)
 
 
 def targets(
@@ -166,9 +84,6 @@ def targets(
     run: Annotated[
         list[str] | None,
         typer.Option(help="Measure only this run, such as scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
-    ] = None,
-    only: Annotated[
-        list[str] | None, typer.Option(help="Measure only the capture with this name. May be repeated.")
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, shown in the table.")] = None,
     again: Again = False,
@@ -180,7 +95,7 @@ def targets(
     """
     from studies.quality.runs import measure_runs
 
-    rows = measure_runs(captures, out, run or (), only=only or (), frames=frames, again=again)
+    rows = measure_runs(captures, out, run or (), frames=frames, again=again)
     if any("error" in row for row in rows):
         raise typer.Exit(1)
 
@@ -196,7 +111,7 @@ def table(
     Only rows with the settings of the current presets are used. If several rows qualify, the one with the most frames
     is used.
     """
-    from studies.quality.targets import compare, count_words, left_out, page, read_study, target_table
+    from studies.quality.targets import compare, count_words, page, read_study, target_table
 
     if not study.is_dir():
         raise typer.BadParameter(
@@ -206,7 +121,6 @@ def table(
     outcomes = compare(rows)
     print(target_table(outcomes))
     print(f"\n{count_words(outcomes)}.")
-    if others := left_out(study, rows):
-        print(f"{others} rows of the study are not used, because their settings differ or they have fewer frames.")
     if out is not None:
-        write_page(out, page(rows))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(page(rows))

@@ -1,15 +1,13 @@
 """``scripts/bench effects``: benefit and cost of each effect, compared with mode `auto`.
 
 Two reconstructions start from the same frame 0 and are updated alternately, frame by frame, in one process. One uses
-`auto` for every effect; in the other, some effects are pinned. An effect that waits for evidence is tested in the modes
-"on", "off" and "removed". In mode "removed", the effect is missing from the registry, which shows what it costs while
-it is off.
+`auto` for every effect; in the other, some effects are pinned "on" or "off".
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -17,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.captures import Capture
@@ -28,16 +26,15 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import compile_in_processes
 from studies.captures import open_measured
-from studies.machine import core_version, machine
 from studies.quality.first_frame import first_of
 from studies.quality.settings import settings_of
+from studies.rows import RowStudy
 
 Pins = Mapping[str, str]
-"""Maps each effect to its mode: "on", "off", or "removed"."""
+"""Maps each effect to its mode: "on" or "off"."""
 
 COLUMNS = (
     Column("capture", "capture"),
-    Column("seed", "seed", "d"),
     Column("pinned", "pinned"),
     Column("in auto", "in_auto"),
     Column("updates", "updates", "d"),
@@ -57,8 +54,6 @@ def run(
     *,
     names: Sequence[str] = (),
     pins: Sequence[Pins] = (),
-    preset: str = "scas4d",
-    seeds: Sequence[int] = (0,),
     frames: int | None = None,
     changes: Sequence[str] = (),
     again: bool = False,
@@ -67,21 +62,10 @@ def run(
 ) -> list[Row]:
     """Measures every variant of each capture, prints the table and writes it to ``out/effects.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished run; a second call resumes the study.
-        names: effect names; all effects if empty, unless there are ``pins``.
-        pins: additional variants, each given as the effects that it pins together.
-        preset: preset that both reconstructions share.
-        seeds: seeds for frame 0 and the updates; every seed is measured.
-        frames: number of frames; all if None.
-        changes: changes to the settings that both reconstructions share.
-        again: whether to repeat the runs that ``out`` already contains.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench effects --help``. A second call for the same folder resumes the study.
 
     Returns:
-        One row per capture, seed and variant.
+        One row per capture and variant.
 
     Raises:
         ValueError: an effect or setting is unknown, the settings contradict a pin, or there are fewer than two frames.
@@ -89,19 +73,25 @@ def run(
     if frames is not None and frames < 2:
         raise ValueError("frames must be at least 2, because effects are compared in updates")
     compile_in_processes()
-    rows = []
+    study = RowStudy(out, "effects", COLUMNS, again=again, report=report)
+    settings = settings_of("scas4d", None, 0, changes)
+    record = settings_record(settings, ())
+    singles = variants(names or (() if pins else tuple(EFFECTS)), settings)
     for folder in captures:
-        for seed in seeds:
-            settings = settings_of(preset, None, seed, changes)
-            singles = variants(names or (() if pins else tuple(EFFECTS)), settings)
-            for variant in [*singles, *pins]:
-                row = _row(folder, out, settings, variant, frames, again, options)
-                report(f"{row['capture']}, seed {seed}, {row['pinned']}: {row['gain']:+.2f} dB")
-                rows.append(row)
-    table = markdown(rows, COLUMNS)
-    (out / "effects.md").write_text(table + "\n")
-    report(table)
-    return rows
+        capture = open_measured(folder, options)
+        count = min(frames or capture.frame_count, capture.frame_count)
+        if count < 2:
+            raise ValueError(f"{capture.name} has only one frame, but effects are compared in updates")
+        for variant in [*singles, *pins]:
+            words = ", ".join(f"{name} {mode}" for name, mode in variant.items())
+            known: Row = {"capture": capture.name, "pinned": words, "settings": record}
+            study.add(
+                "-".join([capture.name, *(f"{name}-{mode}" for name, mode in variant.items())]),
+                (record, count, *options.changed.items()),
+                partial(_compared, known, capture, out, settings, variant, count),
+                lambda row: f"{row['capture']}, {row['pinned']}: {row['gain']:+.2f} dB",
+            )
+    return study.finish()
 
 
 def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
@@ -113,85 +103,37 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
         ValueError: an effect is unknown.
 
     >>> variants(["rigidity", "entering"], Settings())
-    [{'rigidity': 'off'}, {'entering': 'off'}, {'entering': 'removed'}, {'entering': 'on'}]
+    [{'rigidity': 'off'}, {'entering': 'off'}, {'entering': 'on'}]
     """
     pins: list[Pins] = []
     for name in names:
         if name not in EFFECTS:
             raise ValueError(f"unknown effect {name!r}; see docs/effects.md for the list")
         one = effect(name)
-        modes = ("off",) if not one.auto else ("off", "removed", "on")
-        refused = one.refusal(settings) is not None
-        for mode in modes:
-            contradicts = mode != "removed" and any(find_contradictions(pinned(settings, {name: mode})))
-            if not contradicts and not (refused and mode != "removed"):
-                pins.append({name: mode})
+        if one.refusal(settings) is not None:
+            continue
+        modes = ("off", "on") if one.auto else ("off",)
+        pins += [{name: mode} for mode in modes if not any(find_contradictions(pinned(settings, {name: mode})))]
     return pins
 
 
 def pinned(settings: Settings, pins: Pins) -> Settings:
-    """Returns the settings with the given effects pinned and the removed ones left out.
+    """Returns the settings with the given effects pinned.
 
     Raises:
         ValueError: an effect or a mode is unknown.
     """
-    effects = {**settings.effects, **pins}
-    effects = {name: mode for name, mode in effects.items() if pins.get(name) != "removed"}
-    return Settings.model_validate({**settings.model_dump(), "effects": effects})
+    return Settings.model_validate({**settings.model_dump(), "effects": {**settings.effects, **pins}})
 
 
-@contextmanager
-def without(pins: Pins) -> Iterator[None]:
-    """Temporarily removes the effects that are marked "removed" from the registry.
-
-    >>> with without({"entering": "removed"}):
-    ...     "entering" in EFFECTS
-    False
-    """
-    before = dict(EFFECTS)
-    for name, mode in pins.items():
-        if mode == "removed":
-            del EFFECTS[name]
-    try:
-        yield
-    finally:
-        EFFECTS.clear()
-        EFFECTS.update(before)
-
-
-def _row(
-    folder: Path,
-    out: Path,
-    settings: Settings,
-    pins: Pins,
-    frames: int | None,
-    again: bool,
-    options: CaptureOptions,
-) -> Row:
-    """Returns the row of a variant, measuring it if it is missing."""
-    capture = open_measured(folder, options)
-    count = min(frames or capture.frame_count, capture.frame_count)
-    if count < 2:
-        raise ValueError(f"{capture.name} has only one frame, but effects are compared in updates")
-    words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
-    seed = settings.update.seed
-    file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])
-    path = out / "effects" / f"{file}-{digest(settings_record(settings, ()), count, *options.changed.items())}.json"
-    known: Row = {"key": path.stem, "capture": capture.name, "seed": seed, "pinned": words, "frames": count}
-    of = {"settings": settings_record(settings, ()), "core": core_version(), "machine": machine()}
-    return kept_row(path, lambda: known | _compared(capture, out, settings, pins, count) | of, again=again)
-
-
-def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
+def _compared(known: Row, capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
     """Returns the measurements of a variant relative to auto."""
     given = (settings, pinned(settings, pins))
     scenes, psnr = [], np.zeros((2, count - 1))
     wall, cpu = np.zeros((2, count - 1)), np.zeros((2, count - 1))
-    taken: tuple[Pins, Pins] = ({}, pins)
-    for one, removed in zip(given, taken, strict=True):
+    for one in given:
         first: dict[str, Any] = {"points": capture.points, "static": first_of(capture, out, one)}
-        with without(removed):
-            scenes.append(Reconstruction.start(capture.rig, capture.frame(0), one, **first))
+        scenes.append(Reconstruction.start(capture.rig, capture.frame(0), one, **first))
     truth, same = capture.scaled(settings.scene.image_scale), True
     rig = truth.test_rig
     assert rig is not None
@@ -199,17 +141,15 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
         shown = truth.test_frame(index).images
         for which in (0, 1) if index % 2 else (1, 0):  # the second reconstruction finds the images in the cache
             frame = capture.frame(index)
-            with without(taken[which]):
-                began, spent = perf_counter(), process_time()
-                scenes[which].step(frame)
-                wall[which, index - 1], cpu[which, index - 1] = perf_counter() - began, process_time() - spent
+            began, spent = perf_counter(), process_time()
+            scenes[which].step(frame)
+            wall[which, index - 1], cpu[which, index - 1] = perf_counter() - began, process_time() - spent
             drawn = [metrics.psnr(scenes[which].render(one, index).colour, shown[one.name]) for one in rig.cameras]
             psnr[which, index - 1] = np.mean(drawn)
         auto, other = (scene.history.newest.arrays() for scene in scenes)
         same &= auto.keys() == other.keys() and all(np.array_equal(auto[key], other[key]) for key in auto)
     timed = slice(1 if count > 2 else 0, None)  # the first update loads kernels and searches for the motion
-    report = scenes[0].report
-    return {
+    return known | {
         "updates": count - 1,
         "in_auto": _words(scenes[0], pins),
         "psnr_auto": float(psnr[0].mean()),
@@ -220,7 +160,6 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
         "seconds_ratio": float(np.median(wall[1, timed] / wall[0, timed])),
         "cpu_ratio": float(cpu[1, timed].sum() / cpu[0, timed].sum()),
         "same_bits": "yes" if same else "no",
-        "gaussians": 0 if report is None else report.gaussians,
     }
 
 

@@ -1,9 +1,8 @@
-"""``scripts/bench quality``: scores of each capture's images, tracks and parts, and seconds per update.
+"""Rows of scores: each capture's images, tracks and parts, and seconds per update.
 
-There is one row for every combination of capture, preset, number of iterations and seed. Each row runs in a separate
-process, so that its peak memory can be measured. Rows already on disk are not run again. Frame 0 is fitted only once
-for all rows of a capture with the same scene and frame 0 settings. It is stored in the study folder under ``first/``.
-An interrupted row is restarted from frame 0.
+Each row runs in a separate process, so that its peak memory can be measured. Rows already on disk are not run again.
+Frame 0 is fitted only once for all rows of a capture with the same scene and frame 0 settings. It is stored in the
+study folder under ``first/``. An interrupted row is restarted from frame 0.
 """
 
 from __future__ import annotations
@@ -14,14 +13,12 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from client.cli import evaluate
-from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, score_tables
+from client.cli.evaluate import Job, Report, score_tables
 from client.cli.scores import QUALITY, Row, Store, digest
-from client.importers.open_source import CaptureOptions
 from scas4d_core.warm_up import compile_in_processes
 from studies.apart import in_a_process
 from studies.constants import all_varied
 from studies.machine import core_version, machine
-from studies.quality.settings import settings_of
 
 OBJECT_CAPTURES = ("robot", "wheel", "pendulums", "cloth", "spring")
 """Captures over which the table also contains the mean scores."""
@@ -29,72 +26,11 @@ LATER = ("scas4d_core.update.", "scas4d_core.robust.", "scas4d_core.structure.")
 """Prefixes of constants that do not affect frame 0. Rows share a frame 0 only if they agree in all other constants."""
 
 
-def run(
-    captures: Sequence[Path | str],
-    out: Path | str,
-    presets: Sequence[str] = ("scas4d",),
-    *,
-    iterations: Sequence[int] = (),
-    seeds: Sequence[int] = (0,),
-    changes: Sequence[str] = (),
-    frames: int | None = None,
-    masks: bool = True,
-    points: bool = True,
-    pictures: Sequence[int] = (0, 1, -1),
-    lpips: bool = False,
-    again: bool = False,
-    options: CaptureOptions = DEFAULT_OPTIONS,
-    report: Report = print,
-) -> list[Row]:
-    """Measures every capture with every preset, prints the table and writes it to ``out/table.md``.
-
-    Args:
-        captures: capture folders. Captures without test cameras are measured on their training cameras, and their rows
-            are marked.
-        out: folder for rows, per-frame lines and images; a second call with the same folder resumes the study.
-        presets: preset names.
-        iterations: numbers of iterations per update, all of which are measured; the preset's own number if empty.
-        seeds: seeds for frame 0 and the updates; every seed is measured.
-        changes: further settings, such as ``"update.clusters=[64]"``, with a JSON value after the equals sign.
-        frames: number of frames per capture; all if None.
-        masks: whether the masks are passed to the method.
-        points: whether the initial point cloud is passed to the method.
-        pictures: frames for which images (truth | render | difference) are saved; negative numbers count from the end.
-        lpips: whether to measure LPIPS, if its weights are installed.
-        again: whether to repeat rows that are already on disk.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
-
-    Returns:
-        The requested rows, in order; a failed row has an ``error`` and is retried on the next call.
-
-    Raises:
-        ValueError: a preset or setting is unknown, or a value is out of range.
-    """
-    jobs = [
-        Job(
-            capture=Path(capture),
-            preset=name,
-            settings=settings_of(name, count, seed, changes),
-            frames=frames,
-            masks=masks,
-            points=points,
-            pictures=tuple(pictures),
-            lpips=lpips,
-            options=options,
-        )
-        for name in presets
-        for count in (iterations or (None,))
-        for seed in seeds
-        for capture in captures
-    ]
-    return run_jobs(jobs, Path(out), again=again, report=report)
-
-
 def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
     """Measures the missing rows, each in its own process, and returns all rows in the order of the jobs.
 
-    Prints the table and writes it to ``out/table.md``. With ``again``, also repeats the rows already on disk.
+    Prints the table and writes it to ``out/table.md``. A failed row has an ``error`` and is retried on the next call.
+    With ``again``, also repeats the rows already on disk.
     """
     store = Store(out)
     if jobs:

@@ -84,40 +84,27 @@ def measure_runs(
     out: Path,
     names: Sequence[str] = (),
     *,
-    only: Sequence[str] = (),
     frames: int | None = None,
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
     """Measures runs on the available captures. Existing rows are not measured again.
 
-    Args:
-        captures: folder that contains the captures.
-        out: study folder.
-        names: names from ``RUNS``; all runs if empty.
-        only: names of captures; all captures of each run if empty.
-        frames: number of frames per capture; all if None.
-        again: whether to repeat rows that are already on disk.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench targets --help``.
 
     Returns:
         One row per run and available capture.
 
     Raises:
-        ValueError: a run or capture is unknown, or the folder contains no capture of any run.
+        ValueError: a run is unknown, or the folder contains no capture of any run.
     """
     for name in names:
         if name not in RUNS:
             raise ValueError(f"unknown run {name!r}; choose from {', '.join(RUNS)}")
-    for name in only:
-        if name not in CAPTURES:
-            raise ValueError(f"capture {name!r} has no targets; choose from {', '.join(CAPTURES)}")
     jobs: list[Job] = []
     missing: dict[str, None] = {}
     for name in names or RUNS:
         for capture in RUNS[name].captures:
-            if only and capture not in only:
-                continue
             if (captures / capture).is_dir():
                 jobs.append(RUNS[name].job(captures / capture, frames))
             else:

@@ -12,7 +12,7 @@ import numpy as np
 
 from client.cli.scores import Row, Store, markdown
 from scas4d_core.presets import preset
-from studies.machine import in_words
+from studies.machine import provenance
 from studies.quality.quality import OBJECT_CAPTURES
 from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
 
@@ -228,19 +228,10 @@ def read_study(folder: Path) -> dict[tuple[str, str], Row]:
     return rows
 
 
-def left_out(folder: Path, rows: Rows) -> int:
-    """Counts finished rows that belong to no current run, or are not the longest of their run."""
-    used = {row.get("key") for row in rows.values()}
-    return sum("error" not in row and row["key"] not in used for row in Store(folder).rows())
-
-
 def page(rows: Rows) -> str:
     """Returns a Markdown page with the commands, machine and date, the table of targets, and the underlying rows."""
     verdicts = compare(rows)
-    known = list(rows.values())
-    days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
-    machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
-    cores = sorted({str(row["core"]) for row in known if "core" in row})
+    days, machines, cores = provenance(rows.values())
     runs = [(name, run) for name, run in RUNS.items() if run.preset == "scas4d" and not run.changes]
     behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
@@ -254,9 +245,9 @@ scripts/bench kernels CAPTURES/robot --store out/quality --out docs/kernels.md
 scripts/bench table out/quality --out docs/quality.md
 ```
 
-- Measured: {" to ".join(dict.fromkeys((days[0], days[-1]))) if days else "nothing yet"}.
-- Machine: {"; ".join(machines) if machines else "–"}.
-- Source versions of the core: {", ".join(cores) if cores else "–"}.
+- Measured: {days}.
+- Machine: {machines}.
+- Source versions of the core: {cores}.
 
 An iteration is a forward and a backward pass over one training view. Results are averaged over the test cameras and the
 updates in the column "updates". Differences are computed over the updates that both runs cover. The metrics are defined

@@ -1,1 +1,1 @@
-"""Studies of third-party rigs, wrong calibrations and drifting cameras."""
+"""Studies of third-party rigs and wrong calibrations."""

@@ -5,17 +5,16 @@ Faults are added to the calibration, but the images do not change. Test cameras 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from client.cli.evaluate import Report, settings_record
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.first_frame.calibration.matches import Matches, match_by_appearance
@@ -24,8 +23,8 @@ from scas4d_core.first_frame.calibration.residuals import measure_residuals
 from scas4d_core.metrics.evaluation import measure_pictures
 from scas4d_core.posed_pictures import collect_views
 from scas4d_core.reconstruction import Reconstruction
-from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
+from studies.rows import RowStudy
 
 FAULTS = (
     ("across", 1.0), ("down", 1.0), ("across", 2.0), ("down", 2.0), ("across", 4.0), ("down", 4.0), ("centre", 2.0),
@@ -93,44 +92,30 @@ def run(
 ) -> list[Row]:
     """Measures each capture, prints two tables and writes them to ``out/calibration.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder, which stores each finished run; a second call resumes the study.
-        fit: whether to also fit frame 0 to faulty rigs.
-        changes: changes to the settings.
-        again: whether to repeat finished runs.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench calibration --help``. A second call for the same folder resumes the study.
 
     Returns:
         The rows of both tables.
     """
-    measured_rows, fitted = [], []
+    measured_rows: list[Row] = []
+    study = RowStudy(out, "calibration", FITTED, again=again, report=report)
+    settings = settings_record(settings_of("scas4d", None, 0, changes), ())
     for folder in captures:
         capture = open_source(folder)
         matches = match_by_appearance(collect_views(capture.rig, dict(capture.frame(0).images), {}))
         measured_rows += _measured(capture.name, matches)
         report(f"{capture.name}, as given: {refine_rig(capture.rig, matches).text}")
         for way, pixels in RIGS if fit and capture.test_rig is not None else ():
-            settings = settings_record(settings_of("scas4d", None, 0, list(changes)), ())
-            path = (
-                out / "calibration" / f"{folder.resolve().name}-{way}-{pixels:g}-{digest(settings, way, pixels)}.json"
+            known = {"capture": capture.name, "rig": f"{way} {pixels:g}", "settings": settings}
+            study.add(
+                f"{folder.resolve().name}-{way}-{pixels:g}",
+                (settings, way, pixels),
+                partial(_fitted, known, folder, faulty_rig(capture.rig, way, pixels), changes),
+                lambda row: f"{row['capture']}, {row['rig']}: {row['given']:.2f} dB, refined {row['refined']:.2f} dB",
             )
-            known = {"key": path.stem, "capture": capture.name, "rig": f"{way} {pixels:g}", "settings": settings}
-            rig = faulty_rig(capture.rig, way, pixels)
-            row = kept_row(path, partial(_row, known, folder, rig, changes), again=again)
-            report(f"{row['capture']}, {row['rig']}: {row['given']:.2f} dB, refined {row['refined']:.2f} dB")
-            fitted.append(row)
-    tables = "\n\n".join(
-        markdown(rows, columns) for rows, columns in ((measured_rows, MEASURED), (fitted, FITTED)) if rows
-    )
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "calibration.md").write_text(tables + "\n")
-    report(tables)
-    return [*measured_rows, *fitted]
-
-
-def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
-    return {**known, **_fitted(folder, rig, changes), "core": core_version(), "machine": machine()}
+    tables = ((measured_rows, MEASURED), (study.rows, FITTED))
+    study.write("\n\n".join(markdown(rows, columns) for rows, columns in tables if rows))
+    return [*measured_rows, *study.rows]
 
 
 def _measured(name: str, matches: Matches) -> list[Row]:
@@ -159,9 +144,9 @@ def _told_row(capture: str, fault: str, residual: NDArray[np.float64], named: st
     return {"capture": capture, "fault": fault, "residual": text + few, "named": named, "others": others}
 
 
-def _fitted(folder: Path, rig: Rig, changes: Sequence[str]) -> Mapping[str, Any]:
+def _fitted(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
     """Returns the PSNR of the test cameras in frame 0, with the given and with the refined rig."""
-    capture, row = open_source(folder), dict[str, Any]()
+    capture, row = open_source(folder), known
     for refine in (False, True):
         settings = settings_of("scas4d", None, 0, [*changes, f"static.refine_calibration={str(refine).lower()}"])
         scene = Reconstruction.start(rig, capture.frame(0), settings, points=capture.points)

@@ -1,19 +1,14 @@
-"""The rig studies as commands of `scripts/bench`: `rigs`, `calibration` and `drift`."""
+"""The rig studies as commands of `scripts/bench`: `rigs` and `calibration`."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import QUALITY, Again, Captures, Changes
-
-Study = Annotated[
-    Path, typer.Option(help="Study folder, for rows, images and frames 0. A second run continues the study.")
-]
+from studies.options import QUALITY, Again, Captures, Changes, Study
 
 
 @with_capture_options
@@ -35,26 +30,6 @@ def rigs(
     from studies.rigs.rigs import run
 
     run(captures, out, frames=frames, longer=longer, changes=changes or (), again=again, options=options)
-
-
-def drift(
-    captures: Captures,
-    out: Study = QUALITY,
-    updates: Annotated[int, typer.Option(min=1, help="Updates per capture.")] = 14,
-    pixels: Annotated[
-        float, typer.Option(min=0, help="Camera drift per frame, in pixels of the original files.")
-    ] = 0.3,
-    most: Annotated[float, typer.Option(min=0, help="Maximum camera drift, in pixels of the original files.")] = 4.0,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Updates captures with two drifting cameras or none, with and without the effect pose_drift.
-
-    Writes drift.md to the study's folder. Runs that were already measured are not repeated.
-    """
-    from studies.rigs.pose_drift import run
-
-    run(captures, out, updates=updates, pixels=pixels, most=most, changes=changes or (), again=again)
 
 
 def calibration(

@@ -2,8 +2,7 @@
 
 Frame 0 keeps its time limit, because its duration is measured. The study should run on an otherwise idle machine. With
 five or more cameras, one is held out. As a baseline, the image of the nearest training camera is also compared with
-that of the held-out camera. For all captures, tracks are compared with optical flow (``flow.py``). If a folder has a
-``joints.npz`` (``points3d`` [T, J, 3], in the calibration's world), its points are also tracked from frame 0.
+that of the held-out camera. For all captures, tracks are compared with optical flow (``flow.py``).
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from client.cli.changes import parse_changes
 from client.cli.evaluate import Report, save_comparisons, settings_record
-from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
+from client.cli.scores import Column, Row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
 from scas4d_core.cameras import Rig
@@ -31,8 +30,8 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.warm_up import compile_in_processes
-from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
+from studies.rows import RowStudy
 
 ENOUGH_TO_HOLD_OUT = 5
 """Minimum number of cameras for holding one out. With fewer, each camera sees content that no other camera sees."""
@@ -47,22 +46,16 @@ COLUMNS = (
     Column("Gaussians", "gaussians", ",d"),
     Column("pairs", "pairs", ".1f"),
     Column("99%", "pairs_99", ".0f"),
-    Column("last", "pairs_last", ".1f"),
-    Column("99%", "pairs_last_99", ".0f"),
     Column("frame 0 s", "seconds_first", ".0f"),
     Column("update s", "seconds_update", ".1f"),
     Column("held", "held", "d"),
     Column("unmoved", "unmoved", "d"),
     Column("training dB", "psnr_training", ".1f"),
-    Column("last", "psnr_training_last", ".1f"),
     Column("held out", "held_out"),
     Column("its dB", "psnr_held_out", ".1f"),
-    Column("last", "psnr_held_out_last", ".1f"),
     Column("nearest picture dB", "psnr_nearest", ".1f"),
     Column("flow px", "flow_px", ".1f"),
     Column("epipolar px", "epipolar_px", ".1f"),
-    Column("joints px", "joints_px", ".1f"),
-    Column("last", "joints_px_last", ".1f"),
 )
 
 
@@ -79,33 +72,22 @@ def run(
 ) -> list[Row]:
     """Reconstructs captures, prints the table and writes it to ``out/rigs.md``.
 
-    Args:
-        captures: capture folders.
-        out: study folder; a second call resumes the study.
-        frames: maximum number of frames.
-        longer: maximum length of the longer side of the largest image, in pixels.
-        changes: changes to the settings, such as ``"static.seconds=60"``.
-        again: whether to repeat rows that ``out`` already contains.
-        options: options for reading the captures; ``options.test`` names the cameras to hold out instead of the middle
-            one.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench rigs --help``. A second call for the same folder resumes the study.
 
     Returns:
         One row per capture.
     """
-    store, rows = Store(out), list[Row]()
+    study = RowStudy(out, "rigs", COLUMNS, again=again, report=report)
     compile_in_processes()
     for folder in captures:
-        key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
-        path = store.folder / "rigs" / f"{key}.json"
-        pictures = store.folder / "pictures" / key
-        row = kept_row(path, partial(measured, folder, options, frames, longer, changes, pictures), again=again)
-        rows.append(row)
-        report(markdown([row], COLUMNS))
-    table = markdown(rows, COLUMNS)
-    (store.folder / "rigs.md").write_text(table + "\n")
-    report(table)
-    return rows
+        name = folder.resolve().name
+        study.add(
+            name,
+            (list(changes), frames, longer, *options.changed.items()),
+            partial(measured, folder, options, frames, longer, changes, out / "pictures" / name),
+            lambda row: markdown([row], COLUMNS),
+        )
+    return study.finish()
 
 
 def measured(
@@ -136,10 +118,7 @@ def measured(
         unmoved += report.candidate is Candidate.PREVIOUS
     cameras = [CameraArrays.of(camera) for camera in scene.rig.cameras]
     renderer = renderer_of("cpu", (0, 0, 0), rig_limits(settings.scene.near, scene.world, given.rig.cameras))
-    pairs, pairs_last = (
-        np.concatenate([pairs.ravel() for pairs in renderer.pairs_per_pixel(state, cameras)])
-        for state in map(scene.history.gaussians, (0, count - 1))
-    )
+    pairs = np.concatenate([each.ravel() for each in renderer.pairs_per_pixel(scene.history.first, cameras)])
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,
@@ -151,25 +130,19 @@ def measured(
         "gaussians": len(scene.history.first),
         "pairs": float(pairs.mean()),
         "pairs_99": float(np.percentile(pairs, 99)),
-        "pairs_last": float(pairs_last.mean()),
-        "pairs_last_99": float(np.percentile(pairs_last, 99)),
         "seconds_first": first,
         "shortened": list(scene.history.report(0).get("shortened") or []),
         "seconds_update": float(np.median(seconds)) if seconds else None,
         "held": held,
         "unmoved": unmoved,
         "psnr_training": float(np.mean(trained)),
-        "psnr_training_last": trained[-1],
         "settings": settings_record(settings, ()),
-        "core": core_version(),
-        "machine": machine(),
     }
     if (unseen := truth.test_rig) is not None:
         scores = [_psnr(scene, unseen, truth.test_frame(index)) for index in range(count)]
         row |= {
             "held_out": ", ".join(unseen.names),
             "psnr_held_out": float(np.mean(scores)),
-            "psnr_held_out_last": scores[-1],
             "psnr_nearest": float(np.mean([_nearest_psnr(truth, unseen, index) for index in range(count)])),
         }
     if count > 1:
@@ -177,8 +150,6 @@ def measured(
     seen = truth if truth.test_rig is not None else truth.with_training_as_test()
     for index in sorted({0, count - 1}):
         save_comparisons(scene, seen, index, pictures)
-    if (folder / "joints.npz").is_file():
-        row |= _joints(folder / "joints.npz", scene, given.full_rig, count)
     return row
 
 
@@ -205,26 +176,3 @@ def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uin
     lines, columns = (np.arange(want) * have // want for want, have in zip(shape[:2], image.shape[:2], strict=True))
     resized: NDArray[np.uint8] = image[lines[:, None], columns[None]]
     return resized
-
-
-def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:
-    """Returns the median error in full-resolution pixels of joints tracked from frame 0, over cameras and frames."""
-    with np.load(path) as file:
-        true = file["points3d"][:count].astype(np.float64)
-    tracks = scene.tracks_of_points(true[0], 0, list(range(count))).positions
-    error = np.stack(
-        [
-            np.linalg.norm(
-                camera.project(tracks.reshape(-1, 3))[0] - camera.project(true.reshape(-1, 3))[0], axis=1
-            ).reshape(true.shape[:2])
-            for camera in rig.cameras
-        ]
-    )
-    lost = np.isnan(error)  # the Gaussian that carried it has left the scene
-    error = np.where(lost, np.inf, error)
-    return {
-        "joints_px": float(np.median(error[:, 1:])),
-        "joints_px_last": float(np.median(error[:, -1])),
-        "joints_px_each": np.median(error[:, 1:], axis=(0, 1)).tolist(),
-        "joints_lost": float(lost.mean()),
-    }

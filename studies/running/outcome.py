@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from client.cli.scores import Column, markdown
+
 
 @dataclass
 class ScenarioResult:
@@ -28,12 +30,14 @@ class ScenarioResult:
         return not self.faults
 
 
+COLUMNS = (Column("fault", "name"), Column("target", "target"), Column("found", "found"), Column("", "verdict"))
+
+
 def table(outcomes: Sequence[ScenarioResult]) -> str:
     """Formats the outcomes as a Markdown table, with one row per fault."""
-    rows = ["| fault | target | found | |", "|---|---|---|---|"]
-    for outcome in outcomes:
-        summary = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])
-        rows.append(
-            f"| {outcome.name} | {outcome.target} | {summary} | {'reached' if outcome.reached else '**missed**'} |"
-        )
-    return "\n".join(rows)
+    rows = [
+        vars(one)
+        | {"found": "; ".join([*one.faults, one.found]), "verdict": "reached" if one.reached else "**missed**"}
+        for one in outcomes
+    ]
+    return markdown(rows, COLUMNS)

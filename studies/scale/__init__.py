@@ -1,1 +1,1 @@
-"""Studies of cost against size: pixels, Gaussians, cameras, share of moving pixels, and frames."""
+"""Studies of cost against size: pixels, Gaussians, cameras and share of moving pixels."""

@@ -1,4 +1,4 @@
-"""Kills, truncation, bit flips, a full disk and attackers: no acknowledged frame may be lost, and no bit may differ.
+"""Kills: no acknowledged frame may be lost, and no bit may differ.
 
 Each scenario runs the whole service in a separate process. The undisturbed run comes first. The states of the other
 runs must be bit-identical to those of the undisturbed run.
@@ -9,32 +9,22 @@ from __future__ import annotations
 import contextlib
 import os
 import random
-import resource
-import shutil
 import signal
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
+from client.cli.evaluate import Report
 from client.wire import FrameState
 from scas4d_core.storage.frame_files import checkpoint_file, frame_file
-from server.storage.events import FrameAccepted
 from server.storage.frame_store import has_record
-from server.storage.journal import read_journal
-from server.storage.layout import DataFolder, SceneFolder
-from studies.options import Echo
+from server.storage.layout import DataFolder
 from studies.running.outcome import ScenarioResult
 from studies.running.process import PATIENCE_S, Service, StudyError
-from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, running, undisturbed
-from studies.service import damage
-from studies.service.beginnings import beginnings
-from studies.service.strangers import Attack, strangers
+from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, running
 
-TURN_S = 15.0
-"""Seconds of updates without an attack. Updates under attack continue until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
 """Maximum number of worker kills per frame. At the sixth kill, the service would rightly fail the frame."""
 
@@ -49,9 +39,6 @@ VICTIMS = ("worker", "service")
 RANDOM = "at random"
 POLL_S = 0.0005
 """Seconds between checks whether a frame has reached a stage, less than a write takes."""
-
-PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
-"""Names of the scenarios."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +71,7 @@ def _in_order(kills: Sequence[Kill]) -> list[Kill]:
 
 
 def kills(
-    study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
+    study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Report
 ) -> ScenarioResult:
     """Kills the worker or the whole service with `kill -9` `count` times: between pipeline stages and at random."""
     random_ = random.Random(seed)
@@ -184,209 +171,3 @@ def _kill_worker(service: Service, scene: str, killed: Counter[int], *, at_once:
             return
         time.sleep(AGAIN_S)
     raise StudyError("there was no worker to kill")
-
-
-def damaged_log(
-    study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, echo: Echo
-) -> ScenarioResult:
-    """Truncates log files or flips a bit while the service is down. It must then start, report the damage and continue.
-
-    Half of the frames are committed and the other half are waiting, as they would be after a kill.
-    """
-    random_ = random.Random(seed)
-    service = study.service("log")
-    service.start()
-    half = len(study.frames) // 2
-    scene = study.create(service)
-    sender = FrameSender(study, service, scene)
-    for index in range(half):
-        sender.send(index)
-    service.finish(scene, half)
-    service.http.post(f"/v1/scenes/{scene}/pause")
-    for index in range(half, len(study.frames)):
-        sender.send(index)
-    service.kill()
-    service.stop()
-    faults = list(sender.faults)
-    dropped = 0
-    for number in range(cuts + flips):
-        kind = "cut" if number < cuts else "flip"
-        victim = study.service("damaged")
-        shutil.rmtree(victim.data)
-        shutil.copytree(service.data, victim.data)
-        folder = DataFolder(victim.data).scene(scene)
-        said, hit = _damage(folder, kind, random_, half)
-        victim.start()
-        try:
-            victim.http.post(f"/v1/scenes/{scene}/resume")
-            status = victim.finish(scene, len(study.frames) if hit is None else 0)
-            echo(f"{said}: {'; '.join(status.damage) or 'nothing reported'}")
-            wrong = _check_damaged(victim, scene, sender, hit)
-            wrong += compare(digests(folder.states), expected, range(hit, len(study.frames)) if hit else ())
-            if hit is not None:
-                report = victim.frame(scene, hit)
-                dropped += 1
-                if report.state != FrameState.FAILED or not report.error:
-                    wrong.append(f"frame {hit} is {report.state}, although its record is damaged")
-            elif not status.damage:
-                wrong.append("the damage was not reported")
-            faults += [f"{said}: {fault}" for fault in wrong]
-        except StudyError as error:
-            faults.append(f"{said}: {error}")
-        finally:
-            victim.stop()
-    summary = f"started {cuts + flips} times; {dropped} frames failed with a reason, all others committed"
-    target = "the service starts, loses nothing acknowledged before the damage, and reports what it dropped"
-    return ScenarioResult(
-        f"{cuts} truncations and {flips} flipped bytes in journal and frame log", target, summary, faults
-    )
-
-
-def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
-    """Damages the journal or the record of a waiting frame.
-
-    Returns:
-        A description of the damage, and the index of the affected frame; None for the journal.
-    """
-    journal = folder.journal
-    taken = {event.index: event for event in read_journal(journal).events if isinstance(event, FrameAccepted)}
-    waiting = [index for index in taken if index >= half]
-    hit = random_.choice([None, random_.choice(waiting)])
-    file = journal if hit is None else folder.frames / taken[hit].files[0]
-    at = random_.randrange(1, file.stat().st_size)
-    with file.open("r+b") as opened:
-        if kind == "cut":
-            opened.truncate(at)
-        else:
-            opened.seek(at)
-            byte = opened.read(1)[0]
-            opened.seek(at)
-            opened.write(bytes([byte ^ (1 << random_.randrange(8))]))
-    return f"{kind} of {file.name} at byte {at}", hit
-
-
-def _check_damaged(service: Service, scene: str, sender: FrameSender, hit: int | None) -> list[str]:
-    faults = []
-    for index, receipt in sender.receipts.items():
-        report = service.frame(scene, index)
-        if index != hit and report.state != FrameState.COMMITTED:
-            faults.append(f"frame {index} is {report.state}: {report.error}")
-        if report.identity != receipt["identity"]:
-            faults.append(f"frame {index} has a different identity")
-    return faults
-
-
-def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> ScenarioResult:
-    """Prevents files from growing, first for the service and then for the worker, and lifts the limit each time.
-
-    The file size limit is set on the running processes (RLIMIT_FSIZE). Every write then fails where it would fail on a
-    full disk.
-    """
-    faults: list[str] = []
-    with running(study, "full") as (service, scene, sender):
-        half = len(study.frames) // 2
-        for index in range(half):
-            sender.send(index)
-        service.finish(scene, half)
-        with _no_room(service.pid):
-            answers = [service.put(scene, half, *study.frames[half]) for _ in range(3)]
-            echo(f"while the disk is full: {[answer.status_code for answer in answers]}")
-            faults += [
-                f"expected status 507, got {answer.status_code}" for answer in answers if answer.status_code != 507
-            ]
-            if service.status(scene).next_frame != half:
-                faults.append("a frame was accepted but not acknowledged")
-        worker = service.worker_pid(scene)
-        assert worker is not None
-        before = service.status(scene).error  # possibly still the error that the service had no room
-        with _no_room(worker):
-            sender.send(half)
-            until = time.monotonic() + PATIENCE_S
-            while service.status(scene).error in (None, before) and time.monotonic() < until:
-                time.sleep(AGAIN_S)
-            echo(f"while the worker has no disk space: {service.status(scene).error}")
-            if service.frame(scene, half).state != FrameState.UPDATING:
-                faults.append("the worker did not wait for disk space")
-        for index in range(half + 1, len(study.frames)):
-            sender.send(index)
-        service.finish(scene, len(study.frames))
-        faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-    target = "status 507 while the disk is full; no acknowledged frame lost, all committed once there is space"
-    return ScenarioResult(
-        "disk full during ingest", target, "507 while full; all committed once there was space", faults
-    )
-
-
-@contextlib.contextmanager
-def _no_room(pid: int) -> Any:
-    soft, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, hard))
-    try:
-        yield
-    finally:
-        resource.prlimit(pid, resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioResult:
-    """Flips single bits in all files on disk, with and without a restart (`studies.service.damage`)."""
-    longer = replace(study, frames=encoded_frames(study.capture, damage.frames_for(count)))
-    flipped = damage.flips(longer, count, seed, echo)
-    counts = Counter(kind.rpartition(" ")[2] for kind in flipped.counts.elements())
-    said = (
-        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.recomputed)} states recomputed from "
-        f"images, {len(flipped.lost)} reported as lost, {len(flipped.unreported)} without a report"
-    )
-    target = "each flip is noticed or harmless; no wrong images, no status 500, and the scene continues"
-    return ScenarioResult(
-        f"{count} flipped bits in {', '.join(damage.KINDS)}, half of them while the service is down",
-        target,
-        said,
-        flipped.faults,
-    )
-
-
-def run(
-    study: Study,
-    *,
-    moments: int = 30,
-    cuts: int = 20,
-    flips: int = 1,
-    bits: int = 200,
-    seed: int = 0,
-    attack: Attack | None = None,
-    turns: int = 3,
-    parts: Sequence[str] = PARTS,
-    echo: Echo = print,
-) -> list[ScenarioResult]:
-    """Runs the scenarios named in `parts` and returns their results.
-
-    Args:
-        study: study that defines the frames and the service.
-        moments: number of kills, and of reconstruction restarts.
-        cuts: number of truncated log files.
-        flips: number of log files with a flipped bit.
-        bits: number of bits flipped in all files on disk.
-        seed: random seed for the moments and places of the faults.
-        attack: attack by clients without a token; the full attack if None.
-        turns: number of turns without and with the attack.
-        parts: names of the scenarios to run.
-        echo: callback that prints progress messages.
-    """
-    outcomes = []
-    if set(parts) & {"kills", "beginnings", "log", "disk"}:
-        expected, update_s = undisturbed(study)
-        echo(f"undisturbed run: {len(expected)} states, {update_s:.2f} s per update")
-        if "kills" in parts:
-            outcomes.append(kills(study, expected, update_s, moments, seed, echo))
-        if "beginnings" in parts:
-            outcomes.append(beginnings(study, expected, moments, seed, echo))
-        if "log" in parts:
-            outcomes.append(damaged_log(study, expected, cuts, flips, seed, echo))
-        if "disk" in parts:
-            outcomes.append(full_disk(study, expected, echo))
-    if "bits" in parts:
-        outcomes.append(flipped_bits(study, bits, seed, echo))
-    if "strangers" in parts:
-        for token in (False, True):
-            outcomes.append(strangers(study, attack or Attack(), turns=turns, seconds=TURN_S, token=token, echo=echo))
-    return outcomes

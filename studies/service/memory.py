@@ -1,17 +1,10 @@
 """Peak memory of a reconstruction compared with the service's estimate (server/health/estimate.py).
 
 The scene is a ball in the middle of a ring of cameras. Frame 0 and two updates are reconstructed with few iterations,
-because memory does not depend on their number. A second study measures a service whose scenes are all asleep: its
-memory, and the times to list the scenes and to render a first view.
+because memory does not depend on their number.
 """
 
 from __future__ import annotations
-
-import os
-import shutil
-import time
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -22,11 +15,7 @@ from scas4d_core.captures import Frame, InitialPoints
 from scas4d_core.presets import preset
 from server.health.estimate import estimate
 from server.settings import ServerSettings
-from server.storage.definition import read_definition, write_definition
-from server.storage.layout import DataFolder, SceneFolder
 from studies.constants import varied
-from studies.machine import resident_mb
-from studies.running.process import Service
 
 
 def ring(count: int, size: int) -> Rig:
@@ -74,62 +63,3 @@ def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) 
     expected = estimate(RigModel.of(rig), settings, ServerSettings()).worker_mb
     kept = len(reconstruction.history.gaussians(0))
     return {"peak_mb": round(peak), "estimate_mb": round(expected), "ratio": peak / expected, "kept": kept}
-
-
-def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float]:
-    """Copies a scene's folder, starts a service on the sleeping copies, and requests views of some of them.
-
-    Args:
-        scene: folder of a scene with committed frames, in the data folder of a service that has stopped.
-        count: number of copies.
-        views: number of scenes that are woken, one after the other.
-        work: data folder; its contents are deleted.
-
-    Returns:
-        Memory per scene in MB; seconds from startup until the scenes are listed, for new and for known folders; and
-        median and longest seconds until the first view of a scene is rendered.
-    """
-    shutil.rmtree(work, ignore_errors=True)
-    empty, full = work / "empty", DataFolder(work / "full")
-    full.scenes.mkdir(parents=True)
-    definition, _ = read_definition(SceneFolder(scene))
-    names = [f"{number:012x}" for number in range(count)]
-    for name in names:
-        folder = full.scene(name)
-        shutil.copytree(scene, folder.path)
-        write_definition(folder, replace(definition, id=name))
-        os.utime(folder.journal, (0, 0))  # last used long ago
-    megabytes = {}
-    for name, data in (("empty", empty), ("new", full.path), ("again", full.path)):
-        data.mkdir(exist_ok=True)
-        service = Service(data)
-        try:
-            began = time.perf_counter()
-            service.start()
-            listed = service.http.get("/v1/scenes").json()["scenes"]
-            megabytes[name] = time.perf_counter() - began, resident_mb(service.pid), len(listed)
-            waited = [_first_view(service, one) for one in names[:views]] if name == "again" else []
-        finally:
-            service.stop()
-    (_, alone, _), (new, together, counted), (seconds, _, again) = (
-        megabytes["empty"],
-        megabytes["new"],
-        megabytes["again"],
-    )
-    assert (counted, again) == (count, count), f"{counted} and {again} of {count} scenes are listed"
-    return {
-        "mb_a_scene": (together - alone) / count,
-        "new_list_s": new,
-        "list_s": seconds,
-        "view_s": float(np.median(waited)),
-        "longest_view_s": max(waited),
-    }
-
-
-def _first_view(service: Service, name: str) -> float:
-    camera = service.http.get(f"/v1/scenes/{name}").json()["cameras"][0]
-    began = time.perf_counter()
-    service.http.post(f"/v1/scenes/{name}/render", json={"camera": camera}).raise_for_status()
-    waited = time.perf_counter() - began
-    service.http.post(f"/v1/scenes/{name}/sleep").raise_for_status()
-    return waited

@@ -23,13 +23,18 @@ from typing import Any
 import httpx
 import numpy as np
 
+from client.cli.evaluate import Report
+from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
-from studies.options import Echo
 from studies.running.process import Service
 from studies.running.study import Updates, encoded_frames
 
 TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
+RATES = (1.0, 5.0, 20.0)
+"""Views per second."""
+WIDTH = 256
+"""Width of a view in pixels."""
 IDLE_S = 6.0
 """Seconds per turn during which views are requested while nothing is updated."""
 WARM_UP = 3
@@ -74,17 +79,16 @@ class Load:
         url: URL of the scene.
         cameras: names of the cameras, which are rendered in turn.
         rate: views per second.
-        width: width of a view in pixels.
 
     Attributes:
         latencies: latency of each view in ms, from the time at which it was due.
         refused: number of views without a response of 200.
     """
 
-    def __init__(self, url: str, cameras: Sequence[str], rate: float, width: int) -> None:
+    def __init__(self, url: str, cameras: Sequence[str], rate: float) -> None:
         self.latencies: list[float] = []
         self.refused = 0
-        self._url, self._cameras, self._rate, self._width = url, cameras, rate, width
+        self._url, self._cameras, self._rate = url, cameras, rate
         self._stop = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
 
@@ -112,7 +116,7 @@ class Load:
 
     async def _ask(self, http: httpx.AsyncClient, camera: str, due: float) -> None:
         try:
-            answer = await http.get("render", params={"camera": camera, "format": "jpeg", "width": self._width})
+            answer = await http.get("render", params={"camera": camera, "format": "jpeg", "width": WIDTH})
         except httpx.HTTPError:
             self.refused += 1
             return
@@ -126,35 +130,23 @@ def measure(
     capture: Capture,
     folder: Path,
     *,
-    rates: Sequence[float],
     updates: int,
     turns: int,
-    width: int,
     settings: Mapping[str, Any],
-    environment: Mapping[str, str],
-    echo: Echo,
+    echo: Report,
 ) -> list[ViewTimes]:
     """Measures views and updates, alone and together, and returns the times at each rate.
 
-    Args:
-        capture: capture whose frames are sent.
-        folder: folder for the service's data; its contents are deleted.
-        rates: view rates to measure, in views per second.
-        updates: number of updates per turn, both with and without views.
-        turns: number of turns per rate.
-        width: width of a view in pixels.
-        settings: scene settings.
-        environment: environment variables for the service.
-        echo: callback that prints progress messages.
+    For the arguments, see ``scripts/bench views --help``.
     """
     shutil.rmtree(folder, ignore_errors=True)
     data = folder / "data"
     data.mkdir(parents=True)
-    service = Service(data, environment)
+    service = Service(data)
     service.start()
     try:
-        many = 1 + WARM_UP + 2 * updates * turns * len(rates)
-        scene = service.create(capture.rig, settings, ingest={"queue_frames": updates + 1})
+        many = 1 + WARM_UP + 2 * updates * turns * len(RATES)
+        scene = service.create(capture.rig, settings, ingest={"queue_frames": max(updates, WARM_UP) + 1})
         if capture.points is not None:
             service.put_points(scene, capture.points)
         frames = Updates(service, scene, encoded_frames(capture, many))
@@ -163,21 +155,21 @@ def measure(
         frames.run(WARM_UP)
         url = f"http://127.0.0.1:{service.port}/v1/scenes/{scene}/"
         names = capture.rig.names
-        with Load(url, names, 2.0, width):  # opens connections and loads the reader's kernels
+        with Load(url, names, 2.0):  # opens connections and loads the reader's kernels
             time.sleep(3.0)
-        times = [ViewTimes(rate) for rate in rates]
+        times = [ViewTimes(rate) for rate in RATES]
         for _ in range(turns):
             for row in times:
-                with Load(url, names, row.rate, width) as load:
+                with Load(url, names, row.rate) as load:
                     time.sleep(IDLE_S)
                 row.idle += load.latencies
                 row.refused += load.refused
                 row.alone += frames.run(updates)
-                with Load(url, names, row.rate, width) as load:
+                with Load(url, names, row.rate) as load:
                     row.together += frames.run(updates)
                 row.loaded += load.latencies
                 row.refused += load.refused
-                echo(line(row))
+                echo(str(row_of(row)))
         return times
     finally:
         with contextlib.suppress(Exception):
@@ -185,28 +177,33 @@ def measure(
         service.kill()
 
 
-def line(row: ViewTimes) -> str:
-    """Formats the times at one rate as a row of the Markdown table."""
-    cells = [
-        f"{row.rate:g}",
-        *(f"{statistics.median(times):.0f} ({np.percentile(times, 95):.0f})" for times in (row.idle, row.loaded)),
-        f"{row.latency:.2f}",
-        f"{statistics.median(row.alone):.2f}",
-        f"{statistics.median(row.together):.2f}",
-        f"{100 * row.slower:+.0f}%",
-        str(row.refused),
-    ]
-    return "| " + " | ".join(cells) + " |"
+COLUMNS = (
+    Column("views per second", "rate", "g"),
+    Column("idle, ms (95%)", "idle"),
+    Column("during updates, ms (95%)", "loaded"),
+    Column("ratio", "latency"),
+    Column("update alone, s", "alone"),
+    Column("under views, s", "together"),
+    Column("slower", "slower", "+.0%"),
+    Column("no response", "refused", "d"),
+)
+
+
+def row_of(times: ViewTimes) -> Row:
+    """Returns the medians at one rate as a row of the table."""
+    idle, loaded = (
+        f"{statistics.median(each):.0f} ({np.percentile(each, 95):.0f})" for each in (times.idle, times.loaded)
+    )
+    alone, together = (statistics.median(each) for each in (times.alone, times.together))
+    return vars(times) | {
+        "idle": idle, "loaded": loaded, "alone": alone, "together": together, "latency": times.latency,
+        "slower": times.slower,
+    }  # fmt: skip
 
 
 def table(rows: Sequence[ViewTimes]) -> str:
     """Formats the results as a Markdown table, followed by a sentence on the target."""
-    head = [
-        "| views per second | idle, ms (95%) | during updates, ms (95%) | ratio | update alone, s | under views, s | "
-        "slower | no response |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    text = "\n".join([*head, *map(line, rows)])
+    text = markdown([row_of(times) for times in rows], COLUMNS)
     for row in rows:
         if row.rate == TARGET_RATE:
             reached = row.latency <= TARGET_LATENCY and row.slower <= TARGET_SLOWER and row.refused == 0
@@ -218,11 +215,11 @@ def table(rows: Sequence[ViewTimes]) -> str:
     return text
 
 
-def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turns: int) -> str:
+def page(rows: Sequence[ViewTimes], capture: str, updates: int, turns: int) -> str:
     """Returns the table as Markdown, preceded by the date, the machine and the conditions of the measurement."""
     day = datetime.now(UTC).date().isoformat()
     return (
-        f"Measured {day} on {in_words(machine())}: `{capture}`, views {width} pixels wide as JPEG, every camera of the "
+        f"Measured {day} on {in_words(machine())}: `{capture}`, views {WIDTH} pixels wide as JPEG, every camera of the "
         f"rig in turn; {turns} turns of {updates} updates alone and {updates} under views. Medians, with the 95th "
         f"percentile in parentheses.\n\n{table(rows)}\n"
     )

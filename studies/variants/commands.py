@@ -9,7 +9,7 @@ import typer
 
 from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
-from studies.options import Again, Captures, Changes, Page, write_page
+from studies.options import Again, Captures, Changes, Page, show
 
 
 @with_capture_options
@@ -30,18 +30,14 @@ def variants(
     variant: Annotated[list[str] | None, typer.Option(help="Measure only this variant; default: all.")] = None,
     seed: Annotated[list[int] | None, typer.Option(min=0, help="Seed of the updates. May be repeated.")] = None,
     frames: Annotated[int | None, typer.Option(min=2, help="Maximum number of frames per variant.")] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Screen quickly, with half the pixels and six updates.")
-    ] = False,
     again: Again = False,
     page: Page = None,
 ) -> None:
     """Compares settings on variants of captures, such as reversed frames, or half the frames, cameras or pixels.
 
-    Reports the gain of each contender over the first on every variant, and how often the contender is behind. For each
-    capture, it also reports the gain of the contender that wins on all other captures.
+    Reports the gain of each contender over the first on every variant, and how often the contender is behind.
 
-    Example: scripts/bench variants captures/robot captures/wheel --contender scas4d --contender adaptive --quick
+    Example: scripts/bench variants captures/robot captures/wheel --contender scas4d --contender adaptive --frames 7
     """
     from studies.variants.screen import Contender, run
     from studies.variants.variants import VARIANTS
@@ -62,11 +58,10 @@ def variants(
         variants=variant or (),
         seeds=seed or (0,),
         frames=frames,
-        quick=quick,
         again=again,
         options=options,
     )
-    write_page(page, text)
+    show(text, page)
 
 
 @with_capture_options
@@ -92,14 +87,12 @@ def gaps(
     scale = settings.scene.image_scale
     jobs = [(options.open(path), open_measured(path, options, image_scale=scale), settings) for path in captures]
     text = run(jobs, frames, step, queue, typer.echo)
-    typer.echo(text)
-    write_page(page, text)
+    show(text, page)
 
 
 def confidence(
     captures: Captures,
     out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/confidence"),
-    scale: Annotated[float, typer.Option(min=0.01, max=1, help="Scale of the images.")] = 0.5,
     page: Page = None,
 ) -> None:
     """Fits the confidence of tracks on captures with known tracks, and reports its calibration on the one left out.
@@ -112,6 +105,5 @@ def confidence(
 
     if len(captures) < 2:
         raise typer.BadParameter("pass at least two captures, because one is left out", param_hint="CAPTURE...")
-    text = run(captures, out, scale)
-    typer.echo(text)
-    write_page(page, text)
+    text = run(captures, out)
+    show(text, page)

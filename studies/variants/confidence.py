@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from client.cli.scores import Column, Row, markdown
 from scas4d_core.captures import Capture, open_capture
 from scas4d_core.gaussians import moving_extent
 from scas4d_core.metrics import calibration_error
@@ -29,6 +30,8 @@ Float = NDArray[np.float64]
 
 PLAYED = ("as it is", "backwards")
 """Variants of each capture; the second has the second seed."""
+SCALE = 0.5
+"""Scale of the images."""
 SAMPLE = 4000
 """Maximum number of positions of a run that are used, chosen at random. All runs count equally."""
 BINS = 5
@@ -37,15 +40,15 @@ SMALLEST = 1e-4
 """Probability to which estimates are clipped in the loss."""
 
 
-def run(captures: Sequence[Path], out: Path, scale: float) -> str:
+def run(captures: Sequence[Path], out: Path) -> str:
     """Measures the runs that are not in the folder ``out``, and returns the report as Markdown."""
     out.mkdir(parents=True, exist_ok=True)
     runs: dict[str, list[Float]] = {}
     for capture in captures:
         for seed, variant in enumerate(PLAYED):
-            file = out / f"{capture.name}-{variant.replace(' ', '-')}-{scale:g}.npy"
+            file = out / f"{capture.name}-{variant.replace(' ', '-')}.npy"
             if not file.exists():
-                opened = open_capture(capture, image_scale=scale)
+                opened = open_capture(capture, image_scale=SCALE)
                 rows = measure(opened if seed == 0 else VARIANTS[variant].made(opened), seed)
                 np.save(file, rows)
                 print(f"{file}: {len(rows)} positions")
@@ -115,31 +118,34 @@ def confidence(rows: Float, constants: Float) -> Float:
 def report(runs: dict[str, list[Float]]) -> str:
     """Returns the constants, the calibration error of each capture, left out of the fit, and a reliability table."""
     rng = np.random.default_rng(0)
-    lines = ["| capture, left out | calibration error | mean confidence | correct |", "|---|---|---|---|"]
+    rows: list[Row] = []
     held_out: list[Float] = []
     for name, own in runs.items():
-        constants = fit([rows for other, several in runs.items() if other != name for rows in several])
-        rows = np.concatenate(own)
-        estimate, correct = confidence(rows, constants), rows[:, 3] > 0
-        error = calibration_error(estimate, correct)
-        lines.append(f"| {name} | {error:.3f} | {estimate.mean():.2f} | {correct.mean():.2f} |")
-        held_out.append(np.column_stack([estimate, correct])[rng.permutation(len(rows))[:SAMPLE]])
+        constants = fit([measured for other, several in runs.items() if other != name for measured in several])
+        positions = np.concatenate(own)
+        estimate, correct = confidence(positions, constants), positions[:, 3] > 0
+        rows.append({"name": name, "error": calibration_error(estimate, correct), **_means(estimate, correct)})
+        held_out.append(np.column_stack([estimate, correct])[rng.permutation(len(positions))[:SAMPLE]])
     estimate, correct = np.concatenate(held_out).T
     odds, disagreement, ageing = fit([rows for own in runs.values() for rows in own])
-    lines += [
-        "",
-        f"Calibration error over all captures: {calibration_error(estimate, correct > 0):.3f}. With all captures, "
-        f"ODDS = {np.exp(odds):.2f}, DISAGREEMENT = {disagreement:.2f}, AGEING = {ageing:.2f}.",
-        "",
-        "| confidence | positions | mean confidence | correct |",
-        "|---|---|---|---|",
-    ]
-    bin_of = np.minimum((BINS * estimate).astype(int), BINS - 1)
-    for k in range(BINS):
+    bin_of, bins = np.minimum((BINS * estimate).astype(int), BINS - 1), list[Row]()
+    for k in np.unique(bin_of).tolist():
         inside = bin_of == k
-        if inside.any():
-            lines.append(
-                f"| {k / BINS:g} to {(k + 1) / BINS:g} | {100 * inside.mean():.0f}% "
-                f"| {estimate[inside].mean():.2f} | {correct[inside].mean():.2f} |"
-            )
-    return "\n".join(lines)
+        between = {"name": f"{k / BINS:g} to {(k + 1) / BINS:g}", "share": float(inside.mean())}
+        bins.append(between | _means(estimate[inside], correct[inside]))
+    means = (Column("mean confidence", "confidence"), Column("correct", "correct"))
+    left_out = markdown(
+        rows, (Column("capture, left out", "name"), Column("calibration error", "error", ".3f"), *means)
+    )
+    return "\n\n".join(
+        [
+            left_out,
+            f"Calibration error over all captures: {calibration_error(estimate, correct > 0):.3f}. With all captures, "
+            f"ODDS = {np.exp(odds):.2f}, DISAGREEMENT = {disagreement:.2f}, AGEING = {ageing:.2f}.",
+            markdown(bins, (Column("confidence", "name"), Column("positions", "share", ".0%"), *means)),
+        ]
+    )
+
+
+def _means(estimate: Float, correct: NDArray[Any]) -> Row:
+    return {"confidence": float(estimate.mean()), "correct": float(correct.mean())}

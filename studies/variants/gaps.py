@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from client.cli.evaluate import Report
+from client.cli.scores import Column, Row, markdown
 from client.wire import Budget
 from scas4d_core.captures import Capture
 from scas4d_core.first_frame.static_result import StaticResult
@@ -167,30 +168,31 @@ def measure(
     return GapResult(truth.name, full, [gaps, shorter, policy])
 
 
+COLUMNS = (
+    Column("capture", "capture"),
+    Column("run", "name"),
+    Column("frames", "frames", "d"),
+    Column("mean difference, dB", "mean", "+.2f"),
+    Column("worst frame", "worst", "+.2f"),
+    Column("lost parts", "lost", ".0f"),
+    Column("track error, %", "track"),
+)
+
+
 def page(results: Sequence[GapResult], step: int) -> str:
     """Returns the results as a Markdown table."""
-    lines = [
-        f"Updates that take as long as {step} frames, compared with updates of all frames:",
-        "",
-        "| capture | run | frames | mean difference (worst frame), dB | lost parts | track error, % |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows: list[Row] = []
     for one in results:
         for run in (one.full, *one.runs):
             off = one.differences(run)
-            lines.append(
-                f"| {one.capture} | {run.name} | {len(off)} | {statistics.fmean(off):+.2f} ({min(off):+.2f}) | "
-                f"{_number(run.lost, '.0f')} | {_number(run.track, '.2f')} |"
-            )
-    lines += ["", f"Captures within {TARGET_DB} dB and without further lost parts:"]
+            figures = {"frames": len(off), "mean": statistics.fmean(off), "worst": min(off)}
+            rows.append({"capture": one.capture, **vars(run), **figures})
+    lines = [f"Updates that take as long as {step} frames, compared with updates of all frames:", ""]
+    lines += [markdown(rows, COLUMNS), "", f"Captures within {TARGET_DB} dB and without further lost parts:"]
     for place, name in enumerate(run.name for run in results[0].runs):
         reached = sum(one.reached(one.runs[place]) for one in results)
         lines.append(f"- {name}: {reached} of {len(results)}")
     return "\n".join(lines)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
 
 
 def run(

@@ -1,4 +1,4 @@
-"""Page of the variants study: gains of the contenders, and cross-validation over captures."""
+"""Page of the variants study: gains of the contenders."""
 
 from __future__ import annotations
 
@@ -53,28 +53,7 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
             f"not behind on {np.mean(gains > BEHIND_DB):.0%} of {len(both)}; "
             f"worst {gains[worst]:+.2f} dB ({', '.join(both[worst])}).",
         ]
-    if len(others) > 1:
-        lines += ["", *left_out(figures, places, contenders)]
     return "\n".join(lines)
-
-
-def left_out(figures: Figures, places: Sequence[Place], contenders: Sequence[str]) -> list[str]:
-    """Returns the lines of a Markdown table for cross-validation, with one row per capture.
-
-    Each row contains the contender that wins on all other captures, and its gain on this one.
-    """
-    lines = ["| left out | chosen without it | gains on it dB |", "|---|---|---|"]
-    first = contenders[0]
-    for capture in dict.fromkeys(place[0] for place in places):
-        rest = [place for place in places if place[0] != capture]
-        own = [place for place in places if place[0] == capture]
-        whole = [name for name in contenders if all((place, name) in figures for place in (*rest, *own))]
-        if not rest or not whole:
-            continue
-        best = max(whole, key=lambda name: np.mean([gain(figures, place, name, first) for place in rest]))
-        gained = float(np.mean([gain(figures, place, best, first) for place in own]))
-        lines.append(f"| {capture} | {best} | {gained:+.2f} |")
-    return lines
 
 
 def gain(figures: Figures, place: Place, name: str, first: str) -> float:

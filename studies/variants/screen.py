@@ -1,8 +1,7 @@
 """``scripts/bench variants``: compares contenders for the default settings on variants of captures.
 
-Every row (capture, variant, contender, seed) runs in a separate process and stays on disk, like the rows of
-``scripts/bench quality``. The contenders alternate row by row, so that they are timed within the same minutes.
-Contenders with the same settings for frame 0 share one frame 0.
+Every row (capture, variant, contender, seed) runs in a separate process and stays on disk. The contenders alternate row
+by row, so that they are timed within the same minutes. Contenders with the same settings for frame 0 share one frame 0.
 """
 
 from __future__ import annotations
@@ -22,11 +21,6 @@ from studies.quality.settings import settings_of
 from studies.variants.page import page
 from studies.variants.variants import VARIANTS
 
-QUICK = ("half the pixels", "backwards", "every second", "half the cameras")
-"""Variants of the quick screening, all at half the pixels."""
-QUICK_FRAMES = 7
-"""Number of frames in the quick screening. The first updates are the most decisive."""
-QUICK_CHANGES = ("scene.image_scale=0.5",)
 CONSTANTS = "scas4d_core."
 """Prefix of the changes that set a constant of the method."""
 
@@ -106,36 +100,23 @@ def run(
     variants: Sequence[str] = (),
     seeds: Sequence[int] = (0,),
     frames: int | None = None,
-    quick: bool = False,
     again: bool = False,
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> str:
     """Measures every contender on every variant of every capture, writes ``out/variants.md`` and returns its text.
 
-    Args:
-        captures: capture folders.
-        contenders: settings to compare; the first is the baseline.
-        out: folder for rows and frames 0; a second call with the same folder resumes the study.
-        variants: names from ``VARIANTS``; if empty, all of them or those of the quick screening.
-        seeds: seeds for the updates; frame 0 always uses the first one.
-        frames: maximum number of frames per variant.
-        quick: whether to run only the quick screening; see ``QUICK``.
-        again: whether to repeat rows that are already on disk.
-        options: options for reading the captures.
-        report: callback that prints progress messages.
+    For the arguments, see ``scripts/bench variants --help``.
 
     Raises:
         ValueError: a preset or setting is unknown, or a value is out of range.
     """
-    variants = variants or (QUICK if quick else tuple(VARIANTS))
-    frames = frames or (QUICK_FRAMES if quick else None)
     jobs, places = list[VariantJob](), list[Row]()
     for capture in captures:
-        for of in variants:
+        for of in variants or VARIANTS:
             for seed in seeds:
                 for contender in contenders:
-                    own = (*VARIANTS[of].changes, *(QUICK_CHANGES if quick else ()), f"static.seed={seeds[0]}")
+                    own = (*VARIANTS[of].changes, f"static.seed={seeds[0]}")
                     settings = settings_of(contender.preset, None, seed, (*own, *contender.changes))
                     job = VariantJob(
                         Path(capture), contender.preset, settings, frames, pictures=(), options=options,
@@ -146,5 +127,4 @@ def run(
     measured = run_jobs(jobs, out, again=again, report=report)
     text = page([row | place for row, place in zip(measured, places, strict=True)], [one.name for one in contenders])
     (out / "variants.md").write_text(text + "\n")
-    report(text)
     return text

@@ -60,7 +60,7 @@ def test_it_says_what_to_do_where_a_package_is_missing(tmp_path: Path, missing: 
 def test_without_a_set_up_it_says_so(tmp_path: Path) -> None:
     (tmp_path / "scripts").mkdir()
     (tmp_path / "scripts" / "bench").write_text((ROOT / "scripts" / "bench").read_text())
-    command = ["sh", tmp_path / "scripts" / "bench", "quality"]
+    command = ["sh", tmp_path / "scripts" / "bench", "targets"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S)
     assert done.returncode == 1
     assert "scripts/setup dev" in done.stderr

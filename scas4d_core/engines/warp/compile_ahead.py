@@ -1,4 +1,4 @@
-"""Compilation of all GPU kernels without a GPU, to check the kernels and report their resource usage."""
+"""Compilation of all GPU kernels without a GPU, to check the kernels."""
 
 from __future__ import annotations
 
@@ -24,17 +24,16 @@ def kernel_modules() -> list[wp.Module]:
     return [modules[name] for name in sorted(modules)]
 
 
-def compile_ahead(architecture: int, folder: Path, ptx: bool = False) -> list[Path]:
+def compile_ahead(architecture: int, folder: Path) -> list[Path]:
     """Compiles all kernels for a GPU architecture, and returns the paths of the compiled files.
 
     Args:
         architecture: compute capability times 10, such as 90.
         folder: output folder.
-        ptx: whether to write PTX (the input of ``ptxas``) instead of machine code.
 
     Raises:
         RuntimeError: if a kernel does not compile.
     """
     for module in kernel_modules():
-        wp.compile_aot_module(module, device=None, arch=architecture, module_dir=str(folder), use_ptx=ptx)
-    return sorted(folder.glob(f"*.sm{architecture}.{'ptx' if ptx else 'cubin'}"))
+        wp.compile_aot_module(module, device=None, arch=architecture, module_dir=str(folder), use_ptx=False)
+    return sorted(folder.glob(f"*.sm{architecture}.cubin"))

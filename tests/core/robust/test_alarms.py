@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_cases.footage import SyntheticFootage
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effect_names import EFFECTS
@@ -33,7 +34,6 @@ from scas4d_core.robust.alarms import (
 )
 from scas4d_core.robust.lens_dirt import SHARE, STATIC_SHARE, ShiftedRegion
 from scas4d_core.robust.outliers import LAST_DB, NEAR_DB, NEW_DB, Past
-from studies.hard_frames.footage import SyntheticFootage
 
 NAMES = [f"c{k}" for k in range(10)]
 SHARP = dict.fromkeys(NAMES, -0.3)

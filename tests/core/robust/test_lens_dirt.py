@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from box_scene import MOVING, make_box, make_rig, take_frame
+from frame_cases.footage import SyntheticFootage
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -18,7 +19,6 @@ from scas4d_core.robust import confirmed_errors
 from scas4d_core.robust.confirmed_errors import CellErrors, ImageErrors
 from scas4d_core.robust.lens_dirt import FEWEST_CAMERAS, SHARE, STATIC_SHARE, ShiftedRegion, shifted_region
 from scas4d_core.update.view_factory import ViewFactory
-from studies.hard_frames.footage import SyntheticFootage
 
 RIG = make_rig()
 BOX = make_box()

@@ -7,6 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from frame_cases import footage as frames_footage
+from frame_cases.footage import SyntheticFootage
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effect_names import Mode
@@ -19,8 +21,6 @@ from scas4d_core.robust.checks import ALIKE, EXPOSURE, light_continues, record_b
 from scas4d_core.robust.outliers import Past
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
-from studies.hard_frames import footage as frames_footage
-from studies.hard_frames.footage import SyntheticFootage
 
 pytestmark = pytest.mark.slow
 

@@ -8,6 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from frame_cases.footage import ANGLE, SyntheticFootage
+from frame_cases.scene import BALL, GOES, first_state, gone
 
 from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
@@ -27,8 +29,6 @@ from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import AttemptOptions
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.view_factory import ViewFactory
-from studies.hard_frames.footage import ANGLE, SyntheticFootage
-from studies.hard_frames.scene import BALL, GOES, first_state, gone
 
 FOOTAGE = SyntheticFootage()
 BEFORE = first_state(resting_may_move=False)

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from box_scene import take_frame
+from frame_cases.footage import SyntheticFootage
+from frame_cases.scene import first_state, gone
 
 from scas4d_core.cameras import Rig
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -30,8 +32,6 @@ from scas4d_core.update.parts import NOTHING, Arrays
 from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
-from studies.hard_frames.footage import SyntheticFootage
-from studies.hard_frames.scene import first_state, gone
 
 FOOTAGE = SyntheticFootage()
 RIG: Rig = FOOTAGE.rig

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_cases.footage import SyntheticFootage, shown_out_of_step
 
 from scas4d_core.engines.renderer import extrapolated
 from scas4d_core.frame_outcome import Candidate, FrameOutcome, timing_warnings
@@ -29,8 +30,6 @@ from scas4d_core.robust.timing import (
 )
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
-from studies.hard_frames.footage import SyntheticFootage
-from studies.hard_frames.out_of_step import shown_out_of_step
 
 FOOTAGE = SyntheticFootage()
 APART_BY = {"c3": 0.5, "c7": -0.5}
@@ -249,3 +248,14 @@ def test_moments_move_what_moves_alone() -> None:
     np.testing.assert_allclose(back.means[0], [0.1, 0, 2], atol=1e-6)
     np.testing.assert_allclose(ahead.factors[0], 2.5 * before.factors[0], atol=1e-6)
     assert np.array_equal(ahead.factors[1], now.factors[1])
+
+
+def test_the_synthetic_footage_is_rendered_at_any_moment() -> None:
+    footage = SyntheticFootage()
+    frame, later = footage.frame(3), footage.frame(4)
+    shown = shown_out_of_step(footage, 3, {"c1": 1.0, "c2": 0.0})
+    assert np.array_equal(shown.images["c0"], frame.images["c0"])
+    assert np.array_equal(shown.masks["c1"], later.masks["c1"])
+    assert np.array_equal(shown.masks["c2"], frame.masks["c2"])
+    difference = shown.images["c1"].astype(float) - later.images["c1"]
+    assert difference.std() == pytest.approx(np.sqrt(2) * 3, rel=0.3)  # noise of its own alone

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from frame_cases.scene import first_state, gone
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.checks import (
@@ -19,7 +20,6 @@ from scas4d_core.robust.checks import (
     check_plausible,
 )
 from scas4d_core.update.result import UpdateResult, UpdateTrace
-from studies.hard_frames.scene import first_state, gone
 
 BEFORE = first_state(resting_may_move=True)
 AFTER = gone(BEFORE, 0.05)

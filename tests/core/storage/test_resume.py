@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_cases import cases as frames
+from frame_cases.cases import Sent, each
+from frame_cases.footage import SyntheticFootage
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
-from studies.hard_frames import frames
-from studies.hard_frames.footage import SyntheticFootage
-from studies.hard_frames.frames import Sent, each
 
 FOOTAGE = SyntheticFootage()
 AT = 2

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import httpx
 import pytest
+from attack import attack
 from peers import HOST, SHORT, Peer, parsed
 from prometheus_client.parser import text_string_to_metric_families
 from running import Running, fake_settings, make_rig, pictures, problem
 from waiting import HANG_S, wait_for
 
 from client.sdk import Client
-from studies.service import strangers
-from studies.service.attack import attack
 
 TOKEN = "a-token-of-thirty-two-characters"
 
@@ -99,10 +98,3 @@ def test_a_client_of_a_proxy_on_this_machine_is_not_on_this_machine(tmp_path):
         problem(httpx.get(f"{service.url}/v1/scenes", headers=forwarded, timeout=HANG_S), 403)
     finally:
         service.stop()
-
-
-def test_the_study_tells_a_service_that_holds_from_one_that_does_not():
-    good, bad = strangers.AttackTimes([1.0] * 99, 0, 100, [1.0]), strangers.AttackTimes([900.0] * 99, 3, 400, [1.5])
-    assert strangers.compare(strangers.Attack(), good, good, 20, 0, token=True).reached
-    found = strangers.compare(strangers.Attack(), good, bad, 70, 5, token=False)
-    assert len(found.faults) == 5

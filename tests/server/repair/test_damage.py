@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
+import bit_flips
 import fakes
 import httpx
 import pytest
@@ -18,7 +20,6 @@ from scas4d_core.captures import open_capture
 from server.repair.repair_queue import SENTENCES_KEPT, DamageKind, DamageLog
 from server.repair.scrub import Scrub
 from studies.running import study as of
-from studies.service import faults
 
 ROOT = Path(__file__).parents[3]
 CAPTURE = ROOT / "samples" / "robot"
@@ -327,10 +328,12 @@ def test_sentences_are_bounded_and_counted():
 
 
 def test_flipped_bits_over_everything(tmp_path):
-    capture = open_capture(CAPTURE)
-    study = of.Study(tmp_path, capture, [], {}, fakes.environment())
-    outcome = faults.flipped_bits(study, 3, 1, lambda said: None)
-    assert outcome.faults == []
+    """Another number of bits: `SCAS4D_FLIPPED_BITS=200 scripts/test -n 0 tests/server/repair/test_damage.py -s`."""
+    capture, count = open_capture(CAPTURE), int(os.environ.get("SCAS4D_FLIPPED_BITS", 3))
+    frames = of.encoded_frames(capture, bit_flips.BEFORE + count)
+    found = bit_flips.flips(of.Study(tmp_path, capture, frames, {}, fakes.environment()), count, seed=1)
+    print(dict(found.counts), f"recomputed {found.recomputed}, lost {found.lost}, without a report {found.unreported}")
+    assert found.faults == []
 
 
 @pytest.mark.parametrize("restart", [False, True])

@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 from running import make_rig
+from virtual_clock import run_virtual
 from waiting import Hand
 
 from scas4d_core.presets import preset
@@ -14,7 +15,6 @@ from server.processes.placement import ProcessExit
 from server.storage.layout import SceneFolder
 from server.updates.work_clock import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
 from server.updates.worker_process import WorkerProcess
-from studies.simulation.clock import run_virtual
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The study of accuracy against time on rows made of formulas, and its watch over updates of a small scene."""
+"""The study of accuracy against time on rows made of formulas, and its times."""
 
 import json
 import types
@@ -6,74 +6,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from box_scene import held_out_camera, make_box, make_rig, moved, photograph
 from made_frontier import made_psnr, made_row, made_seconds, made_study
 from PIL import Image
+from plates import write_capture
 from typer.testing import CliRunner
 
 from client.cli.scores import Store
-from scas4d_core.captures import open_capture
-from scas4d_core.first_frame.static_result import StaticResult
-from scas4d_core.metrics import evaluation as measures
 from studies.commands import app
-from studies.frontier import convergence, frontier, timing
-from studies.frontier.frontier import AXES, DEFAULT, Variant, measure_frontier, row_of, variants
+from studies.frontier import frontier, timing
+from studies.frontier.frontier import AXES, DEFAULT, Variant, measure_variants, row_of, variants
 from studies.frontier.page import chosen, equal_table, equal_words, write_page
 from studies.frontier.tradeoff import (
     curve,
     equal_seconds,
     mean_points,
-    of_axis,
     psnr_at,
     read_points,
-    spread,
     undominated,
 )
 from studies.quality import first_frame
-from studies.quality.first_frame import first_frame_key, save_first_frame
-
-FRAMES = 4
-
-
-@pytest.fixture(scope="module")
-def box_capture(tmp_path_factory):
-    """The box on its plate, moved a little every frame, as a capture with one test camera."""
-    folder = tmp_path_factory.mktemp("captures") / "box"
-    boxes = [make_box()]
-    for _ in range(FRAMES - 1):
-        boxes.append(moved(boxes[-1]))
-    for file, cameras in (("train_meta.json", make_rig().cameras), ("test_meta.json", (held_out_camera(),))):
-        names = [c.name for c in cameras]
-        meta = {
-            "w": cameras[0].width,
-            "h": cameras[0].height,
-            "k": [[c.intrinsics.tolist() for c in cameras]] * FRAMES,
-            "w2c": [[c.world_to_camera.tolist() for c in cameras]] * FRAMES,
-            "fn": [[f"{name}/{t:06d}.png" for name in names] for t in range(FRAMES)],
-            "cam_id": [names] * FRAMES,
-        }
-        folder.mkdir(exist_ok=True)
-        (folder / file).write_text(json.dumps(meta))
-        for t, box in enumerate(boxes):
-            for camera in cameras:
-                for kind, image in zip(("ims", "seg"), photograph(box, camera), strict=True):
-                    (folder / kind / camera.name).mkdir(parents=True, exist_ok=True)
-                    Image.fromarray(image).save(folder / kind / camera.name / f"{t:06d}.png")
-    return folder
-
-
-@pytest.fixture
-def with_frame_0(box_capture, tmp_path):
-    """A study that holds frame 0 of the box, exact, for every setting with the usual frame 0."""
-    file = tmp_path / "first" / f"{first_frame_key(open_capture(box_capture), DEFAULT.settings)}.npz"
-    save_first_frame(file, StaticResult(make_box(), {}, [0.1]), 1.0)
-    return tmp_path
 
 
 def test_every_setting_is_another_and_the_default_comes_first():
     everything = variants()
     assert everything[0] == DEFAULT
-    settings = [(json.dumps(v.record, sort_keys=True), v.whole) for v in everything]
+    settings = [json.dumps(v.record, sort_keys=True) for v in everything]
     assert len(set(settings)) == len(settings)
     assert {len(v.settings.update.clusters) for v in AXES["layers"]} == {1, 2, 4, 5}  # the default has three
     assert [v.settings.update.clusters[0] for v in AXES["clusters"]] == [16, 32, 48]
@@ -83,10 +40,7 @@ def test_every_setting_is_another_and_the_default_comes_first():
     assert [(v.settings.update.covariance, v.settings.update.deltas_start) for v in (DEFAULT, *AXES["covariance"])] == [
         ("entangled", 0.4), ("separate", 0.0),
     ]  # fmt: skip
-    seeds = AXES["seeds"]
-    assert {(v.settings.static.seed, v.settings.update.seed) for v in seeds} == {(0, 1), (0, 2)}
-    assert variants(["iterations"], most_iterations=25)[0] == DEFAULT
-    assert max(v.iterations for v in variants(["iterations"], most_iterations=25)[1:]) == 25
+    assert variants(["iterations"])[0] == DEFAULT
     with pytest.raises(ValueError, match="unknown axis 'layer'; choose from iterations"):
         variants(["layer"])
 
@@ -101,9 +55,8 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
     asked = []
     monkeypatch.setattr(frontier, "run_jobs", lambda jobs, out, report: asked.extend(jobs) or [])
     lines: list[str] = []
-    measure_frontier(
-        [tmp_path / "robot"], tmp_path / "out", ["iterations"], updates=5, most_iterations=100, report=lines.append
-    )
+    chosen = [variant for variant in AXES["iterations"] if variant.iterations <= 100]
+    measure_variants([tmp_path / "robot"], chosen, tmp_path / "out", updates=5, report=lines.append)
     done = [(job.preset, job.settings.update.iterations, job.frames) for job in asked]
     assert done == [
         ("scas4d", 10, 6),
@@ -122,15 +75,6 @@ def test_a_varied_constant_is_another_row():
     assert varied.record["constants"] == {"scas4d_core.engines.plan.MAX_SCALE": 2.0}
     rows = [made_row(DEFAULT, "robot", 5), made_row(varied, "robot", 5)]
     assert (row_of(rows, DEFAULT, "robot", 5), row_of(rows, varied, "robot", 5)) == (rows[0], rows[1])
-
-
-def test_a_whole_capture_is_another_row_than_its_first_updates():
-    whole = next(v for v in AXES["drift"] if v.label == DEFAULT.label)
-    rows = [made_row(DEFAULT, "robot", 5), made_row(whole, "robot", 5)]
-    assert row_of(rows, whole, "robot", 5) is rows[1]
-    assert row_of(rows, DEFAULT, "robot", 5) is rows[0]
-    assert row_of(rows, DEFAULT, "robot", 9) is None
-    assert row_of(rows, DEFAULT, "wheel", 5) is None
 
 
 def test_dominated_is_what_is_no_faster_and_no_better(tmp_path):
@@ -171,44 +115,32 @@ def frontier_lead(one, lead):
 
 def test_seconds_are_those_measured_in_turns_where_there_are_any(tmp_path):
     made_study(tmp_path, ("robot", "wheel"), axes=("iterations",))
-    entry = {
-        "settings": Variant("", seed=7).settings.model_dump(mode="json"),  # seeds do not change the time
-        "seconds": 0.125,
-        "cpu_seconds": 0.25,
-        "stages": {"render": 0.1},
-    }
+    entry = {"settings": DEFAULT.record, "seconds": 0.125, "stages": {"render": 0.1}}
     (tmp_path / "timing").mkdir()
     (tmp_path / "timing" / "robot.json").write_text(json.dumps({"settings": [entry]}))
     points = read_points(tmp_path, ["robot", "wheel"], 5)
-    timed = {p.capture: p for p in points if p.variant == DEFAULT}
-    assert (timed["robot"].seconds, timed["robot"].cpu_seconds, timed["robot"].timed) == (0.125, 0.25, True)
-    assert (timed["wheel"].seconds, timed["wheel"].timed) == (made_seconds(DEFAULT), False)
+    seconds = {p.capture: p.seconds for p in points if p.variant == DEFAULT}
+    assert seconds == {"robot": 0.125, "wheel": made_seconds(DEFAULT)}
     (beside,) = [p for p in points if p.capture == "robot" and p.variant.label == "scas4d 300"]
     assert beside.seconds == pytest.approx(3 * 0.125)  # not timed itself: as its row is to the default's
-    assert not beside.timed
     assert sum(beside.stages.values()) == pytest.approx(beside.seconds / 7)  # as its row's were of its row's seconds
     (mean,) = [p for p in mean_points(points, ["robot", "wheel"]) if p.variant == DEFAULT]
     assert mean.seconds == pytest.approx((0.125 + made_seconds(DEFAULT)) / 2)
-    assert mean.cpu_seconds == pytest.approx((0.25 + made_seconds(DEFAULT)) / 2)
-    assert not mean.timed
     Store(tmp_path).put(made_row(DEFAULT, "wheel", 5, machine={"system": "Linux", "threads": 2}))
     (on_two,) = [p for p in read_points(tmp_path, ["wheel"], 5) if p.variant == DEFAULT]
     assert on_two.seconds == pytest.approx(7 * made_seconds(DEFAULT))  # two threads: the wall clock
 
 
 def test_a_mean_needs_the_row_of_every_capture(tmp_path):
-    store = made_study(tmp_path, ("robot",), axes=("iterations", "seeds"))
+    store = made_study(tmp_path, ("robot",), axes=("iterations",))
     store.put(made_row(DEFAULT, "cloth", 5))
-    points = read_points(tmp_path, ["robot", "cloth"], 5)
-    (mean,) = mean_points(points, ["robot", "cloth"])
+    (mean,) = mean_points(read_points(tmp_path, ["robot", "cloth"], 5), ["robot", "cloth"])
     assert mean.variant == DEFAULT
     assert mean.scores["parts_ari"] == pytest.approx(0.02 * made_psnr(DEFAULT))  # cloth has no parts
-    assert spread(points, "scas4d", "robot") == (pytest.approx(0.2), 3)
-    assert spread(points, "scas4d", "cloth") is None
 
 
 def test_the_choice_follows_its_rules(tmp_path):
-    made_study(tmp_path, ("robot",), axes=("iterations", "seeds"))
+    made_study(tmp_path, ("robot",), axes=("iterations",))
     found = chosen(read_points(tmp_path, ["robot"], 5))
     assert {purpose: point.variant.label for purpose, point in found.items()} == {
         "preview": "scas4d 50",  # loses 2.9 dB, 25 iterations lose 6.3
@@ -221,17 +153,12 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
     made_study(tmp_path / "study", ("robot", "cloth"))
     (tmp_path / "robot").mkdir()
     (tmp_path / "cloth").mkdir()
-    curves = [{"label": "scas4d 10", "preset": "scas4d", "iterations": [0, 5, 10], "psnr": [20.0, 24.0, 26.0]}]
-    (tmp_path / "study" / "convergence").mkdir()
-    (tmp_path / "study" / "convergence" / "cloth.json").write_text(
-        json.dumps({"capture": "cloth", "updates": 5, "curves": curves})
-    )
     page = tmp_path / "docs" / "page.md"
     command = ["frontier", str(tmp_path / "robot"), str(tmp_path / "cloth"), "--out", str(tmp_path / "study")]
     done = CliRunner().invoke(app, [*command, "--only", "page", "--page", str(page)])
     assert done.exit_code == 0, done.output
     text = page.read_text()
-    for name in ("frontier", "captures", "convergence", "drift", "stages"):
+    for name in ("frontier", "captures", "stages"):
         assert f"(page/{name}.png)" in text
         with Image.open(tmp_path / "docs" / "page" / f"{name}.png") as picture:
             colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
@@ -244,10 +171,9 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
         assert f"| {label} |" in table
         assert "| scas4d 100 |" in table
     assert f"| scas4d 100 | 1.00 | 1.00 | {made_psnr(DEFAULT):.2f} |" in text
-    assert "`scas4d` robot 0.20, cloth 0.20 (3 seeds)" in text
     refused = CliRunner().invoke(app, [*command, "--only", "plots"])
     assert refused.exit_code == 2
-    assert "choose from rows, times, convergence, page" in " ".join(refused.output.replace("│", " ").split())
+    assert "choose from rows, times, page" in " ".join(refused.output.replace("│", " ").split())
 
 
 def test_a_page_of_nothing_says_what_to_do(tmp_path):
@@ -255,7 +181,8 @@ def test_a_page_of_nothing_says_what_to_do(tmp_path):
         write_page(tmp_path, ["robot"], tmp_path / "page.md")
 
 
-def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capture, tmp_path, monkeypatch):
+def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(tmp_path, monkeypatch):
+    capture = write_capture(tmp_path / "plates")  # of four frames
     took: list[str] = []
     now = [0.0]
 
@@ -277,71 +204,16 @@ def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capt
         lambda capture, settings, out: Paced(settings.update.iterations, paces[settings.update.iterations]),
     )
     monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
-    seeded = Variant("the same", iterations=10, seed=3)
-    row = timing.measure_times(box_capture, [short, long, seeded], tmp_path, rounds=5, report=lambda line: None)
+    row = timing.measure_times(capture, [short, long], tmp_path, report=lambda line: None)
     assert took == ["10:1", "1000:1", "1000:2", "10:2", "10:3"]
     assert row["rounds"] == 2  # the capture has no more frames
-    assert row == timing.read_times(tmp_path, "box")
-    one, other = row["settings"]
-    assert (one["seconds_each"], one["seconds"], one["ratio"]) == ([2.0, 3.0], 2.5, 1.0)
-    assert (other["seconds_each"], other["ratio"], other["gaussians"]) == ([6.0], 3.0, 7)
-    assert timing.time_of(row, seeded)["label"] == "short"
+    assert row == timing.read_times(tmp_path, "plates")
+    assert [entry["seconds"] for entry in row["settings"]] == [2.5, 6.0]
+    assert timing.time_of(row, short)["label"] == "short"
     assert timing.time_of(row, DEFAULT) is None
     paces[short.settings.update.iterations] = 2.0  # a busier machine
-    alone = timing.measure_times(box_capture, [short], tmp_path, rounds=5, report=lambda line: None)
+    alone = timing.measure_times(capture, [short], tmp_path, report=lambda line: None)
     kept = alone["settings"][1]
-    assert (kept["label"], kept["seconds"], kept["ratio"]) == ("long", 12.0, 3.0)
-    assert kept["stages"] == {"render": 6.0}
-    timing.measure_times(box_capture, [long], tmp_path, rounds=5, report=lambda line: None)
-    assert len(timing.read_times(tmp_path, "box")["settings"]) == 1  # nothing to compare by
-    with pytest.raises(ValueError, match="rounds must be at least 1; got 0"):
-        timing.measure_times(box_capture, [short], tmp_path, rounds=0)
-
-
-def test_watching_an_update_does_not_change_it(box_capture, with_frame_0):
-    short = Variant("scas4d 12", "scas4d", 12)
-    row = convergence.measure_convergence(
-        box_capture, with_frame_0, updates=2, variants=[short], report=lambda line: None
-    )
-    (drawn,) = row["curves"]
-    assert drawn["iterations"] == [0, 1, 2, 4, 7, 10, 12]
-    assert drawn["psnr"][-1] > drawn["psnr"][0] + 1
-    capture = open_capture(box_capture)
-    unwatched = first_frame.started(capture, convergence.once(short.settings), with_frame_0)
-    ends = []
-    for index in (1, 2):
-        unwatched.step(capture.frame(index))
-        ends.append(measures.measure_pictures(unwatched, capture, index)[0]["psnr"])
-    assert drawn["psnr"][-1] == pytest.approx(np.mean(ends), abs=1e-9)
-    assert row == convergence.read_convergence(with_frame_0, "box")
-
-
-def test_flicker_is_told_of_pixels_that_show_something_and_stand(monkeypatch):
-    rng = np.random.default_rng(0)
-    true = np.zeros((4, 60, 40, 3), np.uint8)
-    true[:, :, :20] = 120
-    true[1::2, :10, :20] = 160  # changes
-    shown = true / 255.0
-    shown[:, 10:, :20] += rng.choice([-4, 4], size=(4, 1, 1, 1)) / 255  # all still pixels up and down alike
-    shown[1:, :, 30:] = 0.5  # where nothing is, nothing counts
-    camera = types.SimpleNamespace(name="a")
-    capture = types.SimpleNamespace(
-        test_rig=types.SimpleNamespace(cameras=[camera]),
-        test_frame=lambda index: types.SimpleNamespace(images={"a": true[index]}),
-    )
-    scene = types.SimpleNamespace(render=lambda camera, index: types.SimpleNamespace(colour=shown[index]))
-    found = measures.measure_flicker(scene, capture, range(4))
-    assert found["still_pixels"] == 50 * 20
-    assert found["flicker"] == pytest.approx((255 * shown[:, 30, 5, 0]).std())
-    assert found["mtv"] == pytest.approx(100 * np.abs(np.diff(shown[:, 30, 5, 0])).mean())
-    assert found["mtv"] > 1
-    monkeypatch.setattr(measures, "MIN_STILL", 1001)
-    few = measures.measure_flicker(scene, capture, range(4))
-    assert few["flicker"] is None
-    assert few["mtv"] is None
-
-
-def test_the_drift_goes_through_whole_captures(tmp_path):
-    made_study(tmp_path, ("robot",), axes=("drift",))
-    drift = of_axis(read_points(tmp_path, ["robot"], 5), "drift", "robot")
-    assert [len(p.psnr_by_frame) for p in drift] == [24] * len(AXES["drift"])
+    assert (kept["label"], kept["seconds"], kept["stages"]) == ("long", 12.0, {"render": 6.0})
+    timing.measure_times(capture, [long], tmp_path, report=lambda line: None)
+    assert len(timing.read_times(tmp_path, "plates")["settings"]) == 1  # nothing to compare by

@@ -6,11 +6,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from scas4d_core.captures.frame import Frame
-from studies.hard_frames.footage import SyntheticFootage
-from studies.hard_frames.out_of_step import played, shown_out_of_step, summary
+from studies.hard_frames.out_of_step import played, summary
 
 
 class Counted:
@@ -41,17 +39,6 @@ def test_a_capture_is_played_there_and_back_and_a_camera_sees_between_its_frames
     assert all(picture == mask for picture, mask, _ in late)
     assert [b for _, _, b in late] == [2, 4, 2, 0, 2, 4]
     assert [a for a, _, _ in numbers(2, {"a": -1})] == [1, 3, 3, 1, 1, 3]
-
-
-def test_the_synthetic_footage_is_rendered_at_any_moment() -> None:
-    footage = SyntheticFootage()
-    frame, later = footage.frame(3), footage.frame(4)
-    shown = shown_out_of_step(footage, 3, {"c1": 1.0, "c2": 0.0})
-    assert np.array_equal(shown.images["c0"], frame.images["c0"])
-    assert np.array_equal(shown.masks["c1"], later.masks["c1"])
-    assert np.array_equal(shown.masks["c2"], frame.masks["c2"])
-    difference = shown.images["c1"].astype(float) - later.images["c1"]
-    assert difference.std() == pytest.approx(np.sqrt(2) * 3, rel=0.3)  # noise of its own alone
 
 
 def report(**timing: float) -> Any:

@@ -130,10 +130,3 @@ def test_the_page_says_what_was_measured():
     assert "| peak memory | 1500 | MB | < 1500 MB | **missed** |" in text
     assert "448 Gaussians, 2 images of 48×48" in text
     assert "(A Processor, 2 cores, 1 thread used; source version of the core: 0123abcd)" in text
-
-
-def test_too_short_a_run_is_refused(tmp_path):
-    from studies.quality.settings import settings_of
-
-    with pytest.raises(ValueError, match=r"frames must be at least 3, .* got 2"):
-        kernels.study(tmp_path, settings_of("scas4d"), tmp_path, frames=2)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from scas4d_core.effect_names import EFFECTS
 from scas4d_core.settings import Settings
 from studies.quality import effects
 
@@ -24,16 +23,15 @@ def measured(tmp_path_factory):
     return out, first, again, lines
 
 
-def test_an_effect_that_is_off_changes_no_bit_pinned_or_removed(measured):
+def test_an_effect_that_is_off_changes_no_bit_if_pinned(measured):
     _, rows, _, _ = measured
     by_pin = {row["pinned"]: row for row in rows}
-    for pinned in ("leaving off", "leaving removed"):
-        row = by_pin[pinned]
-        assert row["in_auto"] == "off"
-        assert row["same_bits"] == "yes"
-        assert row["gain"] == 0
-        assert row["seconds_ratio"] > 0
-        assert row["updates"] == 2
+    row = by_pin["leaving off"]
+    assert row["in_auto"] == "off"
+    assert row["same_bits"] == "yes"
+    assert row["gain"] == 0
+    assert row["seconds_ratio"] > 0
+    assert row["updates"] == 2
 
 
 def test_effects_that_are_pinned_together_change_the_result(measured):
@@ -51,20 +49,13 @@ def test_what_is_on_disk_is_not_measured_again(measured):
     out, first, again, lines = measured
     assert again == first
     assert len(list((out / "first").iterdir())) == 1  # all variants start from one frame 0
-    assert "| robot | 0 | leaving removed | off | 2 |" in (out / "effects.md").read_text()
+    assert "| robot | leaving off | off | 2 |" in (out / "effects.md").read_text()
     assert lines[-1] == (out / "effects.md").read_text().rstrip("\n")
-
-
-def test_the_registry_is_as_it_was():
-    before = list(EFFECTS.items())
-    with effects.without({"leaving": "removed", "floor": "off"}):
-        assert list(EFFECTS.items()) == [line for line in before if line[0] != "leaving"]
-    assert list(EFFECTS.items()) == before
 
 
 def test_only_variants_that_the_settings_allow():
     dull = Settings.model_validate({"update": {"rate_static_colour": 0.0}})
-    assert effects.variants(["shadows"], dull) == [{"shadows": "removed"}]
+    assert effects.variants(["shadows"], dull) == []
     assert {"floor": "on"} not in effects.variants(["floor"], Settings())  # no floor is named
     with pytest.raises(ValueError, match="unknown effect 'flour'"):
         effects.variants(["flour"], dull)

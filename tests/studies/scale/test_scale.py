@@ -10,7 +10,7 @@ import pytest
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.scale import scale
-from studies.synthetic.wall import Size, known, rig, shown, wall
+from studies.wall import Size, known, rig, shown, wall
 
 TINY = Size(gaussians=400, width=32, height=24, cameras=3)
 
@@ -48,20 +48,12 @@ def test_frame_0_shows_what_was_photographed() -> None:
 def test_sizes_are_measured_once_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale, "SWEEPS", {"cameras": [TINY]})
     said: list[str] = []
-    found = scale.run(tmp_path, ["cameras"], [2, 4], said.append)
-    (one,) = found["sweeps"]["cameras"]
+    found = scale.run(tmp_path, ["cameras"], said.append)
+    (one,) = found["cameras"]
     assert min(one.values()) > 0
-    assert {name: set(sizes) for name, sizes in found["frames"].items()} == {name: {"2", "4"} for name in scale.KEPT}
-    for file in tmp_path.glob("frames_2,4*.json"):
-        file.write_text('{"2": 100, "4": 101}')
-    again = scale.run(tmp_path, ["cameras"], [2, 4], said.append)
-    assert again["sweeps"] == found["sweeps"]
-    assert again["frames"] == {name: {"2": 100, "4": 101} for name in scale.KEPT}
+    monkeypatch.setattr(scale, "in_a_process", pytest.fail)
+    assert scale.run(tmp_path, ["cameras"], said.append) == found
     monkeypatch.setattr(scale, "SWEEPS", {"cameras": [TINY, Size(cameras=6)]})
-    costs = [{"update": 1.0, "view": 0.01, "frame_0": 2.0, "memory": 100.0}] * 2
-    text = scale.summarize({"sweeps": {"cameras": costs}, "frames": {"a folder": {"2": 100}, "the process": {"2": 99}}})
+    text = scale.summarize({"cameras": [{"update": 1.0, "view": 10.0, "frame_0": 2.0, "memory": 100.0}] * 2})
     assert "| 3 | 1.00 | 10 | 2.00 | 100 |" in text
     assert "| **exponent** | **0.00** |" in text
-    assert "| 2 | 100 | 99 |" in text
-    scale.plot({"sweeps": {"cameras": costs}, "frames": {}}, tmp_path / "a.png")
-    assert (tmp_path / "a.png").stat().st_size > 1000

@@ -11,8 +11,6 @@ import pytest
 from scas4d_core.captures import open_capture
 from studies.running import study as of
 from studies.service import faults
-from studies.service.beginnings import beginnings
-from studies.service.strangers import Attack, strangers
 
 ROOT = Path(__file__).parents[3]
 CAPTURE = ROOT / "samples" / "robot"
@@ -43,27 +41,6 @@ def test_states_of_the_fake_depend_on_every_frame(expected):
 def test_kills(study, expected):
     outcome = faults.kills(study, *expected, count=4, seed=1, echo=lambda said: None)
     assert outcome.faults == []
-
-
-def test_kills_while_reconstructions_are_begun_anew(study, expected):
-    outcome = beginnings(study, expected[0], count=3, seed=1, echo=lambda said: None)
-    assert outcome.faults == []
-
-
-def test_cuts_and_flipped_bytes(study, expected):
-    outcome = faults.damaged_log(study, expected[0], cuts=1, flips=2, seed=0, echo=lambda said: None)
-    assert outcome.faults == []
-
-
-def test_a_full_disk(study, expected):
-    assert faults.full_disk(study, expected[0], echo=lambda said: None).faults == []
-
-
-def test_strangers(study):
-    attack = Attack(header=5_000_000, halves=40, uploads=40)  # tests/server/http has it in full
-    found = strangers(study, attack, turns=1, seconds=1, token=False, echo=lambda said: None)
-    # Times of a busy machine are not judged here.
-    assert not [fault for fault in found.faults if "p99" not in fault and "times" not in fault]
 
 
 def test_kills_with_the_method_itself(tmp_path):

@@ -25,7 +25,7 @@ def address(service):
 
 def test_views_are_asked_for_at_their_rate_and_timed(address):
     began, rate = time.perf_counter(), 20.0
-    with Load(address, ["c0", "c1"], rate, 12) as load:
+    with Load(address, ["c0", "c1"], rate) as load:
         wait_for(lambda: len(load.latencies) >= 10)
     assert load.refused == 0
     assert len(load.latencies) <= rate * (time.perf_counter() - began) + 1
@@ -44,7 +44,7 @@ def test_arrivals_do_not_wait_for_answers(address, service, monkeypatch):
         return await ask(query)
 
     monkeypatch.setattr(readers.views, "ask", slow)
-    with Load(address, ["c0"], 10.0, 12) as load:
+    with Load(address, ["c0"], 10.0) as load:
         wait_for(lambda: len(asked) >= 8 and time.perf_counter() - asked[0] > 1)
         opened.set()
     assert load.refused == 0
@@ -53,7 +53,7 @@ def test_arrivals_do_not_wait_for_answers(address, service, monkeypatch):
 
 
 def test_views_without_an_answer_are_counted(address):
-    with Load(address, ["nobody"], 20.0, 12) as load:
+    with Load(address, ["nobody"], 20.0) as load:
         wait_for(lambda: load.refused >= 5)
     assert load.latencies == []
 

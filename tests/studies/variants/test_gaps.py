@@ -55,5 +55,5 @@ def test_the_page_counts_captures_within_the_target():
     result = GapResult("robot", full, [near, far])
     assert result.differences(near) == pytest.approx([-0.2, -0.4])
     text = page([result], step=3)
-    assert "| robot | near | 2 | -0.30 (-0.40) | 1 | 0.20 |" in text
+    assert "| robot | near | 2 | -0.30 | -0.40 | 1 | 0.20 |" in text
     assert text.endswith("- near: 1 of 1\n- far: 0 of 1")

@@ -82,8 +82,8 @@ def row(capture, of, contender, psnr, seconds=1.0, **more):
     }  # fmt: skip
 
 
-def test_the_page_tells_gains_and_what_a_choice_made_elsewhere_gains():
-    """`b` wins on two captures and loses on the third, which would not have chosen it; `c` wins a little everywhere."""
+def test_the_page_tells_gains():
+    """`b` wins on two captures and loses on the third; `c` wins a little everywhere."""
     gains = {"one": (1.0, 0.2), "two": (1.0, 0.2), "three": (-1.2, 0.2)}
     rows = []
     for capture, (b, c) in gains.items():
@@ -92,8 +92,6 @@ def test_the_page_tells_gains_and_what_a_choice_made_elsewhere_gains():
     text = page(rows, ["a", "b", "c"])
     assert "**b**: +0.27 dB at 0.50 × the time; not behind on 67% of 3; worst -1.20 dB (three, later)." in text
     assert "| one | later | 35.00 | 30.00 | – | +1.00; 0.50; – | +0.20; 1.00; – |" in text
-    assert "| three | b | -1.20 |" in text
-    assert "| one | c | +0.20 |" in text
 
 
 def test_a_failed_row_is_left_out_of_the_page():

@@ -29,7 +29,7 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import EFFECTS, Settings
 from scas4d_core.storage.history import History
 from scas4d_core.update.result import UpdateResult
-from studies.synthetic.wall import Size, known, rig, shown, wall
+from studies.wall import Size, known, rig, shown, wall
 from tests.helpers.effect_cases import visited_room
 from tests.helpers.effect_cases.visited_room import psnr as room_psnr
 from tests.helpers.effect_cases.visited_room import scene, seen, visitor

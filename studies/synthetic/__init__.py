@@ -1,1 +1,0 @@
-"""Synthetic scenes with known motion: a ball over a floor, and a wall."""
