@@ -4,7 +4,7 @@ A figure in a page is followed by a comment with its name, such as ``35.7<!-- ro
 many decimals as the number that it replaces. ``robot.date``, ``robot.machine`` and ``robot.command`` can be used as
 well.
 
-PYTHONPATH=. python scripts/figures.py rows out/quality/rows/robot*.json  # records rows of `scripts/bench quality`
+PYTHONPATH=. python scripts/figures.py rows out/evaluate/rows/robot*.json  # records rows of `scas4d evaluate`
 PYTHONPATH=. python scripts/figures.py time tests scripts/test            # runs a command, and records its duration
 PYTHONPATH=. python scripts/figures.py                                    # writes all figures into the pages
 PYTHONPATH=. python scripts/figures.py --check                            # exits with 1 if a page is out of date
@@ -93,16 +93,16 @@ def unrecorded(page: str) -> list[str]:
 
 
 def record_rows(paths: list[Path]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields the name and record of each row of `scripts/bench quality`: the capture and its default preset."""
+    """Yields the capture and record of each row of `scas4d evaluate`, measured on this machine."""
     for path in paths:
         row = json.loads(path.read_text())
         values = {key: row[key] for key in ROW_VALUES if row.get(key) is not None}
         yield (
             row["capture"],
             {
-                "command": f"scripts/bench quality CAPTURES/{row['capture']}",
+                "command": f"scas4d evaluate CAPTURES/{row['capture']}",
                 "date": row["measured"][:10],
-                "machine": in_words(row["machine"]),
+                "machine": in_words(row.get("machine") or machine()),
                 "values": {key: round(value, 4) for key, value in values.items()},
             },
         )

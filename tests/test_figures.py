@@ -77,7 +77,7 @@ def test_rows_and_times_are_recorded(tmp_path: Path) -> None:
     (tmp_path / "robot.json").write_text(json.dumps(row))
     assert dict(figures.record_rows([tmp_path / "robot.json"])) == {
         "robot": {
-            "command": "scripts/bench quality CAPTURES/robot", "date": "2026-12-01", "machine": "AMD EPYC, 2 cores",
+            "command": "scas4d evaluate CAPTURES/robot", "date": "2026-12-01", "machine": "AMD EPYC, 2 cores",
             "values": {"psnr": 35.7481},
         }
     }  # fmt: skip
