@@ -51,19 +51,20 @@ GROW = READ.replace(
 )
 PAINT = """
   const { Painter } = await import('/viewer/splats/painter.js');
-  const { Projector } = await import('/viewer/splats/project.js');
+  const { Sorter } = await import('/viewer/splats/sort.js');
   const { Sequence } = await import('/viewer/splats/sequence.js');
   const { inside, nearOf } = await import('/viewer/splats/rig.js');
   const { place, model } = order;
   const sequence = new Sequence();
   sequence.add(new CompactReader(bytes));
   const canvas = document.createElement('canvas');
-  const [painter, projector] = [new Painter(canvas), new Projector()];
+  const [painter, sorter] = [new Painter(canvas), new Sorter()];
   const camera = inside(model, sequence.head, nearOf(sequence.head));
-  projector.project(sequence.moment(place), camera, { colours: null, depth: false, hidden: null });
-  painter.size(camera.width, camera.height);
-  painter.colours(projector.ellipses, projector.count, sequence.head.background);
-  return { png: canvas.toDataURL('image/png').split(',')[1], at: projector.at(camera.width / 2, camera.height / 2) };
+  const moment = sequence.moment(place);
+  sorter.sort(moment, camera.rows[2], null);
+  painter.project(moment, camera, sorter, "own");
+  painter.colours(sequence.head.background);
+  return { png: canvas.toDataURL('image/png').split(',')[1] };
 }"""
 
 BOUND = """async () => {
