@@ -1,11 +1,13 @@
 // Painting with WebGL2: projection, ellipses from back to front, depth in colours, and trails on top.
 
-import { FLOOR, LEVEL, PAINTS, ROW, TEXELS, programs } from "./programs.js";
+import { FLOOR, LEVEL, PAINTS, ROW, programs } from "./programs.js";
+import { Recent, TEXELS, interleave } from "./texels.js";
 import { joined } from "./trails.js";
 import { DEPTH_RAMP } from "../view/colours.js";
 
 const FEWEST = 4096; // minimum capacity in Gaussians
 const STATES = 3; // states that stay uploaded: those before and after the moment, and the previous one
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const FRAMES_MORE = 32; // spare capacity for frames of trails, since live frames arrive one by one
 
 export class Painter {
@@ -29,13 +31,15 @@ export class Painter {
     this.programs = programs(gl);
     this.plain = gl.createVertexArray();
     this.room = this.count = this.width = this.height = 0;
-    this.states = []; // { state, texture }, least recently used first
     this.table = null; // colours that the `paints` texture has
     this.target = this.ellipses = null;
     this.trails = null;
     this.ramp = this.texture(gl.RGBA8, 256, 1);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, Uint8Array.from(DEPTH_RAMP.flatMap((rgb) => [...rgb, 255])));
     this.one = new Uint8Array(4);
+    const named = gl.getExtension("WEBGL_debug_renderer_info");
+    this.software = SOFTWARE.test(gl.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    this.copy = null; // of a picture painted without WebGL
   }
 
   texture(format, width, height) {
@@ -52,11 +56,11 @@ export class Painter {
     const { gl } = this;
     Object.assign(this, { width, height });
     Object.assign(gl.canvas, { width, height });
-    if (this.target) {
-      gl.deleteFramebuffer(this.target.frame);
-      gl.deleteTexture(this.target.picture);
+    for (const target of [this.target, this.copy]) {
+      gl.deleteFramebuffer(target?.frame ?? null);
+      gl.deleteTexture(target?.picture ?? null);
     }
-    this.target = null;
+    this.target = this.copy = null;
   }
 
   reserve(count) {
@@ -65,13 +69,16 @@ export class Painter {
     const rows = Math.ceil(1.25 * Math.max(count, FEWEST) / ROW);
     if (rows > this.most) throw new Error(`this browser can draw at most ${ROW * this.most} Gaussians`);
     if (this.room) {
-      for (const { texture } of this.states) gl.deleteTexture(texture);
-      for (const texture of [this.order, this.paints, ...this.ellipses.tables]) gl.deleteTexture(texture);
+      for (const texture of [...this.uploaded, this.order, this.paints, ...this.ellipses.tables]) gl.deleteTexture(texture);
       gl.deleteFramebuffer(this.ellipses.frame);
     }
     this.room = rows * ROW;
-    this.texels = new Float32Array(4 * TEXELS * this.room);
-    this.states = Array.from({ length: STATES }, () => ({ state: null, texture: this.texture(gl.RGBA32F, TEXELS * ROW, rows) }));
+    const texels = new Float32Array(4 * TEXELS * this.room);
+    this.uploaded = Array.from({ length: STATES }, () => this.texture(gl.RGBA32F, TEXELS * ROW, rows));
+    this.states = new Recent(this.uploaded, (texture, state) => {
+      interleave(state, texels);
+      this.upload(texture, TEXELS, state.count, gl.RGBA, gl.FLOAT, texels);
+    });
     this.order = this.texture(gl.R32UI, ROW, rows);
     this.paints = this.texture(gl.RGBA8, ROW, rows);
     this.table = null;
@@ -81,28 +88,6 @@ export class Painter {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.ellipses.frame);
     tables.forEach((table, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, attachments[k], gl.TEXTURE_2D, table, 0));
     gl.drawBuffers(attachments);
-  }
-
-  /** Texture of a state, which is uploaded unless it was used recently. */
-  stateTexture(state) {
-    const { gl, states, texels } = this;
-    const place = states.findIndex((one) => one.state === state);
-    const [slot] = states.splice(Math.max(0, place), 1);
-    states.push(slot);
-    if (place >= 0) return slot.texture;
-    const { count, means, factors, colours, opacities, retired } = state;
-    for (let i = 0, to = 0; i < count; i++, to += 4 * TEXELS) {
-      for (let k = 0; k < 3; k++) {
-        texels[to + k] = means[k * count + i];
-        const axis = to + 4 + 4 * k;
-        for (let j = 0; j < 3; j++) texels[axis + j] = factors[(3 * j + k) * count + i];
-        texels[axis + 3] = colours[k * count + i];
-      }
-      texels[to + 3] = retired[i] ? 0 : opacities[i];
-    }
-    this.upload(slot.texture, TEXELS, count, gl.RGBA, gl.FLOAT, texels);
-    slot.state = state;
-    return slot.texture;
   }
 
   /** Uploads the first rows of a texture with some texels per Gaussian. */
@@ -122,11 +107,10 @@ export class Painter {
   project({ from, to, share }, camera, { order, count }, paint) {
     const { gl } = this;
     this.count = count;
-    this.size(camera.width, camera.height);
     if (!count) return;
     this.reserve((to ?? from).count);
-    const before = this.stateTexture(from);
-    const after = to ? this.stateTexture(to) : before;
+    const before = this.states.of(from);
+    const after = to ? this.states.of(to) : before;
     this.upload(this.order, 1, count, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
     if (paint instanceof Uint8Array && paint !== this.table) {
       this.upload(this.paints, 1, this.room, gl.RGBA, gl.UNSIGNED_BYTE, padded(paint, 4 * this.room));
@@ -170,13 +154,7 @@ export class Painter {
   /** Paints the depth of the projected ellipses; `range` of the colours, `nothing` where coverage is below half. */
   depth(range, nothing) {
     const { gl } = this;
-    if (!this.target) {
-      const picture = this.texture(gl.RGBA16F, this.width, this.height);
-      const frame = gl.createFramebuffer();
-      gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
-      this.target = { picture, frame };
-    }
+    this.target ??= this.picture(gl.RGBA16F);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.frame);
     gl.clearColor(0, 0, 0, 0);
     this.blend(true);
@@ -188,6 +166,29 @@ export class Painter {
     gl.uniform2f(places.range, ...range);
     gl.uniform3f(places.nothing, ...nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Framebuffer with a texture of the canvas's size. */
+  picture(format) {
+    const { gl } = this;
+    const picture = this.texture(format, this.width, this.height);
+    const frame = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
+    return { picture, frame };
+  }
+
+  /** Shows RGBA pixels, the uppermost row first. */
+  show(pixels) {
+    const { gl, width, height } = this;
+    this.copy ??= this.picture(gl.RGBA8);
+    gl.bindTexture(gl.TEXTURE_2D, this.copy.picture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.copy.frame);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.blitFramebuffer(0, 0, width, height, 0, height, width, 0, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
   }
 
   blend(deep) {

@@ -1,20 +1,20 @@
 // WebGL2 programs, each with its two shaders.
 
+import { TEXELS } from "./texels.js";
+
 export const ROW = 512; // Gaussians per row of a texture
-export const TEXELS = 4; // texels per Gaussian of a state
 export const FLOOR = Math.log2(255); // a Gaussian is cut off where its alpha is 1/255
 export const LEVEL = 8; // log2 opacity is stored as a share of −LEVEL
 export const PAINTS = { own: 0, white: 1, table: 2 };
-const LOW_PASS = 0.3; // pixels², so that nothing is thinner than about a pixel
-const MARGIN = 0.3; // margin as a share of half the picture's size, beyond which the slope of the projection is clamped
+export const LOW_PASS = 0.3; // pixels², so that nothing is thinner than about a pixel
+export const MARGIN = 0.3; // margin as a share of half the picture's size, beyond which the slope of the projection is clamped
 
 const SCREEN = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
 
 // EWA splatting with the conventions of scas4d_core/rasterize. Each fragment projects one Gaussian to an ellipse, because a
 // vertex shader would do it for every corner. Integer targets, because WebGL2 can render to them without extensions.
-// A state has the centre and opacity of a Gaussian in one texel, and in three more its axes, each with one component of its
-// colour. An ellipse has its centre and half axis (pixels); short/long axis ratio and log2 opacity; colour; depth.
+// An ellipse has its centre and half axis (pixels); short/long axis ratio and log2 opacity; colour; depth.
 const PROJECTION = `#version 300 es
 precision highp float;
 precision highp int;

@@ -5,6 +5,7 @@ import { Painter } from "./painter.js";
 import { CompactReader } from "./reader.js";
 import { inside, nearOf, outside, partColour } from "./rig.js";
 import { Sequence } from "./sequence.js";
+import { Rasterizer } from "./software.js";
 import { Sorter } from "./sort.js";
 import { Ways, Walk } from "./trails.js";
 
@@ -12,7 +13,7 @@ const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // colour in depth pictures wher
 const NO_PART = [90, 96, 104];
 const post = (kind, message = {}) => self.postMessage({ kind, ...message });
 
-const sorter = new Sorter();
+const [sorter, rasterizer] = [new Sorter(), new Rasterizer()];
 const [trailWalk, trackWalk] = [new Walk(), new Walk()];
 const ways = new Ways();
 let painter = null;
@@ -76,12 +77,19 @@ const actions = {
     const [decoded, { mode }] = [performance.now(), look];
     const count = (moment.to ?? moment.from).count;
     sorter.sort(moment, camera.rows[2], covering(count));
-    painter.project(moment, camera, sorter, paintOf(mode, count));
+    painter.size(camera.width, camera.height);
+    const background = mode === "colour" ? look.background ?? head.background : [0, 0, 0];
+    const given = [moment, camera, sorter, paintOf(mode, count)];
     let range = null;
     if (mode === "depth") {
+      painter.project(...given);
       range = painter.range();
       painter.depth(range, NOTHING);
-    } else painter.colours(mode === "colour" ? look.background ?? head.background : [0, 0, 0]);
+    } else if (painter.software) painter.show(rasterizer.paint(...given, background));
+    else {
+      painter.project(...given);
+      painter.colours(background);
+    }
     if (look.trails) painter.paintTrails(camera, place, look.span);
     painter.finish();
     shown = { camera, moment };
@@ -95,6 +103,7 @@ const actions = {
   /** Follows the Gaussian at a point of the last picture. */
   pick({ u, v }) {
     if (!shown) return;
+    painter.project(shown.moment, shown.camera, sorter, "own");
     const place = painter.at(u, v);
     if (place < 0) return post("picked", { row: -1 });
     actions.follow({ row: sorter.order[place] });
