@@ -12,7 +12,7 @@ from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
 from studies.hard_cases.commands import alarms, stability, timing
 from studies.kernels.commands import gpu_kernels, kernels, moving, startup
-from studies.live.commands import live, soak, viewer
+from studies.live.commands import drawing, live, soak, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -41,6 +41,7 @@ STUDIES = {
         live,
         soak,
         viewer,
+        drawing,
         views,
         memory,
         sleeping,

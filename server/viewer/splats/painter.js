@@ -16,7 +16,7 @@ export class Painter {
    * @throws Error if the browser has no WebGL2
    */
   constructor(canvas) {
-    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
+    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
     if (!this.gl) throw new Error("this browser has no WebGL2");
     canvas.addEventListener?.("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener?.("webglcontextrestored", () => this.begin());
@@ -26,7 +26,7 @@ export class Painter {
   /** Creates all WebGL objects; called again after the context was lost. */
   begin() {
     const { gl } = this;
-    this.floats = gl.getExtension("EXT_color_buffer_float") !== null && gl.getExtension("EXT_float_blend") !== null;
+    this.floats = ["EXT_color_buffer_float", "EXT_color_buffer_half_float"].some((name) => gl.getExtension(name) !== null);
     this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.programs = programs(gl);
     this.plain = gl.createVertexArray();
@@ -140,15 +140,17 @@ export class Painter {
   }
 
   /**
-   * Paints the projected ellipses.
+   * Paints the projected ellipses, in half floats if possible, since 8 bits are too few for dozens of layers.
    *
    * @param background [red, green, blue] in [0, 1]
    */
   colours(background) {
     const { gl } = this;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    if (this.floats) this.target ??= this.picture(gl.RGBA16F);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target?.frame ?? null);
     gl.clearColor(...background, 1);
     this.blend(false);
+    if (this.target) this.present(this.target, false);
   }
 
   /** Paints the depth of the projected ellipses; `range` of the colours, `nothing` where coverage is below half. */
@@ -184,11 +186,17 @@ export class Painter {
     this.copy ??= this.picture(gl.RGBA8);
     gl.bindTexture(gl.TEXTURE_2D, this.copy.picture);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.copy.frame);
+    this.present(this.copy, true);
+  }
+
+  /** Copies a picture to the canvas; `down` if its first row is the uppermost. */
+  present({ frame }, down) {
+    const { gl, width, height } = this;
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    gl.blitFramebuffer(0, 0, width, height, 0, height, width, 0, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.blitFramebuffer(0, 0, width, height, 0, down ? height : 0, width, down ? 0 : height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
+    gl.viewport(0, 0, width, height); // of the trails
   }
 
   blend(deep) {
