@@ -145,12 +145,13 @@ def with_count(source: Path, target: Path, count: int) -> None:
         for index in reader.frames:
             state = reader.state(index)
             means = state.means[rows] + np.einsum("nij,nj->ni", state.factors[rows], offsets)
-            names = ("rotations", "colours", "foreground", "opacities", "retired")
+            names = ("rotations", "colours", "foreground", "retired")
             writer.add(
                 index,
                 index / STATES_PER_SECOND,
                 Gaussians.of_points(means.astype(np.float32), radius=0.1).replace(
                     factors=state.factors[rows] * np.float32((known / count) ** 0.5),
+                    opacities=state.own_opacities[rows],
                     **{name: getattr(state, name)[rows] for name in names},
                 ),
             )
@@ -240,10 +241,8 @@ def agreement(source: Path, views: int) -> list[tuple[float, float]]:
     for camera, asked, pair in zip(chosen, orders, answers, strict=True):
         state = states[asked["place"]]
         true = renderer.render(state, camera, head.background, colours=state.colours).colour.clip(0, 1)
-        first, second = (
-            _psnr(np.array(Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")), true) for png in pair
-        )
-        found.append((first, second))
+        shaders, software = (_psnr(png, true) for png in pair)
+        found.append((shaders, software))
     return found
 
 

@@ -32,14 +32,14 @@ export class Painter {
     this.plain = gl.createVertexArray();
     this.room = this.count = this.width = this.height = 0;
     this.table = null; // colours that the `paints` texture has
-    this.target = this.ellipses = null;
-    this.trails = null;
+    this.target = null; // half floats, to blend in
+    this.copy = null; // of pixels that were painted without WebGL
+    this.ellipses = this.trails = null;
     this.ramp = this.texture(gl.RGBA8, 256, 1);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, Uint8Array.from(DEPTH_RAMP.flatMap((rgb) => [...rgb, 255])));
     this.one = new Uint8Array(4);
     const named = gl.getExtension("WEBGL_debug_renderer_info");
     this.software = SOFTWARE.test(gl.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-    this.copy = null; // of a picture painted without WebGL
   }
 
   texture(format, width, height) {
@@ -199,6 +199,7 @@ export class Painter {
     gl.viewport(0, 0, width, height); // of the trails
   }
 
+  /** Blends the ellipses, or their depths in place of red, into the current framebuffer. */
   blend(deep) {
     const { gl, width, height } = this;
     gl.viewport(0, 0, width, height);

@@ -4,7 +4,7 @@ import { ROW } from "./programs.js";
 
 const DIGIT = 11;
 const BUCKETS = 1 << DIGIT;
-const LEVELS = BUCKETS * BUCKETS; // depths, so that a scene of 100 m is sorted to 0.03 mm
+const LEVELS = BUCKETS * BUCKETS; // of depth, each 0.03 mm in a scene of 100 m
 
 export class Sorter {
   constructor() {

@@ -81,7 +81,7 @@ const actions = {
     const background = mode === "colour" ? look.background ?? head.background : [0, 0, 0];
     const given = [moment, camera, sorter, paintOf(mode, count)];
     let range = null;
-    if (mode === "depth") {
+    if (mode === "depth") { // also in software, since it is rarely shown
       painter.project(...given);
       range = painter.range();
       painter.depth(range, NOTHING);
