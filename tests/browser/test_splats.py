@@ -55,7 +55,7 @@ PAINT = """
   const { Sequence } = await import('/viewer/splats/sequence.js');
   const { inside, nearOf } = await import('/viewer/splats/rig.js');
   const { Rasterizer } = await import('/viewer/splats/software.js');
-  const { place, model, software, hiddenPart } = order;
+  const { place, model, software, hiddenPart, ramp } = order;
   const sequence = new Sequence();
   const reader = new CompactReader(bytes);
   sequence.add(reader);
@@ -65,11 +65,12 @@ PAINT = """
   const camera = inside(model, sequence.head, nearOf(sequence.head));
   const moment = sequence.moment(place);
   const { background } = sequence.head;
+  const paint = ramp ? Uint8Array.from({ length: 4 * (moment.to ?? moment.from).count }, (_, k) => k % 251) : 'own';
   sorter.sort(moment, camera.rows[2], hidden);
   painter.size(camera.width, camera.height);
-  if (software) painter.show(new Rasterizer().paint(moment, camera, sorter, "own", background));
+  if (software) painter.show(new Rasterizer().paint(moment, camera, sorter, paint, background));
   else {
-    painter.project(moment, camera, sorter, "own");
+    painter.project(moment, camera, sorter, paint);
     painter.colours(background);
   }
   return { png: canvas.toDataURL('image/png').split(',')[1] };
@@ -252,9 +253,9 @@ def view(number, width, height, scale):
     return {"intrinsics": intrinsics, "world_to_camera": pose, "width": width, "height": height}
 
 
-def painted(page, service, file, place, model, software, hidden_part=None):
+def painted(page, service, file, place, model, software, hidden_part=None, ramp=False):
     """The picture of the page's shaders, or of its software rasterizer."""
-    order = {"place": place, "model": model, "software": software, "hiddenPart": hidden_part}
+    order = {"place": place, "model": model, "software": software, "hiddenPart": hidden_part, "ramp": ramp}
     found = run(page, service, PAINT, file.read_bytes(), order)
     return np.array(Image.open(io.BytesIO(base64.b64decode(found["png"]))).convert("RGB")) / 255
 
@@ -298,8 +299,13 @@ def test_a_place_between_frames_is_between_them(page, service, file, software):
     assert min(off) > 0
 
 
-def test_shaders_and_software_agree_between_frames(page, service, file):
+def test_shaders_and_software_agree_between_frames_and_in_other_colours(page, service, file):
     """Gaussians are born between places 1 and 2, and three retire between 2 and 3."""
-    for place in (1.5, 2.4):
-        shaders, software = (painted(page, service, file, place, view(0, 256, 192, 8), one) for one in (False, True))
+    own = None
+    for place, ramp in [(1.5, False), (2.4, False), (2.4, True)]:
+        shaders, software = (
+            painted(page, service, file, place, view(0, 256, 192, 8), one, ramp=ramp) for one in (False, True)
+        )
         assert psnr(shaders, software) > 44
+        assert own is None or np.abs(shaders - own).max() > 0.1
+        own = shaders
