@@ -12,12 +12,13 @@ from export_cases import bent
 from PIL import Image
 
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.compact import CompactReader
+from scas4d_core.compact import CompactReader, CompactWriter, FileHeader
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.records import RecordKind
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
 from scas4d_core.engines.limits import scene_limits
 from scas4d_core.engines.views import CameraArrays
+from scas4d_core.gaussians import Gaussians
 
 ATTRIBUTES = ("means", "factors", "rotations", "colours", "foreground", "opacities", "retired", "ids")
 PRELUDE = """async ([data, order]) => {
@@ -280,6 +281,20 @@ def test_pictures_agree_with_the_cpu_rasterizer(page, service, file, number, pla
     assert np.abs(mine - true).max() < 0.1
     if hidden_part is not None:
         assert psnr(mine, rendered(file, index, model)) < 35
+
+
+@pytest.mark.parametrize("software", [False, True])
+def test_many_faint_layers_are_not_rounded_away(page, service, tmp_path, software):
+    """Blending in 8 bits reaches only 52 dB here, and 34 dB in scenes with walls."""
+    rig, draw = browser_engine.make_rig(), np.random.default_rng(0)
+    state = Gaussians.of_points(
+        draw.normal(scale=0.4, size=(3000, 3)), radius=0.2, colours=draw.uniform(size=(3000, 3))
+    )
+    with CompactWriter(tmp_path / "faint.s4d", FileHeader(rig.world_frame(2.0), rig=rig)) as writer:
+        writer.add(0, 0.0, state.replace(opacities=draw.uniform(0.02, 0.05, size=3000).astype(np.float32)))
+    model = view(0, 256, 192, 8)
+    mine = painted(page, service, writer.path, 0, model, software)
+    assert psnr(mine, rendered(writer.path, 0, model)) > 58
 
 
 @pytest.mark.parametrize("software", [False, True])
