@@ -11,7 +11,7 @@ from studies.frontier.commands import frontier
 from studies.gpu.commands import gpu_check
 from studies.hard_frames.commands import alarms, timing
 from studies.kernels.commands import kernels
-from studies.live.commands import live, viewer
+from studies.live.commands import drawing, live, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -36,6 +36,7 @@ STUDIES = {
         ingest,
         live,
         viewer,
+        drawing,
         views,
         memory,
     ),

@@ -1,4 +1,4 @@
-"""The commands `scripts/bench live` and `viewer`."""
+"""The commands `scripts/bench live`, `viewer` and `drawing`."""
 
 from __future__ import annotations
 
@@ -53,4 +53,25 @@ def viewer(
 
     need_server()
     text = report(run(folder, frames, fps, work), fps)
+    show(text, out)
+
+
+def drawing(
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Output folders of `scas4d reconstruct`.")],
+    against: Annotated[
+        Path | None, typer.Option(help="Folder server/viewer of another version, measured in turns.")
+    ] = None,
+    count: Annotated[list[int] | None, typer.Option(min=1, help="Number of Gaussians. May be repeated.")] = None,
+    turns: Annotated[int, typer.Option(min=1, help="Number of measurements of each version.")] = 3,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of a measurement.")] = 4.0,
+    work: Annotated[Path, typer.Option(help="Folder for scenes; its files are overwritten.")] = Path("out/drawing"),
+    out: Page = None,
+) -> None:
+    """Measures how fast the viewer draws in a browser, and how closely its pictures match the CPU renderer's.
+
+    Example: scripts/bench drawing out/robot out/stage --against ../before/server/viewer
+    """
+    from studies.live.drawing import run
+
+    text = run(folders, against, count or [22_000, 94_000, 500_000], turns, seconds, work)
     show(text, out)

@@ -84,8 +84,13 @@ function draw(sharp = false) {
   if (!sharp) movedAt = performance.now();
 }
 
+/** Requests a picture if one is due; while one is being drawn, the page waits for it instead of for each refresh of the screen. */
 function frame(now) {
-  requestAnimationFrame(frame);
+  advance(now);
+  if (!splats?.busy) requestAnimationFrame(frame);
+}
+
+function advance(now) {
   const passed = tick ? (now - tick) / 1000 : 0;
   tick = now;
   if (!clock) return;
@@ -126,6 +131,7 @@ function drawn({ asked: { camera, place, share }, milliseconds, range, followed:
   drawOverlay();
   Object.assign(document.body.dataset, { pictures, place: place.toFixed(3), milliseconds: milliseconds.toFixed(1) });
   measure("shown", performance.now() - began);
+  requestAnimationFrame(frame);
 }
 
 const spent = { script: 0, shown: 0 };
@@ -164,6 +170,7 @@ function drawOverlay() {
 }
 
 function failed({ during, words }) {
+  if (during === "draw") requestAnimationFrame(frame);
   if (during === "file" || during === "begin" || (during === "draw" && !shown)) return fail("The scene cannot be shown", words);
   say(words);
 }

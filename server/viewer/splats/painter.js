@@ -1,11 +1,13 @@
-// Painting with WebGL2: ellipses from back to front, depth in colours, and trails on top.
+// Painting with WebGL2: projection, ellipses from back to front, depth in colours, and trails on top.
 
-import { ROW, programs } from "./programs.js";
-import { STRIDE } from "./project.js";
+import { FLOOR, LEVEL, PAINTS, ROW, programs } from "./programs.js";
+import { Recent, TEXELS, interleave } from "./texels.js";
 import { joined } from "./trails.js";
 import { DEPTH_RAMP } from "../view/colours.js";
 
-const FEWEST = 4096; // minimum capacity in ellipses
+const FEWEST = 4096; // minimum capacity in Gaussians
+const STATES = 3; // states that stay uploaded: those before and after the moment, and the previous one
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const FRAMES_MORE = 32; // spare capacity for frames of trails, since live frames arrive one by one
 
 export class Painter {
@@ -24,18 +26,20 @@ export class Painter {
   /** Creates all WebGL objects; called again after the context was lost. */
   begin() {
     const { gl } = this;
-    this.floats = gl.getExtension("EXT_color_buffer_float") !== null && gl.getExtension("EXT_float_blend") !== null;
+    this.floats = ["EXT_color_buffer_float", "EXT_color_buffer_half_float"].some((name) => gl.getExtension(name) !== null);
     this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.programs = programs(gl);
     this.plain = gl.createVertexArray();
-    this.quads = gl.createVertexArray();
-    this.indices = gl.createBuffer();
-    this.room = this.width = this.height = 0;
-    this.target = null;
-    this.trails = null;
+    this.room = this.count = this.width = this.height = 0;
+    this.table = null; // colours that the `paints` texture has
+    this.target = null; // half floats, to blend in
+    this.copy = null; // of pixels that were painted without WebGL
+    this.ellipses = this.trails = null;
     this.ramp = this.texture(gl.RGBA8, 256, 1);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, Uint8Array.from(DEPTH_RAMP.flatMap((rgb) => [...rgb, 255])));
     this.one = new Uint8Array(4);
+    const named = gl.getExtension("WEBGL_debug_renderer_info");
+    this.software = SOFTWARE.test(gl.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
   }
 
   texture(format, width, height) {
@@ -52,11 +56,11 @@ export class Painter {
     const { gl } = this;
     Object.assign(this, { width, height });
     Object.assign(gl.canvas, { width, height });
-    if (this.target) {
-      gl.deleteFramebuffer(this.target.frame);
-      gl.deleteTexture(this.target.picture);
+    for (const target of [this.target, this.copy]) {
+      gl.deleteFramebuffer(target?.frame ?? null);
+      gl.deleteTexture(target?.picture ?? null);
     }
-    this.target = null;
+    this.target = this.copy = null;
   }
 
   reserve(count) {
@@ -64,41 +68,98 @@ export class Painter {
     const { gl } = this;
     const rows = Math.ceil(1.25 * Math.max(count, FEWEST) / ROW);
     if (rows > this.most) throw new Error(`this browser can draw at most ${ROW * this.most} Gaussians`);
+    if (this.room) {
+      for (const texture of [...this.uploaded, this.order, this.paints, ...this.ellipses.tables]) gl.deleteTexture(texture);
+      gl.deleteFramebuffer(this.ellipses.frame);
+    }
     this.room = rows * ROW;
-    gl.deleteTexture(this.table ?? null);
-    this.table = this.texture(gl.RGBA32F, 3 * ROW, rows);
-    const corners = new Uint32Array(6 * this.room);
-    for (let i = 0; i < this.room; i++) corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
-    gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.indices);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    const texels = new Float32Array(4 * TEXELS * this.room);
+    this.uploaded = Array.from({ length: STATES }, () => this.texture(gl.RGBA32F, TEXELS * ROW, rows));
+    this.states = new Recent(this.uploaded, (texture, state) => {
+      interleave(state, texels);
+      this.upload(texture, TEXELS, state.count, gl.RGBA, gl.FLOAT, texels);
+    });
+    this.order = this.texture(gl.R32UI, ROW, rows);
+    this.paints = this.texture(gl.RGBA8, ROW, rows);
+    this.table = null;
+    const tables = [0, 1].map(() => this.texture(gl.RGBA32UI, ROW, rows));
+    this.ellipses = { tables, frame: gl.createFramebuffer() };
+    const attachments = tables.map((_, k) => gl.COLOR_ATTACHMENT0 + k);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.ellipses.frame);
+    tables.forEach((table, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, attachments[k], gl.TEXTURE_2D, table, 0));
+    gl.drawBuffers(attachments);
+  }
+
+  /** Uploads the first rows of a texture with some texels per Gaussian. */
+  upload(texture, texels, count, format, type, values) {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, texels * ROW, Math.ceil(count / ROW), format, type, values);
   }
 
   /**
-   * Paints ellipses, farthest first.
+   * Projects Gaussians to ellipses.
+   *
+   * @param moment { from, to, share }: states of the frames before and after it (`to` is null at a frame), and share [0, 1] of the way
+   * @param camera camera in the internal world: rows, t, fx, fy, cx, cy, width, height, near in metres
+   * @param order rows of the `count` Gaussians, farthest first  @param paint "own", "white", or their RGBA colours [4 N]
+   */
+  project({ from, to, share }, camera, { order, count }, paint) {
+    const { gl } = this;
+    this.count = count;
+    if (!count) return;
+    this.reserve((to ?? from).count);
+    const before = this.states.of(from);
+    const after = to ? this.states.of(to) : before;
+    this.upload(this.order, 1, count, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    if (paint instanceof Uint8Array && paint !== this.table) {
+      this.upload(this.paints, 1, this.room, gl.RGBA, gl.UNSIGNED_BYTE, padded(paint, 4 * this.room));
+      this.table = paint;
+    }
+    const { program, places } = this.programs.projection;
+    gl.useProgram(program);
+    gl.bindVertexArray(this.plain);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.ellipses.frame);
+    gl.viewport(0, 0, ROW, Math.ceil(count / ROW));
+    this.bind([[places.before, before], [places.after, after], [places.order, this.order], [places.paints, this.paints]]);
+    this.look(places, camera);
+    gl.uniform1i(places.count, count);
+    gl.uniform1i(places.known, from.count);
+    gl.uniform1i(places.paint, PAINTS[paint] ?? PAINTS.table);
+    gl.uniform1f(places.share, to ? share : 0);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Sets the uniforms of a camera. */
+  look(places, camera) {
+    const { gl } = this;
+    gl.uniformMatrix3fv(places.turn, true, camera.rows.flat());
+    gl.uniform3f(places.shift, ...camera.t);
+    gl.uniform4f(places.lens, camera.fx, camera.fy, camera.cx, camera.cy);
+    gl.uniform3f(places.size, camera.width, camera.height, camera.near);
+  }
+
+  /**
+   * Paints the projected ellipses, in half floats if possible, since 8 bits are too few for dozens of layers.
    *
    * @param background [red, green, blue] in [0, 1]
    */
-  colours(ellipses, count, background) {
+  colours(background) {
     const { gl } = this;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    if (this.floats) this.target ??= this.picture(gl.RGBA16F);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target?.frame ?? null);
     gl.clearColor(...background, 1);
-    this.ellipses(ellipses, count);
+    this.blend(false);
+    if (this.target) this.present(this.target, false);
   }
 
-  /** Paints depth, which is in place of red in the ellipses; `range` of the colours, `nothing` where coverage is below half. */
-  depth(ellipses, count, range, nothing) {
+  /** Paints the depth of the projected ellipses; `range` of the colours, `nothing` where coverage is below half. */
+  depth(range, nothing) {
     const { gl } = this;
-    if (!this.target) {
-      const picture = this.texture(gl.RGBA16F, this.width, this.height);
-      const frame = gl.createFramebuffer();
-      gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
-      this.target = { picture, frame };
-    }
+    this.target ??= this.picture(gl.RGBA16F);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.frame);
     gl.clearColor(0, 0, 0, 0);
-    this.ellipses(ellipses, count);
+    this.blend(true);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     const { program, places } = this.programs.depth;
     gl.useProgram(program);
@@ -109,23 +170,88 @@ export class Painter {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  ellipses(ellipses, count) {
+  /** Framebuffer with a texture of the canvas's size. */
+  picture(format) {
+    const { gl } = this;
+    const picture = this.texture(format, this.width, this.height);
+    const frame = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
+    return { picture, frame };
+  }
+
+  /** Shows RGBA pixels, the uppermost row first. */
+  show(pixels) {
+    const { gl, width, height } = this;
+    this.copy ??= this.picture(gl.RGBA8);
+    gl.bindTexture(gl.TEXTURE_2D, this.copy.picture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    this.present(this.copy, true);
+  }
+
+  /** Copies a picture to the canvas; `down` if its first row is the uppermost. */
+  present({ frame }, down) {
+    const { gl, width, height } = this;
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.blitFramebuffer(0, 0, width, height, 0, down ? height : 0, width, down ? 0 : height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height); // of the trails
+  }
+
+  /** Blends the ellipses, or their depths in place of red, into the current framebuffer. */
+  blend(deep) {
     const { gl, width, height } = this;
     gl.viewport(0, 0, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (!count) return;
-    this.reserve(count);
-    const rows = Math.ceil(count / ROW);
+    if (!this.count) return;
     const { program, places } = this.programs.gaussians;
     gl.useProgram(program);
-    gl.bindVertexArray(this.quads);
-    this.bind([[places.table, this.table]]);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 3 * ROW, rows, gl.RGBA, gl.FLOAT, ellipses.subarray(0, STRIDE * ROW * rows));
+    gl.bindVertexArray(this.plain);
+    const [first, second] = this.ellipses.tables;
+    this.bind([[places.places, first], [places.forms, second]]);
     gl.uniform2f(places.scale, 2 / width, -2 / height);
+    gl.uniform1i(places.deep, deep ? 1 : 0);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
+    gl.drawArrays(gl.TRIANGLES, 0, 3 * this.count);
     gl.disable(gl.BLEND);
+  }
+
+  /** Reads the projected ellipses back: [4 N] texels of both tables, and the second as floats, farthest first. */
+  read() {
+    const { gl } = this;
+    const rows = Math.ceil(this.count / ROW);
+    const [places, forms] = [0, 1].map((k) => {
+      const values = new Uint32Array(4 * ROW * rows);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.ellipses.frame);
+      gl.readBuffer(gl.COLOR_ATTACHMENT0 + k);
+      gl.readPixels(0, 0, ROW, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, values);
+      return values;
+    });
+    return { places: new Float32Array(places.buffer), forms, depths: new Float32Array(forms.buffer) };
+  }
+
+  /** Place in the order of the Gaussian with the largest weight at a point of the picture; −1 if coverage is below half. */
+  at(u, v) {
+    if (!this.count) return -1;
+    const { places, forms } = this.read();
+    let [rest, best, most] = [1, -1, 0];
+    for (let i = this.count - 1; i >= 0 && rest > 1e-3; i--) {
+      const alpha = alphaAt(places, forms, 4 * i, u, v);
+      if (alpha * rest > most) [most, best] = [alpha * rest, i];
+      rest *= 1 - alpha;
+    }
+    return rest > 0.5 ? -1 : best;
+  }
+
+  /** 1st and 99th percentile of the depths of the ellipses, in metres. */
+  range() {
+    const { depths } = this.count ? this.read() : { depths: [] };
+    const found = [];
+    for (let i = this.count - 1; i >= 0; i--) if (depths[4 * i + 3] > 0) found.push(depths[4 * i + 3]);
+    const nth = (share) => found[Math.min(found.length - 1, Math.floor(share * found.length))];
+    return found.length ? [nth(0.01), nth(0.99)] : [0, 1];
   }
 
   bind(textures) {
@@ -190,10 +316,7 @@ export class Painter {
     gl.useProgram(program);
     gl.bindVertexArray(this.plain);
     this.bind([[places.centres, this.trails.centres], [places.hues, this.trails.hues]]);
-    gl.uniformMatrix3fv(places.turn, true, camera.rows.flat());
-    gl.uniform3f(places.shift, ...camera.t);
-    gl.uniform4f(places.lens, camera.fx, camera.fy, camera.cx, camera.cy);
-    gl.uniform3f(places.size, camera.width, camera.height, camera.near);
+    this.look(places, camera);
     gl.uniform1f(places.now, now);
     gl.uniform1i(places.trails, this.trails.count);
     gl.uniform1i(places.first, first);
@@ -210,4 +333,21 @@ export class Painter {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, this.one);
   }
+}
+
+function padded(values, length) {
+  const all = new Uint8Array(length);
+  all.set(values);
+  return all;
+}
+
+function alphaAt(places, forms, o, u, v) {
+  const [x, y, ax, ay] = [u - places[o], v - places[o + 1], places[o + 2], places[o + 3]];
+  const square = ax * ax + ay * ay;
+  if (!square) return 0; // not in the picture
+  const [ratio, level] = [(forms[o] & 0xffff) / 0xffff, -LEVEL * (forms[o] >>> 16) / 0xffff];
+  const along = (x * ax + y * ay) / square;
+  const across = (y * ax - x * ay) / square / ratio;
+  const part = along * along + across * across;
+  return part > 1 ? 0 : Math.min(0.99, 2 ** (level - (level + FLOOR) * part));
 }

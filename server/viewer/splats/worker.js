@@ -2,17 +2,18 @@
 // It receives and sends messages { kind, … }; see `Splats`, which is the page's side.
 
 import { Painter } from "./painter.js";
-import { Projector } from "./project.js";
 import { CompactReader } from "./reader.js";
 import { inside, nearOf, outside, partColour } from "./rig.js";
 import { Sequence } from "./sequence.js";
+import { Rasterizer } from "./software.js";
+import { Sorter } from "./sort.js";
 import { Ways, Walk } from "./trails.js";
 
 const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // colour in depth pictures where there is nothing
 const NO_PART = [90, 96, 104];
 const post = (kind, message = {}) => self.postMessage({ kind, ...message });
 
-const projector = new Projector();
+const [sorter, rasterizer] = [new Sorter(), new Rasterizer()];
 const [trailWalk, trackWalk] = [new Walk(), new Walk()];
 const ways = new Ways();
 let painter = null;
@@ -24,7 +25,7 @@ let labels = null; // part of each Gaussian
 let shown = null; // last picture: { camera, moment }
 let look = { mode: "colour", background: null, hiddenParts: [], trails: 0, span: 20 };
 let cover = null; // mask of hidden Gaussians, from `hiddenParts`
-let paints = { labels: null, ones: null };
+let paints = null; // RGBA colours of the Gaussians by their parts
 let followed = -1;
 
 const actions = {
@@ -75,19 +76,25 @@ const actions = {
     const moment = sequence.moment(place);
     const [decoded, { mode }] = [performance.now(), look];
     const count = (moment.to ?? moment.from).count;
-    projector.project(moment, camera, { colours: coloursOf(mode, count), depth: mode === "depth", hidden: covering(count) });
+    sorter.sort(moment, camera.rows[2], covering(count));
     painter.size(camera.width, camera.height);
-    const { ellipses, count: drawn } = projector;
+    const background = mode === "colour" ? look.background ?? head.background : [0, 0, 0];
+    const given = [moment, camera, sorter, paintOf(mode, count)];
     let range = null;
-    if (mode === "depth") {
-      range = projector.range();
-      painter.depth(ellipses, drawn, range, NOTHING);
-    } else painter.colours(ellipses, drawn, mode === "colour" ? look.background ?? head.background : [0, 0, 0]);
+    if (mode === "depth") { // also in software, since it is rarely shown
+      painter.project(...given);
+      range = painter.range();
+      painter.depth(range, NOTHING);
+    } else if (painter.software) painter.show(rasterizer.paint(...given, background));
+    else {
+      painter.project(...given);
+      painter.colours(background);
+    }
     if (look.trails) painter.paintTrails(camera, place, look.span);
     painter.finish();
     shown = { camera, moment };
     const [metres, now] = [head.world.metres_per_unit, performance.now()];
-    post("drawn", { place, mode, drawn, milliseconds: now - began, decoding: decoded - began,
+    post("drawn", { place, mode, milliseconds: now - began, decoding: decoded - began,
       range: range?.map((z) => z / metres), followed: followed < 0 ? null : whereIs(followed) });
     if (ahead === undefined || ahead >= sequence.frames.length || sequence.has(ahead)) return;
     setTimeout(() => guarded("ahead", () => sequence.frames[ahead] && sequence.state(ahead)));
@@ -96,9 +103,10 @@ const actions = {
   /** Follows the Gaussian at a point of the last picture. */
   pick({ u, v }) {
     if (!shown) return;
-    const found = projector.at(u, v);
-    if (!found) return post("picked", { row: -1 });
-    actions.follow({ row: found.row });
+    painter.project(shown.moment, shown.camera, sorter, "own");
+    const place = painter.at(u, v);
+    if (place < 0) return post("picked", { row: -1 });
+    actions.follow({ row: sorter.order[place] });
   },
 
   follow({ row }) {
@@ -122,7 +130,7 @@ function added(reader, name, isLive = false) {
   const found = reader.parts();
   if (found) {
     labels = found;
-    paints.labels = null;
+    paints = null;
     actions.look({});
   }
   if (look.trails) {
@@ -151,23 +159,19 @@ function covering(count) {
   return (cover = all);
 }
 
-/** [3 N] colours that replace the Gaussians' own. */
-function coloursOf(mode, count) {
-  if (mode === "parts" && labels) {
-    if (paints.labels?.length !== 3 * count) {
-      const table = new Map();
-      paints.labels = new Float32Array(3 * count);
-      for (let i = 0; i < count; i++) {
-        const label = labels[i] ?? -1;
-        if (!table.has(label)) table.set(label, (label < 0 ? NO_PART : partColour(label)).map((value) => value / 255));
-        paints.labels.set(table.get(label), 3 * i);
-      }
-    }
-    return paints.labels;
+/** What replaces the Gaussians' own colours; see `Painter.project`. */
+function paintOf(mode, count) {
+  if (mode === "alpha") return "white";
+  if (mode !== "parts" || !labels) return "own";
+  if (paints?.length === 4 * count) return paints;
+  const table = new Map();
+  paints = new Uint8Array(4 * count);
+  for (let i = 0; i < count; i++) {
+    const label = labels[i] ?? -1;
+    if (!table.has(label)) table.set(label, label < 0 ? NO_PART : partColour(label));
+    paints.set(table.get(label), 4 * i);
   }
-  if (mode !== "alpha") return null;
-  if (paints.ones?.length !== 3 * count) paints.ones = new Float32Array(3 * count).fill(1);
-  return paints.ones;
+  return paints;
 }
 
 function forgetTrails() {
