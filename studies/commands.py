@@ -14,18 +14,17 @@ from studies.kernels.commands import kernels
 from studies.live.commands import drawing, live, viewer
 from studies.paper.commands import paper
 from studies.quality.commands import (
-    effects,
     refit,
     table,
     targets,
 )
 from studies.rigs.commands import calibration, rigs
 from studies.scale.commands import scale
-from studies.service.commands import faults, ingest, memory, views
+from studies.service.commands import faults, memory, views
 from studies.variants.commands import confidence, gaps, variants
 
 STUDIES = {
-    "Quality": (refit, effects, targets, table, confidence),
+    "Quality": (refit, targets, table, confidence),
     "Rigs": (rigs, calibration),
     "Quality of the output": (compact, exports),
     "Accuracy against time": (frontier, paper, variants, gaps),
@@ -33,7 +32,6 @@ STUDIES = {
     "Faults of cameras": (timing, alarms),
     "The running service": (
         faults,
-        ingest,
         live,
         viewer,
         drawing,

@@ -41,43 +41,6 @@ def refit(
 
 
 @with_capture_options
-def effects(
-    captures: Captures,
-    options: CaptureOptions,
-    out: Annotated[Path, typer.Option(help="Study folder. A second run continues the study.")] = Path("out/effects"),
-    name: Annotated[
-        list[str] | None, typer.Option(help="Measure only this effect; default: all. May be repeated.")
-    ] = None,
-    pin: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=MODE,NAME=MODE", help="Effects to pin together. May be repeated."),
-    ] = None,
-    frames: Annotated[int | None, typer.Option(min=2, help="Number of frames; default: all.")] = None,
-    again: Again = False,
-    changes: Changes = None,
-) -> None:
-    """Compares pinning each effect with mode auto, by PSNR, update time and bit identity.
-
-    The two reconstructions start from the same frame 0 and are updated alternately. Each finished run is stored in a
-    file. Effects that are on in every scene are tested only in mode "off". Writes effects.md to the study's folder.
-
-    Example: scripts/bench effects captures/robot --name entering --name leaving --frames 8
-    """
-    from studies.quality.effects import run
-
-    pins = [dict(one.split("=", 1) for one in given.split(",")) for given in pin or ()]
-    run(
-        captures,
-        out,
-        names=name or (),
-        pins=pins,
-        frames=frames,
-        changes=changes or (),
-        again=again,
-        options=options,
-    )
-
-
 def targets(
     captures: Annotated[Path, typer.Argument(metavar="CAPTURES", help="Folder that contains the captures.")],
     out: Study = QUALITY,

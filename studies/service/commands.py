@@ -1,4 +1,4 @@
-"""The commands `scripts/bench faults`, `ingest`, `views` and `memory`."""
+"""The commands `scripts/bench faults`, `views` and `memory`."""
 
 from __future__ import annotations
 
@@ -56,27 +56,6 @@ def faults(
     show(text, out)
     if not all(outcome.reached for outcome in outcomes):
         raise typer.Exit(1)
-
-
-def ingest(
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames per round.")] = 20,
-    cameras: Annotated[int, typer.Option(min=1, help="Number of cameras in the rig.")] = 27,
-    side: Annotated[int, typer.Option(min=64, help="Width and height of a JPEG; it has 0.6 bytes per pixel.")] = 1280,
-    rounds: Annotated[int, typer.Option(min=1, help="Number of rounds; each measures every transport.")] = 5,
-    senders: Annotated[int, typer.Option(min=1, help="Number of connections of the sending process.")] = 2,
-    work: Annotated[Path, typer.Option(help="Folder on the disk to measure; its contents are deleted.")] = Path(
-        "out/ingest"
-    ),
-    out: Page = None,
-) -> None:
-    """Measures the ingest rate over the loopback interface, over HTTP and over a WebSocket."""
-    from client.cli.extras import need_server
-    from studies.service import ingest as of_ingest
-
-    need_server()
-    given = {"frames": frames, "cameras": cameras, "side": side, "senders": senders}
-    text = of_ingest.page(of_ingest.measure(work.resolve(), rounds=rounds, **given), **given)
-    show(text, out)
 
 
 def views(
