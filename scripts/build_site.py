@@ -56,11 +56,14 @@ def for_site(text: str, folder: str) -> str:
 
 
 def build(out: Path) -> None:
-    """Builds the site in a folder, which is replaced.
+    """Builds the site in a folder, which replaces an earlier site.
 
     Raises:
+        FileExistsError: if the folder exists and contains something else.
         subprocess.CalledProcessError: if a page has a link to a missing page or heading, or the build fails.
     """
+    if out.exists() and not (out / "sitemap.xml").exists():
+        raise FileExistsError(f"{out} is not a site: choose a new folder, or remove it")
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         shutil.copytree(ROOT / "docs", work / "docs", ignore=shutil.ignore_patterns("examples"))
@@ -72,7 +75,8 @@ def build(out: Path) -> None:
         shutil.copy(ROOT / "mkdocs.yml", work)
         command = [sys.executable, "-m", "zensical", "build", "--strict", "--config-file", str(work / "mkdocs.yml")]
         subprocess.run(command, check=True, cwd=work, stdout=subprocess.DEVNULL)
-        shutil.rmtree(out, ignore_errors=True)
+        if out.exists():
+            shutil.rmtree(out)
         shutil.move(work / "site", out)
 
 

@@ -28,7 +28,7 @@ from studies.machine import in_words, machine
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "docs" / "figures.json"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-FIGURE = re.compile(r"(?P<text>[^\s|(<>]+)<!-- (?P<name>[\w.-]+) -->")
+FIGURE = re.compile(r"(?P<text>\d{4}-\d\d-\d\d|\d[\d,]*(?:\.\d+)?)<!-- (?P<name>[\w.-]+) -->")
 ROW_VALUES = ("gaussians", "psnr_first", "psnr", "psnr_worst", "ssim", "track_3d_median", "parts_ari", "seconds_update")
 UNIT = r"(?:(?:dB|ms|s|seconds?|minutes?|hours?|kB|MB|GB|frames/s|frames per second|times|pixels)\b|%)"
 COUNT = r"\d[\d.,]*|half a|one|two|three|four|five|six|seven|eight|nine|ten|twenty|thirty|forty|fifty|sixty"
@@ -93,16 +93,29 @@ def unrecorded(page: str) -> list[str]:
 
 
 def record_rows(paths: list[Path]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields the capture and record of each row of `scas4d evaluate`, measured on this machine."""
+    """Yields the capture and record of each row of `scas4d evaluate`.
+
+    The rows must have been measured on this machine, because they do not name it.
+
+    Raises:
+        ValueError: if a row was not measured with default settings, or two rows have the same capture.
+    """
+    known: set[str] = set()
     for path in paths:
         row = json.loads(path.read_text())
+        if row["preset"] != "scas4d" or row["changes"]:
+            settings = f"{row['preset']} {row['changes']}"
+            raise ValueError(f"{path}: measured with {settings}; measure it with default settings")
+        if row["capture"] in known:
+            raise ValueError(f"{path}: another row of {row['capture']} was given; pass one row per capture")
+        known.add(row["capture"])
         values = {key: row[key] for key in ROW_VALUES if row.get(key) is not None}
         yield (
             row["capture"],
             {
                 "command": f"scas4d evaluate CAPTURES/{row['capture']}",
                 "date": row["measured"][:10],
-                "machine": in_words(row.get("machine") or machine()),
+                "machine": in_words(machine()),
                 "values": {key: round(value, 4) for key, value in values.items()},
             },
         )

@@ -1,4 +1,4 @@
-"""Makes the pictures of the viewer and the player in docs/, from today's build and the sample.
+"""Makes the pictures of the viewer and the player in docs/, from the current build and the sample.
 
 PYTHONPATH=. python scripts/pictures.py           # needs `scripts/setup dev` and Chromium; takes some minutes
 PYTHONPATH=. python scripts/pictures.py OUT       # writes to another folder
@@ -24,7 +24,7 @@ SIZE, PLAYER_SIZE, PANEL_SIZE = (1280, 800), (1280, 720), (960, 600)
 FRAME = 7
 POINTS = ((0.475, 0.12), (0.46, 0.22), (0.48, 0.34), (0.50, 0.50))
 """Points of the robot to track, as fractions of the view's width and height."""
-PATIENCE_MS = 240_000
+TIMEOUT_MS = 240_000
 QUALITY = 82
 
 
@@ -34,7 +34,7 @@ def save(page: Page, file: Path) -> None:
     Image.open(io.BytesIO(page.screenshot())).convert("RGB").save(file, quality=QUALITY, method=6)
 
 
-def settle(page: Page) -> None:
+def wait_for_picture(page: Page) -> None:
     """Waits until the service's exact picture is shown, with all panels."""
     page.wait_for_selector("#curtain", state="hidden")
     page.wait_for_selector("#view[data-drawn=service]:not(.stale)")
@@ -45,20 +45,20 @@ def picture_viewer(page: Page, address: str, out: Path) -> None:
     """Makes the pictures of the viewer: tracks, parts, exports, and the panel of accuracy and time."""
     page.set_viewport_size({"width": SIZE[0], "height": SIZE[1]})
     page.goto(address)
-    settle(page)
+    wait_for_picture(page)
     box = page.locator("#overlay").bounding_box()
     assert box is not None
     for x, y in POINTS:
         page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
         page.wait_for_timeout(300)
     page.wait_for_function(f"document.querySelectorAll('#tracks li').length === {len(POINTS)}")
-    settle(page)
+    wait_for_picture(page)
     save(page, out / "viewer-tracks.webp")
     page.locator("#clear").click()
     page.get_by_role("radio", name="Parts").click()
     page.wait_for_selector("#view[data-mode=parts]")
     page.locator("aside").evaluate("panels => panels.scrollTo(0, 0)")
-    settle(page)
+    wait_for_picture(page)
     save(page, out / "viewer-parts.webp")
     page.get_by_role("radio", name="Colour").click()
     page.locator("#measure").click()
@@ -66,14 +66,14 @@ def picture_viewer(page: Page, address: str, out: Path) -> None:
     page.wait_for_function("/^Measure/.test(document.getElementById('measure').textContent)")
     page.select_option("#budget-kind", "iterations")
     page.locator("#tradeoff").evaluate("chart => chart.closest('section').scrollIntoView()")
-    settle(page)
+    wait_for_picture(page)
     save(page, out / "viewer-budget.webp")
     page.set_viewport_size({"width": PANEL_SIZE[0], "height": PANEL_SIZE[1]})
     page.select_option("#take-format", "usd")
     page.locator("#take-make").click()
     page.wait_for_selector("#take-list li a, #take-list li button:has-text('Save')")
     page.locator("#take").evaluate("panel => panel.scrollIntoView()")
-    settle(page)
+    wait_for_picture(page)
     save(page, out / "exports" / "take-away.webp")
 
 
@@ -104,7 +104,7 @@ def main(out: Path) -> None:
         export_player(scene, player, url=url, token=None)
         browser = playwright.chromium.launch(executable_path=browser_path(), args=["--no-sandbox"])
         page = browser.new_page()
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(TIMEOUT_MS)
         picture_viewer(page, f"{url}/#scene={scene}&frame={FRAME}", out)
         picture_player(page, player, out)
         browser.close()

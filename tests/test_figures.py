@@ -25,7 +25,7 @@ def test_figures_of_the_pages_are_current() -> None:
         assert figures.with_figures(page.read_text(), records) == page.read_text(), "run scripts/figures.py"
 
 
-def test_the_readme_has_no_other_figures() -> None:
+def test_the_readme_has_no_other_numbers_with_units() -> None:
     assert figures.unrecorded((ROOT / "README.md").read_text()) == []
 
 
@@ -69,20 +69,37 @@ def test_what_is_no_measurement_needs_no_record() -> None:
     )
 
 
-def test_rows_and_times_are_recorded(tmp_path: Path) -> None:
-    row = {
-        "capture": "robot", "measured": "2026-12-01T03:00:00+00:00", "psnr": 35.74812, "parts_ari": None,
-        "machine": {"processor": "AMD EPYC", "cores": 2},
+def row_file(folder: Path, name: str, **changes: object) -> Path:
+    row = {"capture": "robot", "measured": "2026-12-01T03:00:00+00:00", "preset": "scas4d", "changes": [],
+           "psnr": 35.74812, "parts_ari": None}  # fmt: skip
+    (folder / name).write_text(json.dumps(row | changes))
+    return folder / name
+
+
+def test_rows_are_recorded(tmp_path: Path) -> None:
+    records = dict(figures.record_rows([row_file(tmp_path, "a"), row_file(tmp_path, "b", capture="cloth", psnr=30)]))
+    assert set(records) == {"robot", "cloth"}
+    assert records["robot"].pop("machine")
+    assert records["robot"] == {
+        "command": "scas4d evaluate CAPTURES/robot", "date": "2026-12-01", "values": {"psnr": 35.7481}
     }  # fmt: skip
-    (tmp_path / "robot.json").write_text(json.dumps(row))
-    assert dict(figures.record_rows([tmp_path / "robot.json"])) == {
-        "robot": {
-            "command": "scas4d evaluate CAPTURES/robot", "date": "2026-12-01", "machine": "AMD EPYC, 2 cores",
-            "values": {"psnr": 35.7481},
-        }
-    }  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", [{"preset": "fast"}, {"changes": ["update.iterations=9"]}, {}])
+def test_rows_of_other_settings_and_second_rows_are_refused(tmp_path: Path, changes: dict[str, object]) -> None:
+    paths = [row_file(tmp_path, "a"), row_file(tmp_path, "b", **changes)]
+    with pytest.raises(ValueError, match="b: "):
+        list(figures.record_rows(paths))
+
+
+def test_times_of_commands_are_recorded() -> None:
     ran: list[list[str]] = []
     record = figures.record_time(["scripts/test", "--fast"], ran.append)
     assert ran == [["scripts/test", "--fast"]]
     assert record["command"] == "scripts/test --fast"
     assert set(record["values"]) == {"seconds", "minutes"}
+
+
+@pytest.mark.parametrize("text", ["**1.0<!-- robot.psnr -->**", "(1.0<!-- robot.psnr -->)"])
+def test_only_the_number_is_replaced(text: str) -> None:
+    assert figures.with_figures(text, RECORDS) == text.replace("1.0", "35.7")

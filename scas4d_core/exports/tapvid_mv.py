@@ -110,7 +110,7 @@ class TapVidMvSequence:
         self.path = Path(path)
         self._world, self._background = world, background
         self._ids = None if ids is None else np.unique(np.asarray(ids, np.int64))
-        self._known = np.empty(0, np.int64)
+        self._found = np.zeros(0, np.bool_)
         self._extent = 0.0
         self._limits = rig_limits("auto", world, rig.cameras)
         self._renderer = ViewRenderer(world, self._limits)
@@ -135,10 +135,12 @@ class TapVidMvSequence:
                     raise InputError(
                         f"nothing moves in frame {index}, but ids is None", "start at a later frame, or pass ids"
                     )
+            assert self._ids is not None
+            self._found = np.zeros(len(self._ids), np.bool_)
         assert self._ids is not None
         positions = np.full((len(self._ids), 3), np.nan)
         _, columns, rows = np.intersect1d(self._ids, gaussians.ids, return_indices=True)
-        self._known = np.union1d(self._known, self._ids[columns])
+        self._found[columns] = True
         present = gaussians.present[rows]
         positions[columns[present]] = self._world.to_user(gaussians.means[rows[present]])
         self._tracks.append(positions)
@@ -183,7 +185,7 @@ class TapVidMvSequence:
         tracks, count = np.stack(self._tracks), len(self._tracks)
         visible = np.stack([np.stack(view.visible) for view in self._views], axis=-1)  # [T, N, views]
         assert self._ids is not None
-        check_ids_found(self._ids, np.isin(self._ids, self._known))
+        check_ids_found(self._ids, self._found)
         kept = visible.any(axis=(0, 2))
         if not kept.any():
             raise InputError("no camera ever sees any of the tracks", "use other frames or ids")

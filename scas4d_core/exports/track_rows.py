@@ -15,13 +15,14 @@ MAX_TRACKS = 500
 def check_ids_found(ids: NDArray[np.int64], found: NDArray[np.bool_]) -> None:
     """Raises ``InputError`` if some of the requested ids [Q] were not found, according to the mask ``found`` [Q].
 
+    An id is found if a state contains its Gaussian, even one that is absent from the frame.
+
     >>> check_ids_found(np.array([4, 5]), np.array([True, False]))
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: ids: no exported frame contains Gaussian 5; use ids of the exported states
+    scas4d_core.errors.InputError: unknown Gaussian ids [5]; use ids of the exported states
     """
     if not found.all():
-        unknown = ", ".join(map(str, ids[~found][:5].tolist()))
-        raise InputError(f"ids: no exported frame contains Gaussian {unknown}", "use ids of the exported states")
+        raise InputError(f"unknown Gaussian ids {ids[~found][:5].tolist()}", "use ids of the exported states")
 
 
 def evenly_spaced_moving_rows(first: Gaussians) -> NDArray[np.intp]:

@@ -66,7 +66,10 @@ def find_visibility(
 
 def points_in_image(positions: Float, camera: Camera) -> NDArray[np.bool_]:
     """Returns whether points [..., 3] in the user's world are in front of a camera and in its image, [...] bool."""
-    uv, z = camera.project(positions)
+    return _inside(*camera.project(positions), camera)
+
+
+def _inside(uv: Float, z: Float, camera: Camera) -> NDArray[np.bool_]:
     inside: NDArray[np.bool_] = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
     return inside
 
@@ -99,7 +102,7 @@ def visible_points(
     from scas4d_core.kernels.front_transmittance import front_transmittance  # deferred import: it loads the kernels
 
     uv, z = camera.project(positions)
-    visible = points_in_image(positions, camera)
+    visible = _inside(uv, z, camera)
     rows = np.flatnonzero(visible)
     if not len(rows):
         return visible

@@ -51,10 +51,10 @@ SIMILAR = 0.25
 cameras, so errors differ as well."""
 MIN_WITNESSES = 2
 """Minimum number of other cameras that see a point."""
-MAX_WITNESSES = 12
-"""Number of cameras, spread over the rig, among which errors are confirmed if time is short."""
 AGREE = 0.75
 """Minimum share of these cameras that have an error there."""
+MAX_WITNESSES = 12
+"""Maximum number of cameras, spread over the rig, that may confirm errors. The time grows with its square."""
 MOST, PART = 0.4, 0.05
 """Minimum confirmed shares of the squared error in a connected region that confirm the whole region. The first applies
 to the cells that other cameras see at the depth of the object, and the second to all cells."""
@@ -94,13 +94,14 @@ class ImageErrors:
 
     Attributes:
         names: names of the cameras that have a view.
+        rig: rig with all of these cameras.
     """
 
     def __init__(
         self, views: Sequence[TrainingView], factory: ViewFactory, renderer: Renderer, state: Gaussians
     ) -> None:
         self._views = {view.name: view for view in views}
-        self.names = tuple(self._views)
+        self.names, self.rig = tuple(self._views), factory.posed
         self._factory, self._renderer, self._state = factory, renderer, state
         self._errors: dict[str, CellErrors] = {}
 
@@ -117,8 +118,8 @@ class ImageErrors:
             name: name of the camera.
             witnesses: names of the cameras that may confirm errors. The camera itself is ignored.
         """
-        rig, others = self._factory.posed, self._others(name, witnesses)
-        return confirmed_cells(name, self.errors(name), others, rig, ray_depths(rig[name], self._state))
+        depths = ray_depths(self.rig[name], self._state)
+        return confirmed_cells(name, self.errors(name), self._others(name, witnesses), self.rig, depths)
 
     def credited_decibels(self, names: Collection[str]) -> dict[str, float]:
         """Returns by how much the PSNR of each named camera would rise without the errors that other cameras confirm.

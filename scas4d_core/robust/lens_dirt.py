@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label, uniform_filter
 
-from scas4d_core.cameras import Rig
 from scas4d_core.robust.confirmed_errors import MAX_WITNESSES, ImageErrors
 from scas4d_core.update.best_state import spread_cameras
 
@@ -48,13 +47,12 @@ class ShiftedRegion(NamedTuple):
         return self.share >= SHARE and self.static >= STATIC_SHARE
 
 
-def shifted_region(images: ImageErrors, name: str, rig: Rig) -> ShiftedRegion | None:
+def shifted_region(images: ImageErrors, name: str) -> ShiftedRegion | None:
     """Returns the largest connected region of a camera's image that is brighter, or darker, by ``SHIFTED``.
 
     Args:
         images: errors of the state after the update, in the images that were used for the frame.
         name: name of the camera.
-        rig: rig with all of these cameras.
 
     Returns:
         The region, whose share is 0 if there is none; or None if the camera was not used for the frame, or too few
@@ -62,7 +60,7 @@ def shifted_region(images: ImageErrors, name: str, rig: Rig) -> ShiftedRegion | 
     """
     if name not in images.names or len(images.names) < FEWEST_CAMERAS:
         return None
-    witnesses = spread_cameras(rig, [other for other in images.names if other != name], MAX_WITNESSES)
+    witnesses = spread_cameras(images.rig, [other for other in images.names if other != name], MAX_WITNESSES)
     own, confirmed = images.errors(name), images.confirmed(name, witnesses)
     smooth = uniform_filter(np.where(confirmed, 0, own.differences), SMOOTHED, mode="nearest")
     best = ShiftedRegion(0.0, 0.0, 0.0)

@@ -115,7 +115,7 @@ class FrameSolver:
 
         def region(name: str) -> ShiftedRegion | None:
             spent = self._budget_is_spent(given, MAX_WITNESSES)
-            return None if spent else shifted_region(images, name, self._factory.posed)
+            return None if spent else shifted_region(images, name)
 
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,

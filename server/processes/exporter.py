@@ -100,8 +100,8 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
         else:
             history = History.load(spec.scene.folder.states, only=(spec.first, *spec.frames))
             use_one_thread()
-        if spec.ids is not None and (unknown := np.array(spec.ids)[history.rows_of(spec.ids) < 0]).size:
-            raise InputError(f"ids: the scene has no Gaussian {unknown[0]}", "use ids from a state or from tracks")
+        if spec.ids is not None:
+            history.known_rows(spec.ids)  # an unknown id is an error before the first frame is written
         head = compact_head(spec.scene, history)
 
         def progress(_: int, done: int) -> None:

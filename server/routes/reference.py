@@ -51,23 +51,24 @@ HEADERS = security_headers(
     img_src="'self' data:",
     worker_src="'self'",
 )
-"""Security headers like those of the viewer. Swagger UI also needs inline styles and `data:` images."""
+"""Security headers like those of the viewer. The site has inline scripts, and its search runs in a worker; Swagger UI
+also needs inline styles and `data:` images."""
 
 
 @router.get("/docs")
-async def elsewhere() -> Response:
+async def redirect_to_site() -> Response:
     """Redirects to the site, with a relative URL because a proxy may serve the page under a path prefix."""
     return RedirectResponse("docs/")
 
 
 @router.get("/redoc")
-async def redoc() -> Response:
+async def redirect_to_reference() -> Response:
     """Redirects FastAPI's usual ReDoc address to the API reference."""
     return RedirectResponse(f"docs/{REFERENCE}")
 
 
 @router.get("/docs/")
-async def page(request: Request) -> Response:
+async def site_index(request: Request) -> Response:
     """Returns the first page of the site, or redirects to the API reference if the site was not built."""
     if "index.html" not in FILES:
         return RedirectResponse(REFERENCE)

@@ -23,7 +23,10 @@ const SLEEP_TRIES = 10;
 const FINISHED = ["committed", "failed", "missing", "skipped"];
 
 const view = new LiveView($("picture"), $("overlay"), {
-  pick: (...at) => tracks.pick(...at),
+  pick: (...at) => {
+    tracks.pick(...at);
+    tour.did("point");
+  },
   shown: showInfo,
   live: (times) => showLatency($("latency"), page.reports.get(times.frame), times),
   slow: (mode) => {
@@ -31,7 +34,10 @@ const view = new LiveView($("picture"), $("overlay"), {
     $("busy").hidden = !ready || page.lost;
     $("busy").textContent = mode === "parts" ? "Computing the parts …" : "Waiting for the picture …";
   },
-  turned: () => $("hint").classList.add("known"),
+  turned: () => {
+    $("hint").classList.add("known");
+    tour.did("orbit");
+  },
   stale: (stale) => {
     $("view").classList.toggle("stale", stale);
     if (stale) $("legend").hidden = true;
@@ -44,6 +50,7 @@ const timeline = new Timeline(() => {
   if (!timeline.playing) remember(); // browsers limit how often a page may change its URL
   view.setFrame(page.frame, true);
   showMoment();
+  tour.did("time");
 }, () => page.scene && remember(), { smooth: (...frames) => view.smooth(...frames), set: (...moment) => view.setBetween(...moment) });
 const tracks = new Tracks(view);
 const figures = new Figures((index) => timeline.choose(index));
@@ -94,12 +101,13 @@ async function openScene({ id, asleep }) {
   beside.look(0);
   tradeoff.open(id);
   takeAway.open(id);
-  tour.wanted = hash.tour !== undefined;
+  tour.wanted = hash.scene === id && hash.tour !== undefined;
   await loadReports();
 }
 
 function closeScene() {
   page.opened++;
+  tour.hide();
   page.stream?.close();
   view.close();
   beside.close();
@@ -268,6 +276,7 @@ function failed(message) {
 }
 
 function setMode(mode) {
+  if (mode === "parts") tour.did("parts");
   for (const button of $("modes").children) {
     button.setAttribute("aria-checked", String(button.dataset.mode === mode));
     button.tabIndex = button.dataset.mode === mode ? 0 : -1;

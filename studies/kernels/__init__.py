@@ -1,1 +1,1 @@
-"""Studies of the cost of the kernels and of starting the service."""
+"""Studies of the cost of the kernels."""

@@ -1,1 +1,1 @@
-"""Studies of the service under load, faults and hostile requests."""
+"""Studies of the service under load and faults."""

@@ -1,4 +1,4 @@
-"""The demo's tour: four steps that notice what was tried, shown until they are closed once."""
+"""The tour that the demo starts: four steps, each marked when it is done; once closed, the tour does not return."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ def drag(page):
     page.mouse.up()
 
 
-def test_its_steps_notice_what_was_tried_and_it_is_closed_for_ever(page, service, finished):
+def test_steps_are_marked_as_done_and_a_closed_tour_does_not_return(page, service, finished):
     page.goto(f"{service.url}/#scene={finished}&tour")
     tour, done = page.locator("#tour"), page.locator("#tour.done")
     tour.wait_for()
     tries = [
-        ("Look around", "#view.toured", lambda: drag(page)),
-        ("Move through time", "#time.toured", lambda: page.locator("#time").press("ArrowLeft")),
-        ("Follow a point", "#view.toured", lambda: page.locator("#overlay").click()),
-        ("Show the parts", "#modes.toured", lambda: page.get_by_role("radio", name="Parts").click()),
+        ("Look around", "#view.outlined", lambda: drag(page)),
+        ("Move through time", "#time.outlined", lambda: page.locator("#time").press("ArrowLeft")),
+        ("Follow a point", "#view.outlined", lambda: page.locator("#overlay").click()),
+        ("Show the parts", "#modes.outlined", lambda: page.get_by_role("radio", name="Parts").click()),
     ]
     for number, (title, outlined, attempt) in enumerate(tries, start=1):
         assert page.locator("#tour-title").inner_text() == f"{number} of 4 {title}"
@@ -30,7 +30,7 @@ def test_its_steps_notice_what_was_tried_and_it_is_closed_for_ever(page, service
         done.wait_for()
         page.locator("#tour-next").click()
     assert tour.is_hidden()
-    assert page.locator(".toured").count() == 0
+    assert page.locator(".outlined").count() == 0
     assert "tour" not in page.url
     page.goto("about:blank")
     page.goto(f"{service.url}/#scene={finished}&tour")
@@ -39,7 +39,7 @@ def test_its_steps_notice_what_was_tried_and_it_is_closed_for_ever(page, service
     assert page.faults == []
 
 
-def test_it_can_be_left_and_is_not_shown_elsewhere(chromium, service, finished):
+def test_it_is_shown_only_if_the_address_asks_for_it(chromium, service, finished):
     context = chromium.new_context(viewport={"width": 400, "height": 700})
     page = context.new_page()
     page.goto(f"{service.url}/#scene={finished}")

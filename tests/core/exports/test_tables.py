@@ -46,7 +46,7 @@ def test_tracks_of_some_ids(tmp_path):
     assert [row["id"] for row in rows] == ["59"]  # Gaussian 51 is absent
     table = TrackTable(tmp_path / "b.csv", corner.WORLD, ids=[7, 59])
     table.add(12, 0.0, moving.state(0))
-    with pytest.raises(InputError, match="ids: no exported frame contains Gaussian 7"):
+    with pytest.raises(InputError, match=r"unknown Gaussian ids \[7\]"):
         table.finish()
     table.discard()
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]

@@ -168,7 +168,7 @@ def test_ids_select_the_tracks(tmp_path):
         "cameras": list(RIG.names), "frames": [12, 13, 14], "times": [0.0, 0.04, 0.08],
         "ids": [50 + row for row in rows],
     }  # fmt: skip
-    with pytest.raises(InputError, match="ids: no exported frame contains Gaussian 7, 999; use ids"):
+    with pytest.raises(InputError, match=r"unknown Gaussian ids \[7, 999\]; use ids of the exported states"):
         export_sequence(states(), "tapvid-mv", tmp_path / "b.zip", world=WORLD, rig=RIG, ids=[999, 52, 7])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "read"]
 

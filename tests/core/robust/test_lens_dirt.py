@@ -32,7 +32,7 @@ def errors_of(frame: Frame, state: Gaussians = BOX, cameras: int | None = None) 
 
 
 def region_of(name: str, frame: Frame, state: Gaussians = BOX, cameras: int | None = None) -> ShiftedRegion | None:
-    return shifted_region(errors_of(frame, state, cameras), name, RIG)
+    return shifted_region(errors_of(frame, state, cameras), name)
 
 
 def with_image(frame: Frame, name: str, image: np.ndarray) -> Frame:
@@ -107,7 +107,7 @@ def test_each_image_is_rendered_at_most_once(monkeypatch: pytest.MonkeyPatch) ->
     images = errors_of(take_frame(1, 0.1, BOX, RIG))
     assert rendered == []
     for name in RIG.names:
-        shifted_region(images, name, RIG)
+        shifted_region(images, name)
     images.credited_decibels(RIG.names)
     assert sorted(rendered) == sorted(RIG.names)
 

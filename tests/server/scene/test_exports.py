@@ -103,7 +103,7 @@ def test_one_file_holds_a_sequence_with_its_rig_and_parts(ran, tmp_path):
         assert reader.parts().tolist() == [0, 1]
     unknown = over(sdk, id, sdk.begin_export(id, "tracks", ids=[1, 10**9]).id)
     assert (unknown.state, unknown.done) == ("failed", 0)  # before a frame is written
-    assert unknown.error == f"ids: the scene has no Gaussian {10**9}; use ids from a state or from tracks"
+    assert unknown.error.startswith(f"unknown Gaussian ids [{10**9}]; use ids of the scene's")
     for one in (*begun, unknown):
         sdk.delete_export(id, one.id)
 
