@@ -113,3 +113,18 @@ def plain_light(state: Gaussians, extent: float, uv: np.ndarray, depth: float) -
         if alpha >= DEFAULT.alpha_floor and place < depth - OWN_SURFACE * extent:
             light *= 1 - alpha
     return light
+
+
+def test_states_without_points_in_the_image_are_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    history, read = history_of(*[sheet((0, 0, 1), 2.0)] * 3), []
+    states = history.gaussians
+
+    def gaussians_of(index: int) -> Gaussians:
+        read.append(index)
+        return states(index)
+
+    monkeypatch.setattr(history, "gaussians", gaussians_of)
+    inside, outside = at([[32.0, 24.0]], [1.5])[0], np.array([[0.0, 0.0, -1.0]])
+    points = np.stack([outside, inside, np.full((1, 3), np.nan)])
+    assert find_visibility(history, WORLD, points, [0, 1, 2], CAMERA, 0).tolist() == [[False], [True], [False]]
+    assert read == [0, 1]  # frame 0 defines the extent
