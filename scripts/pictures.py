@@ -51,7 +51,7 @@ def picture_viewer(page: Page, address: str, out: Path) -> None:
     for x, y in POINTS:
         page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
         page.wait_for_timeout(300)
-    page.wait_for_function(f"document.querySelectorAll('#tracks li').length === {len(POINTS)}")
+    page.locator("#tracks li").nth(len(POINTS) - 1).wait_for()
     wait_for_picture(page)
     save(page, out / "viewer-tracks.webp")
     page.locator("#clear").click()
@@ -62,8 +62,8 @@ def picture_viewer(page: Page, address: str, out: Path) -> None:
     save(page, out / "viewer-parts.webp")
     page.get_by_role("radio", name="Colour").click()
     page.locator("#measure").click()
-    page.wait_for_function("document.getElementById('measure').textContent === 'Stop'")
-    page.wait_for_function("/^Measure/.test(document.getElementById('measure').textContent)")
+    page.locator("#measure", has_text="Stop").wait_for()
+    page.locator("#measure", has_text="Measure").wait_for()
     page.select_option("#budget-kind", "iterations")
     page.locator("#tradeoff").evaluate("chart => chart.closest('section').scrollIntoView()")
     wait_for_picture(page)
@@ -86,7 +86,7 @@ def picture_player(page: Page, file: Path, out: Path) -> None:
     assert box is not None
     page.mouse.click(box["x"] + 0.51 * box["width"], box["y"] + 0.5 * box["height"])
     page.select_option("#trails", "1000")
-    page.keyboard.press("End")
+    page.locator("#time").press("End")
     page.wait_for_timeout(3000)
     save(page, out / "player.webp")
 
