@@ -169,6 +169,18 @@ class Camera:
         uv = np.stack([self.fx * seen[..., 0] / safe + self.cx, self.fy * seen[..., 1] / safe + self.cy], axis=-1)
         return uv, depth
 
+    def in_image(self, uv: ArrayLike) -> NDArray[np.bool_]:
+        """Returns whether pixel coordinates [..., 2] are in the image, [...] bool; NaN coordinates are not.
+
+        Points with a depth of 0 or less are not in the image, because ``project`` returns NaN for them.
+
+        >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
+        >>> camera.in_image([[0, 0], [63.9, 47.9], [64, 0], [np.nan, 0]])
+        array([ True,  True, False, False])
+        """
+        uv = np.asarray(uv, dtype=np.float64)
+        return np.asarray(((uv >= 0) & (uv < (self.width, self.height))).all(axis=-1))
+
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Float:
         """Converts pixel coordinates [..., 2] and depths [...] to world points [..., 3].
 

@@ -126,10 +126,7 @@ def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDAr
         image.
     """
     uv, depth = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (
-            (depth > 0) & (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-        )
+    inside = camera.in_image(uv)
     pixels = np.where(inside[:, None], uv, 0.0).astype(np.intp)
     return pixels[:, 0], pixels[:, 1], depth, inside
 

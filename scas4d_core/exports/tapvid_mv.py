@@ -135,7 +135,6 @@ class TapVidMvSequence:
                     raise InputError(
                         f"nothing moves in frame {index}, but ids is None", "start at a later frame, or pass ids"
                     )
-            assert self._ids is not None
             self._found = np.zeros(len(self._ids), np.bool_)
         assert self._ids is not None
         positions = np.full((len(self._ids), 3), np.nan)

@@ -214,7 +214,7 @@ def tracks_of_pixels(
     uv = np.asarray(uv, dtype=np.float64)
     if uv.ndim != 2 or uv.shape[1] != 2:
         raise InputError(f"uv has shape {uv.shape}", "expected [Q, 2] pixels")
-    outside = np.flatnonzero(~((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1))
+    outside = np.flatnonzero(~camera.in_image(uv))
     if outside.size:
         raise InputError(
             f"pixel {uv[outside[0]].tolist()} (query {outside[0]}) is outside the image of camera {camera.name!r}",

@@ -58,20 +58,10 @@ def find_visibility(
     >>> find_visibility(history, WorldFrame(np.zeros(3)), points, [0], camera, index=0)
     array([[ True, False,  True]])
     """
-    extent, visible = moving_extent(history.gaussians(index)), points_in_image(positions, camera)
+    extent, visible = moving_extent(history.gaussians(index)), camera.in_image(camera.project(positions)[0])
     for t in np.flatnonzero(visible.any(axis=1)).tolist():  # states of other frames need not be read
         visible[t] = visible_points(history.gaussians(int(indices[t])), world, positions[t], camera, extent, limits)
     return visible
-
-
-def points_in_image(positions: Float, camera: Camera) -> NDArray[np.bool_]:
-    """Returns whether points [..., 3] in the user's world are in front of a camera and in its image, [...] bool."""
-    return _inside(*camera.project(positions), camera)
-
-
-def _inside(uv: Float, z: Float, camera: Camera) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
-    return inside
 
 
 def visible_points(
@@ -102,7 +92,7 @@ def visible_points(
     from scas4d_core.kernels.front_transmittance import front_transmittance  # deferred import: it loads the kernels
 
     uv, z = camera.project(positions)
-    visible = _inside(uv, z, camera)
+    visible = camera.in_image(uv)
     rows = np.flatnonzero(visible)
     if not len(rows):
         return visible

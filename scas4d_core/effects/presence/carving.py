@@ -119,7 +119,7 @@ def _kept(
         agree += near & (new[row, column] <= slack)
         missed = near & (possible[row, column] > slack)
         if not last:
-            missed &= (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+            missed &= camera.in_image(uv)
         against += missed
         asked += missed | (near & (new[row, column] <= slack))
     kept: Bool = (agree >= AGREE) & (against <= np.floor(MISSES * asked))
