@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from browser_page import opened, push, shown, start_scene, until
+from browser_page import expect, opened, push, shown, start_scene, until
 from waiting import HANG_S
 
 from client.sdk import Client
@@ -52,12 +52,12 @@ def test_reports_and_costs_that_come_late_are_those_of_another_reconstruction(pa
     sdk.begin_again(id, 1, frame=4, discard=True)
     sdk.wait(id, 4)
     until(page, "document.querySelectorAll('#psnr .dot').length === 1")
-    assert page.locator("#tradeoff .point").count() == 0  # there is no update yet
+    expect(page.locator("#tradeoff .point")).to_have_count(0)  # there is no update yet
     reports.give()
     costs.give()
     page.wait_for_timeout(500)
-    assert page.locator("#psnr .dot").count() == 1
-    assert page.locator("#tradeoff .point").count() == 0
+    expect(page.locator("#psnr .dot")).to_have_count(1)
+    expect(page.locator("#tradeoff .point")).to_have_count(0)
     push(sdk, id, 5)
     until(page, "document.querySelectorAll('#psnr .dot').length === 2")
     until(page, "document.querySelectorAll('#tradeoff .point.measured').length === 1")

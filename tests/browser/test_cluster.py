@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 
 import pytest
-from browser_page import FRAMES, looked_at, opened, shown, until
+from browser_page import FRAMES, expect, looked_at, opened, shown, until
 from running import Running, fake_settings, make_rig
 
 from client.sdk import Client
@@ -83,14 +83,16 @@ def test_on_one_machine_it_is_not_offered(sized, service, finished):
     opened(sized, service, finished)
     shown(sized, frame=str(FRAMES - 1))
     sized.wait_for_timeout(5000)
-    assert sized.locator("#cluster-open").is_hidden()
+    expect(sized.locator("#cluster-open")).to_be_hidden()
     assert len(asked) == 1
     assert sized.faults == []
 
 
 def test_nodes_and_what_waits(sized, stubbed, finished):
     dialog(sized)
-    assert sized.locator("#cluster-words").inner_text() == "3 nodes alive, 1 lost. 1 process is waiting for a node."
+    expect(sized.locator("#cluster-words")).to_have_text(
+        "3 nodes alive, 1 lost. 1 process is waiting for a node.", use_inner_text=True
+    )
     cards = sized.locator("#cluster-nodes > li")
     lost, head, first, third = cards.all_inner_texts()  # the lost first, then by name
     assert lost.split() == ["stage-2.studio.example", "lost"]
@@ -118,17 +120,17 @@ def test_it_follows_while_it_is_open_and_keeps_the_focus(sized, stubbed, finishe
     stubbed.answer = changed
     until(sized, "document.getElementById('cluster-nodes').innerText.includes('7.25 of 8')")
     assert sized.evaluate("document.activeElement.dataset.scene") == finished
-    assert sized.locator("#cluster-waiting").is_hidden()
+    expect(sized.locator("#cluster-waiting")).to_be_hidden()
     assert sized.locator("#cluster-words").inner_text().endswith("No process is waiting for a node.")
     stubbed.answer = {**changed, "head_responds": False}
     until(sized, f"{WORDS}.startsWith('The head of the cluster does not respond')")
     stubbed.answer = None
     until(sized, f"{WORDS}.startsWith('The service ends. The list below')")
-    assert "7.25 of 8" in sized.locator("#cluster-nodes").inner_text()
+    expect(sized.locator("#cluster-nodes")).to_contain_text("7.25 of 8", use_inner_text=True)
     stubbed.answer = changed
     until(sized, f"{WORDS}.startsWith('3 nodes')")
     sized.keyboard.press("Escape")
-    assert sized.locator("#cluster[open]").count() == 0
+    expect(sized.locator("#cluster[open]")).to_have_count(0)
     assert sized.evaluate("document.activeElement.id") == "cluster-open"
     asked = stubbed.asked
     sized.wait_for_timeout(4000)
@@ -139,7 +141,7 @@ def test_it_follows_while_it_is_open_and_keeps_the_focus(sized, stubbed, finishe
 def test_a_scene_is_opened_from_its_node(sized, stubbed, finished):
     dialog(sized)
     sized.locator("#cluster-nodes button", has_text="0123456789ab").click()
-    assert sized.locator("#cluster[open]").count() == 0
+    expect(sized.locator("#cluster[open]")).to_have_count(0)
     until(sized, "document.querySelector('#curtain h2').innerText === 'The scene cannot be opened'")
 
 

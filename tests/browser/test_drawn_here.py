@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 import pytest
-from browser_page import FRAMES, canvas, opened, push, shown, start_scene, until
+from browser_page import FRAMES, canvas, expect, opened, push, shown, start_scene, until
 from PIL import Image
 from waiting import HANG_S
 
@@ -47,9 +47,9 @@ def test_what_moves_is_drawn_here_and_what_rests_by_the_service(page, service, f
     before = len(sent)
     turn(page, 1)
     until(page, HERE)
-    assert page.locator("#drawn").is_visible()
+    expect(page.locator("#drawn")).to_be_visible()
     until(page, BY_THE_SERVICE)
-    assert page.locator("#drawn").is_hidden()
+    expect(page.locator("#drawn")).to_be_hidden()
     assert len([one for one in sent[before:] if '"render"' in one]) == 1  # the exact picture, at rest
     assert page.faults == []
 
@@ -174,7 +174,7 @@ def test_a_live_take_is_drawn_from_the_stream_and_between_its_states(page, servi
         assert heads[-1].frame == 7
         drawn = page.evaluate("window.drawn")
         assert any(0 < one["share"] < 1 and one["next"] == one["index"] + 1 for one in drawn)
-        assert "drawn" in page.locator("#latency").inner_text()
+        expect(page.locator("#latency")).to_contain_text("drawn", use_inner_text=True)
         page.locator("#time").fill("2")
         shown(page, frame="2")
         until(page, "document.getElementById('live').getAttribute('aria-pressed') === 'false'")
@@ -264,13 +264,13 @@ def test_where_chunks_do_not_come_the_service_draws(page, service, finished):
     shown(page, drawn="service")
     turn(page, 3)
     page.wait_for_timeout(600)
-    assert page.locator("#view").get_attribute("data-drawn") == "service"
+    expect(page.locator("#view")).to_have_attribute("data-drawn", "service")
     page.select_option("#who", "here")
     until(page, "document.getElementById('note').innerText.includes('cannot be drawn here')")
     tag = page.locator("#view").get_attribute("data-tag")
     turn(page, 1)
     until(page, f"document.getElementById('view').dataset.tag !== '{tag}'")
-    assert page.locator("#curtain").is_hidden()
+    expect(page.locator("#curtain")).to_be_hidden()
 
 
 def test_trails_and_parts_that_are_hidden_stay_at_rest(page, service, finished):
@@ -283,8 +283,8 @@ def test_trails_and_parts_that_are_hidden_stay_at_rest(page, service, finished):
     page.get_by_label("Show part 2 alone").click()
     shown(page, frame="5", drawn="here")
     page.wait_for_timeout(500)
-    assert page.locator("#view").get_attribute("data-drawn") == "here"  # at rest, too
-    assert "3 of 4 hidden" in page.locator("#parts-words").inner_text()
+    expect(page.locator("#view")).to_have_attribute("data-drawn", "here")  # at rest, too
+    expect(page.locator("#parts-words")).to_contain_text("3 of 4 hidden", use_inner_text=True)
     page.keyboard.press("Escape")
     page.get_by_label("Show part 2 alone").click()
     until(page, BY_THE_SERVICE)

@@ -8,7 +8,7 @@ import struct
 import browser_engine
 import numpy as np
 import pytest
-from browser_page import canvas, until
+from browser_page import canvas, expect, until
 from export_cases import bent
 from PIL import Image
 from waiting import HANG_S
@@ -97,13 +97,13 @@ def test_it_turns_and_shows_depth_and_parts(offline, player):
     assert 1 < near < far < 6
     offline.click("#modes [data-mode=parts]")
     assert differ(depth, seen(offline))
-    assert offline.locator("#legend").is_hidden()
+    expect(offline.locator("#legend")).to_be_hidden()
     offline.click("#parts-box summary")
-    assert offline.locator("#parts li").count() == bent.PARTS + 1
+    expect(offline.locator("#parts li")).to_have_count(bent.PARTS + 1)
     whole = seen(offline)
     offline.get_by_label("Show part 2 alone").click()
     alone = seen(offline)
-    assert "3 of 4 hidden" in offline.locator("#parts-words").inner_text()
+    expect(offline.locator("#parts-words")).to_contain_text("3 of 4 hidden", use_inner_text=True)
     assert differ(whole, alone)
     offline.get_by_label("Show part 2 alone").click()
     assert not differ(whole, seen(offline))
@@ -127,7 +127,7 @@ def test_a_gaussian_is_followed_and_trails_are_drawn(offline, player):
     until(offline, "document.getElementById('note').innerText.includes('nothing at that point')")
     offline.focus("#overlay")
     offline.keyboard.press("Escape")
-    assert offline.locator("#followed").is_hidden()
+    expect(offline.locator("#followed")).to_be_hidden()
     assert offline.faults == []
 
 
@@ -180,7 +180,7 @@ def test_a_damaged_frame_costs_its_own_pictures_alone(offline, player, tmp_path)
     until(offline, "Number(document.body.dataset.place) > 2")
     until(offline, "document.body.dataset.place === '6.000'")
     offline.click("#play")
-    assert offline.locator("#curtain").is_hidden()
+    expect(offline.locator("#curtain")).to_be_hidden()
     offline.locator("#time").fill("0.88")
     until(offline, "document.body.dataset.place === '6.000'")
     assert differ(first, seen(offline))

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import browser_engine
 import fakes
-from browser_page import SIZES, looked_at, opened, push, shown, start_scene, until
+from browser_page import SIZES, expect, looked_at, opened, push, shown, start_scene, until
 from running import Running, fake_settings
 from sending import wait_for
 from waiting import HANG_S
@@ -44,7 +44,7 @@ def test_waiting(sized, service):
     with scene_of(service) as (_, id):
         opened(sized, service, id)
         title(sized, "Waiting for the first frame")
-        assert f"/v1/scenes/{id}/frames/0" in sized.locator("#curtain .detail").inner_text()
+        expect(sized.locator("#curtain .detail")).to_contain_text(f"/v1/scenes/{id}/frames/0", use_inner_text=True)
         looked_at(sized, "waiting")
 
 
@@ -97,7 +97,7 @@ def test_failed(sized, service):
         push(sdk, id, 0, red=fakes.RAISES)
         opened(sized, service, id)
         title(sized, "The scene has failed")
-        assert f"scas4d begin-again {id}" in sized.locator("#curtain .detail").inner_text()
+        expect(sized.locator("#curtain .detail")).to_contain_text(f"scas4d begin-again {id}", use_inner_text=True)
         assert sized.locator("#curtain p").first.inner_text()
         looked_at(sized, "failed")
 
@@ -111,7 +111,7 @@ def test_asleep(sized, service):
         sized.route("**/rig", lambda route: held.append(route))
         opened(sized, service, id)
         title(sized, "Waking the scene")
-        assert "asleep" in sized.locator("#scenes option:checked").inner_text()
+        expect(sized.locator("#scenes option:checked")).to_contain_text("asleep", use_inner_text=True)
         looked_at(sized, "asleep")
         held[0].continue_()
         shown(sized, frame="0")
@@ -171,10 +171,10 @@ def test_the_dialog_of_a_scene(sized, service):
         until(sized, "document.getElementById('manage-archive').innerText === 'Archive'")
         sized.click("#manage-delete")
         assert sdk.scene(id).committed == 1  # the first press only asks
-        assert sized.locator("#manage-delete").inner_text() == "Delete for good"
+        expect(sized.locator("#manage-delete")).to_have_text("Delete for good", use_inner_text=True)
         sized.click("#manage-close")
         sized.click("#manage-open")
-        assert sized.locator("#manage-delete").inner_text() == "Delete"
+        expect(sized.locator("#manage-delete")).to_have_text("Delete", use_inner_text=True)
 
 
 def test_a_scene_is_put_to_sleep_by_the_page_that_shows_it(sized, service):
@@ -209,7 +209,7 @@ def test_a_deletion_that_fails_is_told(sized, service):
         for _ in range(2):
             sized.click("#manage-delete")
         until(sized, "document.getElementById('manage-words').innerText.includes('disk does not do')")
-        assert sized.locator("#manage[open]").count() == 1
+        expect(sized.locator("#manage[open]")).to_have_count(1)
 
 
 def test_a_scene_is_begun_again_and_deleted_by_hand(sized, service):

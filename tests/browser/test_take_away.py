@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from browser_page import opened, push, start_scene, until
+from browser_page import expect, opened, push, start_scene, until
 from waiting import HANG_S
 
 from client.sdk import Client
@@ -110,7 +110,7 @@ def test_who_may_only_read_saves_what_is_there_and_makes_none(page, service, sce
     page.reload()
     until(page, "document.querySelector('#take-list .save')")
     assert page.is_hidden("#take-form")
-    assert page.locator("#take-list button").count() == 1  # to save; none removes
+    expect(page.locator("#take-list button")).to_have_count(1)  # to save; none removes
     page.evaluate("() => { delete window.showSaveFilePicker; }")
     with page.expect_download() as download:
         page.click("#take-list .save")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from browser_page import expect
+
 
 def drag(page):
     box = page.locator("#overlay").bounding_box()
@@ -23,14 +25,14 @@ def test_steps_are_marked_as_done_and_a_closed_tour_does_not_return(page, servic
         ("Show the parts", "#modes.outlined", lambda: page.get_by_role("radio", name="Parts").click()),
     ]
     for number, (title, outlined, attempt) in enumerate(tries, start=1):
-        assert page.locator("#tour-title").inner_text() == f"{number} of 4 {title}"
-        assert page.locator(outlined).count() == 1
-        assert done.count() == 0
+        expect(page.locator("#tour-title")).to_have_text(f"{number} of 4 {title}", use_inner_text=True)
+        expect(page.locator(outlined)).to_have_count(1)
+        expect(done).to_have_count(0)
         attempt()
         done.wait_for()
         page.locator("#tour-next").click()
     assert tour.is_hidden()
-    assert page.locator(".outlined").count() == 0
+    expect(page.locator(".outlined")).to_have_count(0)
     assert "tour" not in page.url
     page.goto("about:blank")
     page.goto(f"{service.url}/#scene={finished}&tour")
@@ -44,12 +46,12 @@ def test_it_is_shown_only_if_the_address_asks_for_it(chromium, service, finished
     page = context.new_page()
     page.goto(f"{service.url}/#scene={finished}")
     page.locator("#curtain").wait_for(state="hidden")
-    assert page.locator("#tour").is_hidden()
+    expect(page.locator("#tour")).to_be_hidden()
     page.goto("about:blank")
     page.goto(f"{service.url}/#scene={finished}&tour")
     page.locator("#tour-next").click()
     page.locator("#tour-back").click()
-    assert "1 of 4" in page.locator("#tour-title").inner_text()
+    expect(page.locator("#tour-title")).to_contain_text("1 of 4", use_inner_text=True)
     page.locator("#tour-close").click()
-    assert page.locator("#tour").is_hidden()
+    expect(page.locator("#tour")).to_be_hidden()
     context.close()

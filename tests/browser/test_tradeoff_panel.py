@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fakes
 import pytest
-from browser_page import opened, push, shown, start_scene, until
+from browser_page import expect, opened, push, shown, start_scene, until
 from waiting import HANG_S
 
 from client.sdk import Client
@@ -44,8 +44,8 @@ def test_what_was_measured_and_what_is_extrapolated_are_told_apart(page, service
     _, id = ran
     opened(page, service, id)
     until(page, "document.querySelectorAll('#tradeoff .point.measured').length === 2")
-    assert page.locator("#tradeoff .point.extrapolated").count() == 6
-    assert page.locator("#tradeoff .point.replayed").count() == 0
+    expect(page.locator("#tradeoff .point.extrapolated")).to_have_count(6)
+    expect(page.locator("#tradeoff .point.replayed")).to_have_count(0)
     said = page.locator("#tradeoff .point.measured title").first.text_content()
     assert said.startswith("40 iterations")
     assert "error 0.0250" in said
@@ -53,7 +53,7 @@ def test_what_was_measured_and_what_is_extrapolated_are_told_apart(page, service
     assert "time only" in page.locator("#tradeoff .point.extrapolated title").first.text_content()
     assert text(page, "tradeoff-unit").startswith("error")
     assert "40 iterations per frame, from frame 4 on" in text(page, "budget-words")
-    assert page.locator("#seconds .change").count() == 1  # where the budget changed
+    expect(page.locator("#seconds .change")).to_have_count(1)  # where the budget changed
     assert page.faults == []
 
 
@@ -111,7 +111,7 @@ def test_frames_under_a_budget_in_time_are_one_point(page, service):
         opened(page, service, id)
         until(page, "document.querySelectorAll('#tradeoff .point.measured').length === 1")
         page.evaluate(GROUPED)
-        assert page.locator("#tradeoff .point.measured").count() == 2
+        expect(page.locator("#tradeoff .point.measured")).to_have_count(2)
         titles = page.locator("#tradeoff .point.measured title").all_text_contents()
         assert titles[0].startswith("90 to 110 iterations")
         assert "7 frames" in titles[0]
@@ -141,14 +141,14 @@ def test_held_frames_are_marked_with_their_reason_and_cameras_have_their_health(
     _, id = ran
     opened(page, service, id, frame=6)
     shown(page, frame="6")
-    assert page.locator("#marks span").count() == 1
+    expect(page.locator("#marks span")).to_have_count(1)
     assert "the fake was asked to" in page.locator("#marks span").get_attribute("title")
     assert text(page, "moment").endswith("rejected")
     assert text(page, "reason") == "Frame 6: previous state kept: the fake was asked to."
-    assert page.locator("#psnr .rejected").count() == 1
+    expect(page.locator("#psnr .rejected")).to_have_count(1)
     page.locator("#time").fill("7")
     shown(page, frame="7")
-    assert page.locator("#reason").is_hidden()
+    expect(page.locator("#reason")).to_be_hidden()
     rows = page.locator("#cameras tr").all_inner_texts()
     assert "left out" in rows[1]
     assert "20%" in rows[2]

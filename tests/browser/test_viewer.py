@@ -8,7 +8,7 @@ import io
 import browser_engine
 import numpy as np
 import pytest
-from browser_page import FRAMES, canvas, opened, push, shown, start_scene, until
+from browser_page import FRAMES, canvas, expect, opened, push, shown, start_scene, until
 from PIL import Image
 from running import Running, fake_settings
 from waiting import HANG_S
@@ -53,12 +53,12 @@ def test_a_scene_is_picked_and_shown_with_its_figures(page, service, finished):
     page.select_option("#scenes", finished)
     picture = shown(page, frame=str(FRAMES - 1), mode="colour")
     assert picture[..., :3].max() > 100  # discs on black
-    assert page.locator("#state").inner_text() == "Ready"
-    assert f"{FRAMES} committed" in page.locator("#facts").inner_text()
-    assert page.locator("#psnr .dot").count() == FRAMES
-    assert page.locator("#seconds .bar").count() == FRAMES - 1
-    assert "frame 7 is next" in page.locator("#queue-words").inner_text()
-    assert page.locator("#curtain").is_hidden()
+    expect(page.locator("#state")).to_have_text("Ready", use_inner_text=True)
+    expect(page.locator("#facts")).to_contain_text(f"{FRAMES} committed", use_inner_text=True)
+    expect(page.locator("#psnr .dot")).to_have_count(FRAMES)
+    expect(page.locator("#seconds .bar")).to_have_count(FRAMES - 1)
+    expect(page.locator("#queue-words")).to_contain_text("frame 7 is next", use_inner_text=True)
+    expect(page.locator("#curtain")).to_be_hidden()
     assert page.faults == []
 
 
@@ -69,7 +69,7 @@ def test_the_effects_are_listed_with_what_switched_them(page, service):
         sdk.wait(id, 0)
         opened(page, service, id)
         page.locator("#effects li").wait_for()
-        assert page.locator("#effects li").all_inner_texts() == ["Static colour: pinned off"]
+        expect(page.locator("#effects li")).to_have_text(["Static colour: pinned off"], use_inner_text=True)
         usual, idle = page.locator("#effects-words").inner_text().split("Not needed here: ")
         assert usual.startswith("In every update: ")
         assert "rigidity" in usual
@@ -104,7 +104,7 @@ def test_time_is_scrubbed_by_slider_keys_and_chart_and_followed_live(page, servi
     first = rests(page, frame="0")
     assert differs(newest, first)
     assert page.locator("#moment").inner_text().startswith("frame 0")
-    assert page.locator("#live").get_attribute("aria-pressed") == "false"
+    expect(page.locator("#live")).to_have_attribute("aria-pressed", "false")
     page.focus("#overlay")
     page.keyboard.press(".")
     shown(page, frame="1")
@@ -157,9 +157,9 @@ def test_a_click_follows_a_point_and_nothing_is_said_where_there_is_none(page, s
     assert abs(ys - at[1] * drawn.shape[0]).min() < 6
     page.mouse.click(box["x"] + 5, box["y"] + box["height"] - 5)  # the background
     until(page, "document.getElementById('note').innerText.includes('no surface')")
-    assert page.locator("#tracks li").count() == 1
+    expect(page.locator("#tracks li")).to_have_count(1)
     page.click("#tracks button")
-    assert page.locator("#tracks li").count() == 0
+    expect(page.locator("#tracks li")).to_have_count(0)
     assert canvas(page, "overlay")[..., 3].max() == 0
     page.check("#frusta")
     page.focus("#overlay")
@@ -175,10 +175,10 @@ def test_a_bumped_camera_shows(page, service, finished):
     shown(page, frame=str(FRAMES - 1))
     until(page, "document.getElementById('camera-summary').innerText.includes('c2')")
     row = page.locator("#cameras tr.bad")
-    assert row.count() == 1
+    expect(row).to_have_count(1)
     assert row.locator("th").inner_text() == "c2"
     words = "Camera c2: its picture fits 11.0 dB worse: moved? The pictures are 1.3 times as bright."
-    assert page.locator("#camera-summary").inner_text() == words
+    expect(page.locator("#camera-summary")).to_have_text(words, use_inner_text=True)
     assert row.locator("td.words").get_attribute("title") == "its picture fits 11.0 dB worse: moved?"
     page.locator("#time").fill("3")  # before it was bumped
     until(page, "document.querySelectorAll('#cameras tr.bad').length === 0")
@@ -190,18 +190,18 @@ def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
         id = start_scene(sdk, "newborn")
         opened(page, service, id)
         until(page, "document.querySelector('#curtain h2').innerText === 'Waiting for the first frame'")
-        assert page.locator("#time").is_disabled()
+        expect(page.locator("#time")).to_be_disabled()
         push(sdk, id, 0)
         shown(page, frame="0")
         push(sdk, id, 1)
         shown(page, frame="1")  # followed live
         push(sdk, id, 2, red=250)  # the fake raises: the frame is set aside
         until(page, "document.getElementById('trouble').innerText.includes('Frame 2 failed')")
-        assert page.locator("#state").inner_text() == "Degraded"
-        assert page.locator("#psnr .fault").count() == 1
+        expect(page.locator("#state")).to_have_text("Degraded", use_inner_text=True)
+        expect(page.locator("#psnr .fault")).to_have_count(1)
         sdk.delete_scene(id)
         until(page, "document.querySelector('#curtain h2').innerText === 'The scene is gone'")
-        assert page.locator("#curtain").is_visible()
+        expect(page.locator("#curtain")).to_be_visible()
         page.select_option("#scenes", finished)
         shown(page, frame=str(FRAMES - 1))
     assert [fault for fault in page.faults if "404" not in fault] == []
@@ -219,8 +219,8 @@ def test_it_connects_again_when_the_service_restarts(page, tmp_path):
         shown(page, frame="0")
         service.stop()
         page.wait_for_selector("#banner:not([hidden])")
-        assert "connection to the service was lost" in page.locator("#banner").inner_text()
-        assert page.locator("#curtain").is_hidden()  # the last picture stays
+        expect(page.locator("#banner")).to_contain_text("connection to the service was lost", use_inner_text=True)
+        expect(page.locator("#curtain")).to_be_hidden()  # the last picture stays
         service = Running(settings, service.port, core=browser_engine.install)
         page.wait_for_selector("#banner[hidden]", state="attached")
         with Client(service.url, busy_timeout=HANG_S) as sdk:
@@ -364,7 +364,7 @@ def test_a_camera_s_picture_beside_the_view(page, service, finished):
     page.locator("#time").fill("0")
     until(page, f"{box}.frame === '0'")
     page.select_option("#beside-what", "")
-    assert page.locator("#beside").is_hidden()
+    expect(page.locator("#beside")).to_be_hidden()
     assert page.faults == []
 
 
@@ -387,13 +387,13 @@ def test_keys_work_whatever_was_used_last(page, service, finished):
         shown(page, mode="colour")
         page.keyboard.press(",")
     page.click("#play")
-    assert page.locator("#play").get_attribute("aria-label") == "Pause"
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
     page.keyboard.press(" ")  # not the button again
-    assert page.locator("#play").get_attribute("aria-label") == "Play"
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
     page.locator("#from").focus()
     page.keyboard.press("2")
     shown(page, mode="depth")
-    assert page.locator("#from").input_value() == "1"
+    expect(page.locator("#from")).to_have_value("1")
     assert page.faults == []
 
 
@@ -448,9 +448,9 @@ def test_a_link_shows_one_scene_and_changes_nothing(page, tmp_path):
         page.goto(service.url + link.address)  # in the same tab
         shown(page, frame="0")
         assert "token" not in page.url
-        assert page.locator("#scenes option").count() == 1
-        assert page.locator("#manage-open").is_hidden()
-        assert page.locator("#budget-box").is_hidden()
+        expect(page.locator("#scenes option")).to_have_count(1)
+        expect(page.locator("#manage-open")).to_be_hidden()
+        expect(page.locator("#budget-box")).to_be_hidden()
         page.select_option("#beside-what", "picture")
         until(page, "document.getElementById('beside').dataset.frame === '0'")
         page.reload()

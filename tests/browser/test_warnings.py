@@ -5,7 +5,7 @@ from __future__ import annotations
 import browser_engine
 import fakes
 import pytest
-from browser_page import FRAMES, opened, push, shown, start_scene, until
+from browser_page import FRAMES, expect, opened, push, shown, start_scene, until
 from waiting import HANG_S
 
 from client.sdk import Client
@@ -41,13 +41,13 @@ def test_warnings_are_sentences_in_a_place_of_their_own(page, service, guessed):
     assert [one.lower() for one in said] == [f"{one}.".lower() for one in known]
     assert said[0].startswith("Frame 0 is a guess: ")
     assert said[-1].endswith("frame 0.")
-    assert page.locator("#to-check").inner_text() == f"{len(known)} to check"
+    expect(page.locator("#to-check")).to_have_text(f"{len(known)} to check", use_inner_text=True)
     # The alarms of the frame stay where they are, and only they have the colour of alarms.
     until(page, "document.getElementById('camera-summary').innerText.includes('c2')")
     colour = "(e) => getComputedStyle(e).color"
     assert page.locator("#camera-summary").evaluate(colour) != page.locator("#warnings li").first.evaluate(colour)
     assert "epipolar" not in page.locator("#camera-summary").inner_text()
-    assert page.locator("#state").inner_text() == "Ready"
+    expect(page.locator("#state")).to_have_text("Ready", use_inner_text=True)
     page.locator("#time").fill("3")  # they are the scene's, whatever frame is looked at
     shown(page, frame="3")
     assert listed(page) == said
@@ -59,13 +59,13 @@ def test_many_are_folded_and_stay_as_they_were_left(page, service, guessed):
     opened(page, service, id)
     rest = page.locator("#warnings details li")
     page.locator("#warnings summary").wait_for()
-    assert page.locator("#warnings summary").inner_text() == f"{rest.count()} more"
-    assert rest.count() == len(sdk.scene(id).warnings) - 3
+    expect(page.locator("#warnings summary")).to_have_text(f"{rest.count()} more", use_inner_text=True)
+    expect(rest).to_have_count(len(sdk.scene(id).warnings) - 3)
     assert not rest.first.is_visible()
     page.focus("#warnings summary")
     page.keyboard.press("Space")  # opens them, and does not play
     assert rest.first.is_visible()
-    assert page.locator("#play").get_attribute("aria-label") == "Play"
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
     page.evaluate("document.querySelector('#warnings li').marked = true")
     push(sdk, id, FRAMES)
     shown(page, frame=str(FRAMES))
@@ -101,7 +101,7 @@ def test_a_scene_without_warnings_shows_none(page, service, finished, guessed):
     page.locator("#warnings").wait_for()
     page.select_option("#scenes", finished)
     shown(page, frame=str(FRAMES - 1))
-    assert page.locator("#warnings").is_hidden()
-    assert page.locator("#to-check").is_hidden()
+    expect(page.locator("#warnings")).to_be_hidden()
+    expect(page.locator("#to-check")).to_be_hidden()
     assert listed(page) == []
     assert page.faults == []

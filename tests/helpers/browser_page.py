@@ -12,6 +12,7 @@ import pytest
 from browser_engine import colours, make_rig, positions
 from PIL import Image
 from running import picture
+from waiting import HANG_S
 
 from scas4d_core.captures import InitialPoints
 
@@ -52,6 +53,14 @@ def until(page, condition):
         page.wait_for_function(f"() => {condition}")
     except TimeoutError as error:
         raise AssertionError(f"not within the time: {condition}; the page shows {_text(page)!r}") from error
+
+
+def expect(locator):
+    """Playwright's assertions on a locator, which wait: the page shows parts of one event at different times."""
+    from playwright.sync_api import expect as waiting_expect  # without it the tests of the page are skipped
+
+    waiting_expect.set_options(timeout=1000 * HANG_S)
+    return waiting_expect(locator)
 
 
 def _text(page):
