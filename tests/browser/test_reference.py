@@ -39,7 +39,7 @@ def test_the_pages_are_shown_and_can_be_searched(page, service):
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"{service.url}/docs")
     page.get_by_role("heading", name="Try it").wait_for()
-    field = page.get_by_label("Search").and_(page.locator("input"))
+    field = page.get_by_role("combobox", name="Search")
     for _ in range(int(HANG_S)):  # the key has an effect only after the page's script has started
         page.keyboard.press("/")
         page.wait_for_timeout(1000)
