@@ -17,6 +17,7 @@ import { call, scenePath, token } from "./service.js";
 import { beforeFirstFrame, OPENING, stateKey, stateWords, WAKING } from "./states.js";
 import { Stream } from "./stream.js";
 import { Beside } from "./view/beside.js";
+import { Headset } from "./view/headset.js";
 import { LiveView } from "./view/live.js";
 
 const SLEEP_TRIES = 10;
@@ -313,6 +314,9 @@ function fullScreen() {
   else $("stage").requestFullscreen?.().catch((error) => note(`Full screen is not available: ${error.message}`));
 }
 
+const wear = () => view.wear(() => timeline.play()).catch((error) => note(`The headset cannot be used: ${error.message}`));
+Headset.possible().then((possible) => ($("headset").hidden = !(possible && view.here.possible)));
+
 const fit = () => view.fit().catch((error) => note(error.message));
 
 // Controls.
@@ -344,6 +348,7 @@ $("who").addEventListener("change", (event) => view.setDrawn(event.target.value)
 $("fit").addEventListener("click", fit);
 $("snapshot").addEventListener("click", snapshot);
 $("full").addEventListener("click", fullScreen);
+$("headset").addEventListener("click", wear);
 $("to-check").addEventListener("click", () => {
   $("warnings").scrollIntoView({ block: "nearest" });
   $("warnings-title").focus({ preventScroll: true });

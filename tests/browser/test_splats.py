@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 from export_cases import bent
 from PIL import Image
+from splat_pictures import psnr, rendered
 
-from scas4d_core.cameras import Camera, Rig
 from scas4d_core.compact import CompactReader, CompactWriter, FileHeader
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.records import RecordKind
-from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
-from scas4d_core.engines.limits import scene_limits
-from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 
 ATTRIBUTES = ("means", "factors", "rotations", "colours", "foreground", "opacities", "retired", "ids")
@@ -228,25 +225,6 @@ def test_files_are_forgotten_by_when_they_were_shown(page, service):
     assert page.evaluate(BOUND) == [[10, 20], [0, 10], [0, 10, 20, 30], [0, 10]]
 
 
-def rendered(file, index, model, hidden_part=None):
-    """The CPU rasterizer's picture of a frame."""
-    with CompactReader(file) as reader:
-        state, head = reader.state(index), reader.head
-        if hidden_part is not None:
-            parts = reader.parts()[: len(state)]
-            state = state.retire(np.flatnonzero((parts == hidden_part) & state.present))
-    camera = head.world.camera_to_inside(
-        Camera("view", model["intrinsics"], np.array(model["world_to_camera"]), model["width"], model["height"])
-    )
-    inside = Rig(tuple(head.world.camera_to_inside(one) for one in head.rig.cameras))
-    features = np.concatenate([state.colours, np.zeros((len(state), 1), np.float32)], axis=1)
-    background = np.array([*head.background, 0], np.float32)
-    picture = CpuRasterizer(scene_limits("auto", inside.radius)).forward(
-        state.means, state.factors, state.opacities, features, CameraArrays.of(camera), background
-    )
-    return np.moveaxis(picture.features[:3], 0, -1).clip(0, 1)
-
-
 def view(number, width, height, scale):
     camera = browser_engine.make_rig().cameras[number]
     intrinsics = (np.array([[scale], [scale], [1]]) * camera.intrinsics).tolist()
@@ -259,10 +237,6 @@ def painted(page, service, file, place, model, software, hidden_part=None, ramp=
     order = {"place": place, "model": model, "software": software, "hiddenPart": hidden_part, "ramp": ramp}
     found = run(page, service, PAINT, file.read_bytes(), order)
     return np.array(Image.open(io.BytesIO(base64.b64decode(found["png"]))).convert("RGB")) / 255
-
-
-def psnr(one, other):
-    return -10 * np.log10(np.square(one - other).mean())
 
 
 @pytest.mark.parametrize("software", [False, True])

@@ -8,6 +8,7 @@ import { Splats } from "../splats/splats.js";
 import { Pace } from "../splats/pace.js";
 import { Orbit, project, readCamera } from "../view/geometry.js";
 import { listenToPointer, moveByKey } from "../view/gestures.js";
+import { Headset } from "../view/headset.js";
 import { drawTracks } from "../view/overlay.js";
 
 const SETTLE_MS = 220; // time at rest after which the picture is drawn sharp
@@ -22,6 +23,7 @@ let [splats, clock, orbit, rig] = [null, null, null, null];
 let scene = null; // what the worker reported about the files
 let shown = null; // { camera, place } of the current picture
 let followed = null; // { row, positions, at }
+let headset = null; // that shows the scene in place of the page
 let [dirty, movedAt, tick, pictures] = [true, -Infinity, 0, 0];
 
 // Opening.
@@ -71,6 +73,7 @@ function frames(message) {
   named.disabled = parts === 0;
   if (!parts) named.title = "This file has no parts";
   trails();
+  Headset.possible().then((possible) => ($("headset").hidden = !possible));
   if (message.damage) say(`Only part of the file can be read: ${message.damage}`);
   draw();
 }
@@ -91,17 +94,21 @@ function frame(now) {
 }
 
 function advance(now) {
-  const passed = tick ? (now - tick) / 1000 : 0;
-  tick = now;
-  if (!clock) return;
+  if (!clock || headset) return;
   const began = performance.now();
-  clock.pass(Math.min(passed, 0.5));
+  pass(now);
   if ((dirty || clock.playing) && !splats.busy) {
     const moves = moving();
     dirty = moves && pace.share < 1 && !clock.playing; // draws a sharp picture once at rest
     if (!dirty || performance.now() - movedAt < SETTLE_MS / 2 || !shown) request(moves);
   }
   measure("script", performance.now() - began);
+}
+
+function pass(now) {
+  const passed = tick ? (now - tick) / 1000 : 0;
+  tick = now;
+  clock.pass(Math.min(passed, 0.5));
 }
 
 function request(moves) {
@@ -239,6 +246,25 @@ function showPlaying() {
   $("play").setAttribute("aria-label", clock.playing ? "Pause" : "Play");
 }
 
+/** Shows the scene in a headset, until the button is pressed again or the person leaves. */
+async function wear() {
+  if (headset) return headset.end();
+  headset = new Headset(splats, orbit, {
+    moment: (now) => (pass(now), { place: clock.place }),
+    pressed: play,
+    ended() {
+      headset = null;
+      draw();
+    },
+  });
+  try {
+    await headset.begin();
+  } catch (error) {
+    headset = null;
+    say(`The headset cannot be used: ${error.message}`);
+  }
+}
+
 function step(count) {
   clock.step(count);
   showPlaying();
@@ -274,6 +300,7 @@ $("modes").addEventListener("keydown", (event) => {
 });
 $("trails").addEventListener("change", trails);
 $("fit").addEventListener("click", reset);
+$("headset").addEventListener("click", wear);
 $("play").addEventListener("click", play);
 $("back").addEventListener("click", () => step(-1));
 $("forth").addEventListener("click", () => step(1));

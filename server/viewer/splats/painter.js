@@ -12,11 +12,12 @@ const FRAMES_MORE = 32; // spare capacity for frames of trails, since live frame
 
 export class Painter {
   /**
-   * @param canvas canvas of the page or of a worker
+   * @param canvas canvas of the page or of a worker  @param headset whether the context is for a headset
    * @throws Error if the browser has no WebGL2
    */
-  constructor(canvas) {
-    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
+  constructor(canvas, headset = false) {
+    this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true,
+      powerPreference: "high-performance", xrCompatible: headset });
     if (!this.gl) throw new Error("this browser has no WebGL2");
     canvas.addEventListener?.("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener?.("webglcontextrestored", () => this.begin());
@@ -32,7 +33,8 @@ export class Painter {
     this.plain = gl.createVertexArray();
     this.room = this.count = this.width = this.height = 0;
     this.table = null; // colours that the `paints` texture has
-    this.target = null; // half floats, to blend in
+    this.screen = { frame: null, x: 0, y: 0 }; // framebuffer and lower left corner of the finished picture
+    this.target = null; // half floats if possible, to blend in
     this.copy = null; // of pixels that were painted without WebGL
     this.ellipses = this.trails = null;
     this.ramp = this.texture(gl.RGBA8, 256, 1);
@@ -75,10 +77,8 @@ export class Painter {
     this.room = rows * ROW;
     const texels = new Float32Array(4 * TEXELS * this.room);
     this.uploaded = Array.from({ length: STATES }, () => this.texture(gl.RGBA32F, TEXELS * ROW, rows));
-    this.states = new Recent(this.uploaded, (texture, state) => {
-      interleave(state, texels);
-      this.upload(texture, TEXELS, state.count, gl.RGBA, gl.FLOAT, texels);
-    });
+    this.states = new Recent(this.uploaded, (texture, state) =>
+      this.upload(texture, TEXELS, state.count, gl.RGBA, gl.FLOAT, state.texels ?? interleave(state, texels)));
     this.order = this.texture(gl.R32UI, ROW, rows);
     this.paints = this.texture(gl.RGBA8, ROW, rows);
     this.table = null;
@@ -146,11 +146,11 @@ export class Painter {
    */
   colours(background) {
     const { gl } = this;
-    if (this.floats) this.target ??= this.picture(gl.RGBA16F);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target?.frame ?? null);
+    this.target ??= this.picture(this.floats ? gl.RGBA16F : gl.RGBA8);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.frame);
     gl.clearColor(...background, 1);
     this.blend(false);
-    if (this.target) this.present(this.target, false);
+    this.present(this.target, false);
   }
 
   /** Paints the depth of the projected ellipses; `range` of the colours, `nothing` where coverage is below half. */
@@ -189,12 +189,13 @@ export class Painter {
     this.present(this.copy, true);
   }
 
-  /** Copies a picture to the canvas; `down` if its first row is the uppermost. */
+  /** Copies a picture to the screen; `down` if its first row is the uppermost. */
   present({ frame }, down) {
-    const { gl, width, height } = this;
+    const { gl, width, height, screen: { x, y } } = this;
+    const [first, last] = down ? [y + height, y] : [y, y + height];
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    gl.blitFramebuffer(0, 0, width, height, 0, down ? height : 0, width, down ? 0 : height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, this.screen.frame);
+    gl.blitFramebuffer(0, 0, width, height, x, first, x + width, last, gl.COLOR_BUFFER_BIT, gl.NEAREST);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height); // of the trails
   }

@@ -5,7 +5,7 @@ export class Splats {
   /**
    * @param canvas canvas that is permanently transferred to the worker
    * @param worker worker that runs worker.js
-   * @param on { frames(message), drawn(message), picked(message), track(message), trails(message), failed(message) }
+   * @param on { frames(message), drawn(message), picked(message), track(message), trails(message), failed(message) }; a headset adds sorted(message)
    * @param mostBytes maximum bytes of files to keep; Infinity if files cannot be fetched again, undefined for the default
    */
   constructor(canvas, worker, on, mostBytes) {

@@ -2,7 +2,7 @@
 
 export const TEXELS = 4; // texels of four floats per Gaussian: centre and opacity (0: retired); then three axes, each with a component of the colour
 
-/** Interleaves the attributes of a state into 16 floats per Gaussian. */
+/** Interleaves the attributes of a state into 16 floats per Gaussian, and returns them. */
 export function interleave({ count, means, factors, colours, opacities, retired }, texels) {
   for (let i = 0, to = 0; i < count; i++, to += 4 * TEXELS) {
     for (let k = 0; k < 3; k++) {
@@ -13,6 +13,7 @@ export function interleave({ count, means, factors, colours, opacities, retired 
     }
     texels[to + 3] = retired[i] ? 0 : opacities[i];
   }
+  return texels;
 }
 
 /** Buffers with the most recently used states, each of which is filled again only for another state. */

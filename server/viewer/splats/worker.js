@@ -2,16 +2,18 @@
 // It receives and sends messages { kind, … }; see `Splats`, which is the page's side.
 
 import { Painter } from "./painter.js";
+import { ROW } from "./programs.js";
 import { CompactReader } from "./reader.js";
 import { inside, nearOf, outside, partColour } from "./rig.js";
 import { Sequence } from "./sequence.js";
 import { Rasterizer } from "./software.js";
 import { Sorter } from "./sort.js";
+import { TEXELS, interleave } from "./texels.js";
 import { Ways, Walk } from "./trails.js";
 
 const NOTHING = [16 / 255, 19 / 255, 24 / 255]; // colour in depth pictures where there is nothing
 const NO_PART = [90, 96, 104];
-const post = (kind, message = {}) => self.postMessage({ kind, ...message });
+const post = (kind, message = {}, transferred = []) => self.postMessage({ kind, ...message }, transferred);
 
 const [sorter, rasterizer] = [new Sorter(), new Rasterizer()];
 const [trailWalk, trackWalk] = [new Walk(), new Walk()];
@@ -27,6 +29,8 @@ let look = { mode: "colour", background: null, hiddenParts: [], trails: 0, span:
 let cover = null; // mask of hidden Gaussians, from `hiddenParts`
 let paints = null; // RGBA colours of the Gaussians by their parts
 let followed = -1;
+const numbers = new WeakMap(); // of the arrays and states that the page may keep
+let numbered = 0;
 
 const actions = {
   canvas({ canvas, mostBytes }) {
@@ -68,7 +72,7 @@ const actions = {
 
   draw({ camera: model, ...asked }) {
     const began = performance.now();
-    const place = asked.place ?? sequence.placeOf(asked.index, asked.next, asked.share);
+    const place = placeOf(asked);
     if (place === null) return post("failed", { during: "draw", gone: true, words: `frame ${asked.index} is no longer loaded` });
     const ahead = asked.index === undefined ? asked.ahead : asked.next === null ? undefined : Math.floor(place) + 2;
     const { head } = sequence;
@@ -78,7 +82,7 @@ const actions = {
     const count = (moment.to ?? moment.from).count;
     sorter.sort(moment, camera.rows[2], covering(count));
     painter.size(camera.width, camera.height);
-    const background = mode === "colour" ? look.background ?? head.background : [0, 0, 0];
+    const background = backgroundOf(mode);
     const given = [moment, camera, sorter, paintOf(mode, count)];
     let range = null;
     if (mode === "depth") { // also in software, since it is rarely shown
@@ -98,6 +102,32 @@ const actions = {
       range: range?.map((z) => z / metres), followed: followed < 0 ? null : whereIs(followed) });
     if (ahead === undefined || ahead >= sequence.frames.length || sequence.has(ahead)) return;
     setTimeout(() => guarded("ahead", () => sequence.frames[ahead] && sequence.state(ahead)));
+  },
+
+  /** Sorts the Gaussians of a moment, which the page paints itself; `known` are the numbers of the states and colours that it has. */
+  sort({ axis, known, ...asked }) {
+    const place = placeOf(asked);
+    if (place === null) return post("sorted");
+    const { from, to, share } = sequence.moment(place);
+    const { count } = to ?? from;
+    sorter.sort({ from, to, share }, axis, covering(count));
+    const order = sorter.order.slice(0, ROW * Math.ceil(sorter.count / ROW));
+    const transferred = [order.buffer];
+    const sent = (value, contents) => {
+      if (!numbers.has(value)) numbers.set(value, ++numbered);
+      const number = numbers.get(value);
+      return { number, count: value.count, ...(known.includes(number) ? {} : contents(value)) };
+    };
+    const withTexels = (state) => {
+      const texels = interleave(state, new Float32Array(4 * TEXELS * ROW * Math.ceil(state.count / ROW)));
+      transferred.push(texels.buffer);
+      return { texels };
+    };
+    const mode = look.mode === "depth" ? "colour" : look.mode;
+    const paint = paintOf(mode, count);
+    const { world } = sequence.head;
+    post("sorted", { from: sent(from, withTexels), to: to && sent(to, withTexels), share, order, count: sorter.count, near, world,
+      background: backgroundOf(mode), paint: typeof paint === "string" ? paint : sent(paint, (values) => ({ values })) }, transferred);
   },
 
   /** Follows the Gaussian at a point of the last picture. */
@@ -142,6 +172,8 @@ function added(reader, name, isLive = false) {
     parts, damage: reader.damage });
 }
 
+const placeOf = ({ place, index, next, share }) => place ?? sequence.placeOf(index, next, share);
+const backgroundOf = (mode) => (mode === "colour" ? look.background ?? sequence.head.background : [0, 0, 0]);
 const centreOf = ({ means, count }, row) => [0, 1, 2].map((k) => means[k * count + row]);
 
 function whereIs(row) {

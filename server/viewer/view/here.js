@@ -13,7 +13,7 @@ const WARM = 3; // pictures before times are measured, since the first ones comp
 const LONGEST_BLEND_MS = 200; // longest transition between two live states
 const AGAIN_MS = 20_000; // delay before another attempt after a failure
 const SPAN = 30; // number of frames in a trail
-const BESIDE = ["ahead", "trails", "track"]; // operations whose failure does not affect the picture
+const BESIDE = ["ahead", "trails", "track", "sort"]; // operations whose failure does not affect the picture
 const KINDS = ["colour", "depth", "alpha"]; // parts come from the service, which finds the Gaussian with the largest weight in each pixel
 
 export class Here {
@@ -214,15 +214,18 @@ export class Here {
    * @param asked { index, next, share, camera, mode, background, moving }: share [0, 1] of the way from one frame to the next
    */
   draw(asked) {
-    const look = JSON.stringify([asked.mode, asked.background]);
-    if (look !== this.look) {
-      this.look = look;
-      this.splats.look({ mode: asked.mode, background: asked.background });
-    }
+    this.setLook(asked.mode, asked.background);
     const share = this.pace.share;
     const request = { ...asked, serial: ++this.serial, opened: this.opened, pace: share };
     const { index, next, share: way, camera } = asked;
     this.splats.draw({ index, next, share: way, camera }, request);
+  }
+
+  setLook(mode, background) {
+    const look = JSON.stringify([mode, background]);
+    if (look === this.look) return;
+    this.look = look;
+    this.splats.look({ mode, background });
   }
 
   shown(message) {

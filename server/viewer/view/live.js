@@ -3,6 +3,7 @@
 import { Orbit, project, readCamera } from "./geometry.js";
 import { paintDepth } from "./colours.js";
 import { listenToPointer, moveByKey } from "./gestures.js";
+import { Headset } from "./headset.js";
 import { Here } from "./here.js";
 import { between, drawFrusta, drawTracks } from "./overlay.js";
 import { readable } from "../page.js";
@@ -37,6 +38,7 @@ export class LiveView {
     this.largest = 8e6;
     this.here = new Here(canvas, { drawn: (...drawn) => this.drawnHere(...drawn), arrived: (all) => this.arrived(all), parts: (count) => on.parts(count) });
     this.touchedAt = this.movedAt = -Infinity;
+    this.headset = null; // shows the scene in place of the page
     this.listen();
     document.addEventListener("visibilitychange", () => this.moved());
     new ResizeObserver(() => this.moved()).observe(canvas.parentElement);
@@ -63,6 +65,7 @@ export class LiveView {
   }
 
   close() {
+    this.headset?.end();
     this.stream = null;
     this.here.close();
     clearTimeout(this.settle);
@@ -158,6 +161,39 @@ export class LiveView {
     this.moved();
   }
 
+  /**
+   * Shows the scene in a headset until it is called again or the person leaves.
+   *
+   * @param pressed called when a trigger of the headset is pressed
+   * @throws Error if the headset cannot be used
+   */
+  async wear(pressed) {
+    if (this.headset) return this.headset.end();
+    this.headset = new Headset(this.here.begin(), this.orbit, { moment: () => this.momentHere(), pressed, ended: () => this.unworn() });
+    this.here.setLook(this.mode, this.background);
+    try {
+      await this.headset.begin();
+    } catch (error) {
+      this.unworn();
+      throw error;
+    }
+  }
+
+  unworn() {
+    this.headset = null;
+    this.moved();
+  }
+
+  /** Moment to draw here, { index, next, share }; null if its frame is not loaded. */
+  momentHere() {
+    const live = this.follow();
+    const index = live ? this.here.live.frame : this.frame ?? readable().at(-1)?.index;
+    if (index === undefined) return null;
+    if (!live) this.here.fetch(index);
+    if (!this.here.has(index)) return null;
+    return live ? this.here.liveMoment() : { index, ...this.between };
+  }
+
   /** Looks through a camera of the rig. */
   lookFrom(index) {
     this.orbit.from(this.rig[index]);
@@ -188,6 +224,7 @@ export class LiveView {
   /** Draws or requests a picture after a change of camera, size or mode: a quick one now, a sharp one at rest. */
   moved(sharp = false) {
     if (!this.stream) return;
+    if (this.headset) return this.here.setLook(this.mode, this.background);
     if (document.hidden) return void this.follow();
     clearTimeout(this.settle);
     this.movedAt = performance.now();
@@ -208,11 +245,9 @@ export class LiveView {
   drawHere(moving = false) {
     const { here } = this;
     const live = this.follow();
-    const index = live ? here.live.frame : this.frame ?? readable().at(-1)?.index;
-    if (!here.draws(this.mode) || index === undefined || !(live || this.isTouched())) return false;
-    if (!live) here.fetch(index);
-    if (!here.has(index)) return here.alone && !here.said;
-    const moment = live ? here.liveMoment() : { index, ...this.between };
+    if (!here.draws(this.mode) || !(live || this.isTouched()) || !(live || readable().length)) return false;
+    const moment = this.momentHere();
+    if (!moment) return here.alone && !here.said;
     if (here.alone || live) this.stream.unsubscribe("view"); // otherwise, the service would render every new frame
     this.overtaken = this.tag; // pictures that have not arrived yet show another view
     clearTimeout(this.slow);
