@@ -1,4 +1,4 @@
-"""Records measured figures in docs/figures.json, and writes them into README.md and the pages of docs/.
+"""Records measured figures in docs/figures.json, and writes them into README.md, CONTRIBUTING.md and docs/.
 
 A record has a name, a date, the machine in words, and the command that measured it. It holds values, a table, or both.
 
@@ -236,8 +236,8 @@ def main(arguments: list[str]) -> int:
         table = tables_of(Path(arguments[3]).read_text())[int(arguments[4]) - 1]
         save(load() | {arguments[1]: new_record(arguments[2], table=table)})
     elif arguments[:1] == ["page"] and len(arguments) == 3:
-        page = Path(arguments[1]).read_text()
-        save(load() | changed_records(page, record_page(page, arguments[2]), load()))
+        written = Path(arguments[1]).read_text()
+        save(load() | changed_records(written, record_page(written, arguments[2]), load()))
     elif arguments not in ([], ["--check"]):
         print(__doc__, file=sys.stderr)
         return 2
