@@ -1,4 +1,4 @@
-"""Records measured figures in docs/figures.json, and writes them into README.md and the pages of docs/.
+"""Records measured figures in docs/figures.json, and writes them into README.md, CONTRIBUTING.md and docs/.
 
 A record has a name, a date, the machine in words, and the command that measured it. It holds values, a table, or both.
 
@@ -12,10 +12,11 @@ Run it as ``PYTHONPATH=. python scripts/figures.py``, with one of these argument
     time tests scripts/test                      # runs a command, and records its duration
     values NAME COMMAND median=1.25 worst=3.5    # records values that COMMAND has measured on this machine today
     table NAME COMMAND out/alarms/alarms.md 2    # records the second table of a Markdown file, in the same way
-    page docs/kernels.md COMMAND                 # records the values and tables of a page that COMMAND has just written
+    page docs/kernels.md COMMAND                 # records what COMMAND has just written into a page
     --check                                      # exits with 1 if a page is out of date
 
-All except ``--check`` then write the figures into the pages, and so does a call without arguments.
+``page`` records only values and tables that are new or differ from their records. All except ``--check`` then write the
+figures into the pages, and so does a call without arguments.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from studies.machine import in_words, machine
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "docs" / "figures.json"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 TABLE = re.compile(r"^<!-- table: (?P<name>[\w-]+) -->\n(?P<table>(?:\|.*\n)*)", re.MULTILINE)
 FIGURE = re.compile(r"(?P<text>\d{4}-\d\d-\d\d|\d[\d,]*(?:\.\d+)?)<!-- (?P<name>[\w.-]+) -->")
 ROW_VALUES = ("gaussians", "psnr_first", "psnr", "psnr_worst", "track_3d_median", "mte_2d", "seconds_update")
@@ -184,22 +185,41 @@ def tables_of(page: str) -> list[list[str]]:
     return [found.splitlines() for found in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)]
 
 
-def record_page(page: str, command: str) -> dict[str, dict[str, Any]]:
+def record_page(page: str, command: str) -> Records:
     """Returns the records of the named values and tables of a page that a command has written on this machine.
 
-    The date is that of the page, if it has one.
+    The date of a record is its own on the page, otherwise the last date before it, otherwise today's.
     """
-    records: dict[str, dict[str, Any]] = {}
-    for match in FIGURE.finditer(page):
+    records: Records = {}
+    date: dict[str, str] = {}
+    for match in sorted([*FIGURE.finditer(page), *TABLE.finditer(page)], key=re.Match.start):
         name, _, key = match["name"].partition(".")
-        record = records.setdefault(name, new_record(command))
-        if key == "date":
-            record["date"] = match["text"]
+        record = records.setdefault(name, new_record(command) | date)
+        if match.re is TABLE:
+            record["table"] = match["table"].splitlines()
+        elif key == "date":
+            date = {"date": match["text"]}
+            record |= date
         else:
-            record.setdefault("values", {})[key] = float(match["text"].replace(",", ""))
-    for match in TABLE.finditer(page):
-        records.setdefault(match["name"], new_record(command))["table"] = match["table"].splitlines()
+            is_date = DATE.fullmatch(match["text"])
+            record.setdefault("values", {})[key] = match["text"] if is_date else float(match["text"].replace(",", ""))
     return records
+
+
+def changed_records(page: str, measured: Records, known: Records) -> Records:
+    """Returns the measured records of a page whose values, tables or dates are not those of the known records."""
+    changed = set()
+    for match in FIGURE.finditer(page):
+        try:
+            same = format_like(match["text"], value_of(known, match["name"])) == match["text"]
+        except KeyError:
+            same = False
+        if not same:
+            changed.add(match["name"].partition(".")[0])
+    for name, record in measured.items():
+        if "table" in record and record["table"] != known.get(name, {}).get("table"):
+            changed.add(name)
+    return {name: record for name, record in measured.items() if name in changed}
 
 
 def main(arguments: list[str]) -> int:
@@ -216,7 +236,8 @@ def main(arguments: list[str]) -> int:
         table = tables_of(Path(arguments[3]).read_text())[int(arguments[4]) - 1]
         save(load() | {arguments[1]: new_record(arguments[2], table=table)})
     elif arguments[:1] == ["page"] and len(arguments) == 3:
-        save(load() | record_page(Path(arguments[1]).read_text(), arguments[2]))
+        written = Path(arguments[1]).read_text()
+        save(load() | changed_records(written, record_page(written, arguments[2]), load()))
     elif arguments not in ([], ["--check"]):
         print(__doc__, file=sys.stderr)
         return 2

@@ -102,7 +102,18 @@ def test_figures_of_a_page_that_a_study_wrote_are_recorded() -> None:
         "command": "scripts/bench speed", "date": "2026-11-01", "values": {"rate": 1200.5}
     }  # fmt: skip
     assert records["times"]["table"] == ["| 1 |", "|---|"]
+    assert records["times"]["date"] == "2026-11-01"
     assert figures.with_figures(page, records) == page
+
+
+def test_only_figures_that_a_study_changed_are_recorded() -> None:
+    page = "35.7<!-- robot.psnr -->, 2<!-- speed.rate -->, 2025-01-01<!-- days.begun -->\n\n<!-- table: a -->\n| 1 |\n"
+    measured = figures.record_page(page, "scripts/bench speed")
+    assert measured["days"]["values"] == {"begun": "2025-01-01"}
+    known = RECORDS | {"speed": {"values": {"rate": 1}}, "a": {"table": ["| 1 |"]}}
+    assert set(figures.changed_records(page, measured, known)) == {"speed", "days"}
+    assert set(figures.changed_records(page, measured, known | measured)) == set()
+    assert set(figures.changed_records(page, measured, {})) == {"robot", "speed", "days", "a"}
 
 
 @pytest.mark.parametrize(
