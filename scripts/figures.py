@@ -1,13 +1,22 @@
-"""Records measured figures in docs/figures.json, and writes them into README.md and the pages of docs/.
+"""Records measured figures in docs/figures.json, and writes them into README.md, CONTRIBUTING.md and docs/.
 
-A figure in a page is followed by a comment with its name, such as ``35.7<!-- robot.psnr --> dB``. It is written with as
-many decimals as the number that it replaces. ``robot.date``, ``robot.machine`` and ``robot.command`` can be used as
-well.
+A record has a name, a date, the machine in words, and the command that measured it. It holds values, a table, or both.
 
-PYTHONPATH=. python scripts/figures.py rows out/evaluate/rows/robot*.json  # records rows of `scas4d evaluate`
-PYTHONPATH=. python scripts/figures.py time tests scripts/test            # runs a command, and records its duration
-PYTHONPATH=. python scripts/figures.py                                    # writes all figures into the pages
-PYTHONPATH=. python scripts/figures.py --check                            # exits with 1 if a page is out of date
+- A value in a page is followed by a comment with its name, such as ``35.7<!-- robot.psnr --> dB``. It is written with
+  as many decimals as the number that it replaces. ``robot.date`` can be used as well.
+- A table in a page follows the line ``<!-- table: robot -->``, and is replaced as a whole.
+
+Run it as ``PYTHONPATH=. python scripts/figures.py``, with one of these arguments::
+
+    rows out/evaluate/rows/robot*.json           # records rows of `scas4d evaluate`
+    time tests scripts/test                      # runs a command, and records its duration
+    values NAME COMMAND median=1.25 worst=3.5    # records values that COMMAND has measured on this machine today
+    table NAME COMMAND out/alarms/alarms.md 2    # records the second table of a Markdown file, in the same way
+    page docs/kernels.md COMMAND                 # records what COMMAND has just written into a page
+    --check                                      # exits with 1 if a page is out of date
+
+``page`` records only values and tables that are new or differ from their records. All except ``--check`` then write the
+figures into the pages, and so does a call without arguments.
 """
 
 from __future__ import annotations
@@ -27,13 +36,15 @@ from studies.machine import in_words, machine
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "docs" / "figures.json"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TABLE = re.compile(r"^<!-- table: (?P<name>[\w-]+) -->\n(?P<table>(?:\|.*\n)*)", re.MULTILINE)
 FIGURE = re.compile(r"(?P<text>\d{4}-\d\d-\d\d|\d[\d,]*(?:\.\d+)?)<!-- (?P<name>[\w.-]+) -->")
 ROW_VALUES = ("gaussians", "psnr_first", "psnr", "psnr_worst", "track_3d_median", "mte_2d", "seconds_update")
 UNIT = r"(?:(?:dB|ms|s|seconds?|minutes?|hours?|kB|MB|GB|frames/s|frames per second|times|pixels)\b|%)"
-COUNT = r"\d[\d.,]*|half a|one|two|three|four|five|six|seven|eight|nine|ten|twenty|thirty|forty|fifty|sixty"
-UNRECORDED = re.compile(rf"(?<![\w.])(?:{COUNT})[\s-]?{UNIT}")
-"""A number or numeral with a unit, without the comment that names a figure."""
+NUMERAL = "half a|one|two|three|four|five|six|seven|eight|nine|ten|twenty|thirty|forty|fifty|sixty"
+NUMBER_WITH_UNIT = re.compile(rf"(?<![\w.])\d[\d.,]*[\s-]?{UNIT}")
+NUMERAL_WITH_UNIT = re.compile(rf"\b(?:{NUMERAL})[\s-]{UNIT}")
+DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 Records = dict[str, dict[str, Any]]
 
@@ -57,7 +68,7 @@ def value_of(records: Records, name: str) -> Any:
     """
     group, _, key = name.partition(".")
     record = records[group]
-    return record["values"][key] if key in record["values"] else record[key]
+    return {**record, **record.get("values", {})}[key]
 
 
 def format_like(text: str, value: Any) -> str:
@@ -73,23 +84,54 @@ def format_like(text: str, value: Any) -> str:
 
 
 def with_figures(page: str, records: Records) -> str:
-    """Returns the text of a page with the recorded figures."""
+    """Returns the text of a page with the recorded values and tables.
+
+    Raises:
+        KeyError: if a value or table was not recorded.
+    """
 
     def replace(match: re.Match[str]) -> str:
         text, name = match["text"], match["name"]
         return f"{format_like(text, value_of(records, name))}<!-- {name} -->"
 
-    return FIGURE.sub(replace, page)
+    def replace_table(match: re.Match[str]) -> str:
+        return "\n".join((f"<!-- table: {match['name']} -->", *records[match["name"]]["table"], ""))
+
+    return TABLE.sub(replace_table, FIGURE.sub(replace, page))
+
+
+def without_figures(page: str) -> str:
+    """Returns a page without recorded figures, code and tables of settings."""
+    text = TABLE.sub("", FIGURE.sub("", page))
+    return re.sub(
+        r"^```.*?^```|`[^`]*`|<!-- settings: .*?<!-- end of settings", "", text, flags=re.DOTALL | re.MULTILINE
+    )
 
 
 def unrecorded(page: str) -> list[str]:
-    """Returns the numbers with units in a page that are not recorded figures, outside of code.
+    """Returns the numbers and numerals with units in a page that are not recorded, outside of code.
 
     >>> unrecorded("35.7<!-- robot.psnr --> dB and `10 s`, but 3 s and two minutes")
     ['3 s', 'two minutes']
     """
-    text = re.sub(r"^```.*?^```|`[^`]*`", "", page, flags=re.DOTALL | re.MULTILINE)
-    return UNRECORDED.findall(FIGURE.sub("", text))
+    text = without_figures(page)
+    return NUMBER_WITH_UNIT.findall(text) + NUMERAL_WITH_UNIT.findall(text)
+
+
+def unrecorded_in_sections(page: str) -> list[str]:
+    """Returns the numbers with units that are not recorded in sections with recorded figures, and all dates.
+
+    Limits and settings in such sections are written as code, to set them apart. Other sections describe no measurement.
+
+    >>> unrecorded_in_sections("# Speed\\nTakes 3 s, 4<!-- a.b --> s or `5 s`.\\n# Limits\\nUp to 5 s, 2026-01-01.")
+    ['3 s', '2026-01-01']
+    """
+    found = []
+    for section in re.split(r"^(?=#+ )", page, flags=re.MULTILINE):
+        text = without_figures(section)
+        found += NUMBER_WITH_UNIT.findall(text) if FIGURE.search(section) or TABLE.search(section) else []
+        found += DATE.findall(text)
+    return found
 
 
 def record_rows(paths: list[Path]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -121,17 +163,63 @@ def record_rows(paths: list[Path]) -> Iterator[tuple[str, dict[str, Any]]]:
         )
 
 
+def new_record(command: str, **measured: Any) -> dict[str, Any]:
+    """Returns a record of what a command has measured on this machine today."""
+    return {"command": command, "date": str(datetime.now(UTC).date()), "machine": in_words(machine()), **measured}
+
+
 def record_time(command: list[str], run: Callable[[list[str]], Any]) -> dict[str, Any]:
     """Runs a command from the root of the project, and returns a record of its duration."""
     begin = time.monotonic()
     run(command)
     seconds = time.monotonic() - begin
-    return {
-        "command": shlex.join(command),
-        "date": str(datetime.now(UTC).date()),
-        "machine": in_words(machine()),
-        "values": {"seconds": round(seconds, 1), "minutes": round(seconds / 60, 2)},
-    }
+    return new_record(shlex.join(command), values={"seconds": round(seconds, 1), "minutes": round(seconds / 60, 2)})
+
+
+def tables_of(page: str) -> list[list[str]]:
+    """Returns the lines of each table of a Markdown text.
+
+    >>> tables_of("| a |\\n|---|\\n| 1 |\\n\\ntext\\n")
+    [['| a |', '|---|', '| 1 |']]
+    """
+    return [found.splitlines() for found in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)]
+
+
+def record_page(page: str, command: str) -> Records:
+    """Returns the records of the named values and tables of a page that a command has written on this machine.
+
+    The date of a record is its own on the page, otherwise the last date before it, otherwise today's.
+    """
+    records: Records = {}
+    date: dict[str, str] = {}
+    for match in sorted([*FIGURE.finditer(page), *TABLE.finditer(page)], key=re.Match.start):
+        name, _, key = match["name"].partition(".")
+        record = records.setdefault(name, new_record(command) | date)
+        if match.re is TABLE:
+            record["table"] = match["table"].splitlines()
+        elif key == "date":
+            date = {"date": match["text"]}
+            record |= date
+        else:
+            is_date = DATE.fullmatch(match["text"])
+            record.setdefault("values", {})[key] = match["text"] if is_date else float(match["text"].replace(",", ""))
+    return records
+
+
+def changed_records(page: str, measured: Records, known: Records) -> Records:
+    """Returns the measured records of a page whose values, tables or dates are not those of the known records."""
+    changed = set()
+    for match in FIGURE.finditer(page):
+        try:
+            same = format_like(match["text"], value_of(known, match["name"])) == match["text"]
+        except KeyError:
+            same = False
+        if not same:
+            changed.add(match["name"].partition(".")[0])
+    for name, record in measured.items():
+        if "table" in record and record["table"] != known.get(name, {}).get("table"):
+            changed.add(name)
+    return {name: record for name, record in measured.items() if name in changed}
 
 
 def main(arguments: list[str]) -> int:
@@ -141,6 +229,15 @@ def main(arguments: list[str]) -> int:
     elif arguments[:1] == ["time"] and len(arguments) > 2:
         run = lambda command: subprocess.run(command, cwd=ROOT, check=True)  # noqa: E731
         save(load() | {arguments[1]: record_time(arguments[2:], run)})
+    elif arguments[:1] == ["values"] and len(arguments) > 3:
+        pairs = [text.partition("=") for text in arguments[3:]]
+        save(load() | {arguments[1]: new_record(arguments[2], values={key: float(value) for key, _, value in pairs})})
+    elif arguments[:1] == ["table"] and len(arguments) == 5:
+        table = tables_of(Path(arguments[3]).read_text())[int(arguments[4]) - 1]
+        save(load() | {arguments[1]: new_record(arguments[2], table=table)})
+    elif arguments[:1] == ["page"] and len(arguments) == 3:
+        written = Path(arguments[1]).read_text()
+        save(load() | changed_records(written, record_page(written, arguments[2]), load()))
     elif arguments not in ([], ["--check"]):
         print(__doc__, file=sys.stderr)
         return 2

@@ -29,8 +29,16 @@ def test_the_readme_has_no_other_numbers_with_units() -> None:
     assert figures.unrecorded((ROOT / "README.md").read_text()) == []
 
 
+@pytest.mark.parametrize("page", figures.PAGES, ids=lambda page: page.name)
+def test_sections_with_measurements_have_no_other_numbers_with_units(page: Path) -> None:
+    assert figures.unrecorded_in_sections(page.read_text()) == []
+
+
 def test_every_record_names_command_date_and_machine_and_is_used() -> None:
-    used = {name.partition(".")[0] for page in figures.PAGES for _, name in figures.FIGURE.findall(page.read_text())}
+    used = set()
+    for page in figures.PAGES:
+        used |= {name.partition(".")[0] for _, name in figures.FIGURE.findall(page.read_text())}
+        used |= {name for name, _ in figures.TABLE.findall(page.read_text())}
     records = figures.load()
     assert set(records) == used
     for name, record in records.items():
@@ -65,8 +73,62 @@ def test_numbers_with_units_must_be_recorded(text: str) -> None:
 
 def test_what_is_no_measurement_needs_no_record() -> None:
     assert (
-        figures.unrecorded("Python 3.11, 27 cameras 640×360, port 8000, two commands, 1.0<!-- robot.psnr --> dB") == []
+        figures.unrecorded(
+            "Python 3.11, 27 cameras 640×360, port 8000, two commands, the two ones, 1.0<!-- robot.psnr --> dB"
+        )
+        == []
     )
+
+
+def test_tables_of_the_pages_are_replaced() -> None:
+    records = {"speed": {"table": ["| a |", "|---|", "| 2 |"]}}
+    page = "# Speed\n\n<!-- table: speed -->\n| a |\n|---|\n| 1 |\n| 1 |\n\nText.\n\n| b |\n|---|\n"
+    assert figures.with_figures(page, records) == page.replace("| 1 |\n| 1 |", "| 2 |")
+    with pytest.raises(KeyError, match="speed"):
+        figures.with_figures(page, {})
+
+
+def test_a_table_of_a_study_is_found_by_its_number() -> None:
+    assert figures.tables_of("| a |\n|---|\n\ntext | no\n\n| b |\n|---|\n| 1 |\n") == [
+        ["| a |", "|---|"], ["| b |", "|---|", "| 1 |"]
+    ]  # fmt: skip
+
+
+def test_figures_of_a_page_that_a_study_wrote_are_recorded() -> None:
+    page = "On 2026-11-01<!-- speed.date -->: 1,200.5<!-- speed.rate -->\n\n<!-- table: times -->\n| 1 |\n|---|\n"
+    records = figures.record_page(page, "scripts/bench speed")
+    assert records["speed"].pop("machine")
+    assert records["speed"] == {
+        "command": "scripts/bench speed", "date": "2026-11-01", "values": {"rate": 1200.5}
+    }  # fmt: skip
+    assert records["times"]["table"] == ["| 1 |", "|---|"]
+    assert records["times"]["date"] == "2026-11-01"
+    assert figures.with_figures(page, records) == page
+
+
+def test_only_figures_that_a_study_changed_are_recorded() -> None:
+    page = "35.7<!-- robot.psnr -->, 2<!-- speed.rate -->, 2025-01-01<!-- days.begun -->\n\n<!-- table: a -->\n| 1 |\n"
+    measured = figures.record_page(page, "scripts/bench speed")
+    assert measured["days"]["values"] == {"begun": "2025-01-01"}
+    known = RECORDS | {"speed": {"values": {"rate": 1}}, "a": {"table": ["| 1 |"]}}
+    assert set(figures.changed_records(page, measured, known)) == {"speed", "days"}
+    assert set(figures.changed_records(page, measured, known | measured)) == set()
+    assert set(figures.changed_records(page, measured, {})) == {"robot", "speed", "days", "a"}
+
+
+@pytest.mark.parametrize(
+    ("section", "found"),
+    [
+        ("Takes 3 s, 4<!-- a.b --> s, `5 s` or 6%.", ["3 s", "6%"]),
+        ("<!-- table: a -->\n| 1 s |\n\nAt most 2 s.", ["2 s"]),
+        ("At most 2 s.", []),
+        ("Measured on 2026-12-01.", ["2026-12-01"]),
+        ("Measured on 2026-12-01<!-- a.date -->.", []),
+    ],
+)
+def test_measured_sections_are_those_with_figures_or_dates(section: str, found: list[str]) -> None:
+    page = f"# Limits\n\nAt most 9 s.\n\n## Speed\n\n{section}\n\n## Others\n\nAt most 9 s.\n"
+    assert figures.unrecorded_in_sections(page) == found
 
 
 def row_file(folder: Path, name: str, **changes: object) -> Path:

@@ -32,6 +32,7 @@ def frontier(
 
     Rows, which contain the accuracy, can be measured on a busy machine. Times are measured by alternating between
     settings and require an idle machine. The page and its plots are then written from everything in the study's folder.
+    After writing a page in docs/, record its figures: `scripts/figures.py page docs/accuracy-and-time.md COMMAND`.
 
     Example: scripts/bench frontier captures/robot --axes iterations --axes layers
     """

@@ -21,6 +21,7 @@ from studies.frontier.tradeoff import (
     undominated,
 )
 from studies.machine import provenance
+from studies.marks import marked, marked_days, marked_table
 
 PREVIEW_LOSS_DB = 4.0
 """Largest PSNR loss allowed for a preview, relative to the default."""
@@ -60,12 +61,16 @@ CHOICE = (
 """Columns of the table of recommended settings."""
 
 
+ITERATIONS, EQUAL = "accuracy-iterations", "accuracy-equal-time"
+"""Names of the records of the tables that compare iterations, and the methods at equal time."""
+
+
 class NothingMeasured(ValueError):
     """Raised if the study has no rows for the captures."""
 
 
 def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES) -> str:
-    """Draws the plots into a folder named after the page and writes the page.
+    """Draws the plots into a folder named after the page and writes the page, with marked figures.
 
     Args:
         out: study folder.
@@ -140,8 +145,11 @@ def equal_words(compared: Sequence[EqualSeconds]) -> str:
     if not leads:
         return "Not measured at a common time."
     ahead = sum(lead > 0 for lead in leads)
-    words = f"`scas4d` is ahead at {ahead} of {len(leads)} budgets; the smallest lead is {min(leads):+.2f} dB."
-    return words + (f" The measured range does not include the other {missing}." if missing else "")
+    named = {"ahead": str(ahead), "budgets": str(len(leads)), "smallest": f"{min(leads):+.2f}", "missing": str(missing)}
+    words = {name: marked(text, f"{EQUAL}.{name}") for name, text in named.items()}
+    text = f"`scas4d` is ahead at {words['ahead']} of {words['budgets']} budgets;\n"
+    text += f"the smallest lead is {words['smallest']} dB."
+    return text + (f" The measured range does not include the other {words['missing']}." if missing else "")
 
 
 def _draw(points: Sequence[Point], means: Sequence[Point], captures: Sequence[str], folder: Path, updates: int) -> None:
@@ -165,7 +173,8 @@ def _text(
     iterations = [point for method in METHODS for point in curve(means, method)]
     compared = equal_seconds(points, captures)
     others = "\n\n".join(
-        f"**{words}**{_over(points, axis, captures)}\n\n" + score_table(axis_means, base)
+        f"**{words}**{_over(points, axis, captures)}\n\n"
+        + marked_table(score_table(axis_means, base), f"accuracy-{axis}")
         for axis, words in AXIS_WORDS.items()
         for axis_means, base in [_axis_means(points, axis, captures)]
         if axis_means
@@ -184,13 +193,13 @@ dominated if another is at least as fast and more accurate.
 
 ## Recommended settings
 
-{_choice(means, default)}
+{marked_table(_choice(means, default), "accuracy-recommended")}
 
 Selection rules:
 
-- preview: the fastest setting within {PREVIEW_LOSS_DB:g} dB of the default;
-- live show: the slowest setting for which each doubling of the time gains at least {LIVE_GAIN_DB:g} dB;
-- archive: the fastest setting within {ARCHIVE_GAIN_DB:g} dB of the best.
+- preview: the fastest setting within `{PREVIEW_LOSS_DB:g} dB` of the default;
+- live show: the slowest setting for which each doubling of the time gains at least `{LIVE_GAIN_DB:g} dB`;
+- archive: the fastest setting within `{ARCHIVE_GAIN_DB:g} dB` of the best.
 
 ## Comparison at equal time
 
@@ -199,16 +208,16 @@ that time is interpolated linearly in log time between measured settings. Settin
 than another are omitted. Cells show the lead of `scas4d` in dB and both PSNR values (`scas4d` : baseline).
 {equal_words(compared)}
 
-{equal_table(compared)}
+{marked_table(equal_table(compared), EQUAL)}
 
 ![captures]({stem}/captures.png)
 
 ## Iterations
 
-{score_table(iterations, default)}
+{marked_table(score_table(iterations, default), ITERATIONS)}
 
 With 10 iterations, updates miss motion. Fitting the missed motion as new objects takes longer than the saved iterations
-(*rest* in the stage plot; confirmed on *robot* on 2026-11-27).
+(*rest* in the stage plot).
 
 ## One setting at a time
 
@@ -270,9 +279,10 @@ def _provenance(out: Path, captures: Sequence[str]) -> str:
     rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
     times = [row for name in captures if (row := read_times(out, name)) is not None]
     when, _, cores = provenance([*rows, *times])
-    where = provenance(times)[1] if times else "not timed separately; CPU seconds of single-threaded rows"
+    where = f"`{provenance(times)[1]}`" if times else "not timed separately; CPU seconds of single-threaded rows"
     return (
-        f"- Measured: {when}.\n- Machine for times: {where}.\n- Machine for accuracy: {provenance(rows)[1]}.\n"
+        f"- Measured: {marked_days(when, ITERATIONS)}.\n"
+        f"- Machine for times: {where}.\n- Machine for accuracy: `{provenance(rows)[1]}`.\n"
         f"- Source versions of the core: {cores}."
     )
 

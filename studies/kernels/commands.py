@@ -20,6 +20,8 @@ def kernels(
 
     Also measures peak memory, for which frame 0 is fitted again. Requires an idle machine. NUMBA_NUM_THREADS sets the
     number of threads.
+
+    After writing docs/kernels.md with --out, record its figures: `scripts/figures.py page docs/kernels.md COMMAND`.
     """
     from studies.kernels import kernels as study
     from studies.quality.settings import settings_of

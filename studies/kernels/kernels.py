@@ -39,6 +39,7 @@ from studies.apart import in_a_process
 from studies.kernels import regions
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
+from studies.marks import marked, marked_table
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 from studies.quality.targets import KERNELS, TARGETS
 
@@ -258,20 +259,25 @@ BEGIN, END = "<!-- scripts/bench kernels: begin -->", "<!-- scripts/bench kernel
 
 
 def page(row: Row) -> str:
-    """Returns the generated part of docs/kernels.md: command, machine, date, tables and measured quantities."""
+    """Returns the generated part of docs/kernels.md: command, machine, date, tables and measured quantities.
+
+    Its figures are marked for ``scripts/figures.py``.
+    """
     stages = sorted(row["seconds_stages"].items(), key=lambda item: -item[1])
     names = "|".join(f" {name} " for name, _ in stages)
     seconds = "|".join(f" {value:.3f} " for _, value in stages)
+    by_stage = f"|{names}|\n|{'---|' * len(stages)}\n|{seconds}|"
     return f"""{BEGIN}
 
-Measured with `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
-({in_words(row["machine"])}; source version of the core: {row["core"]}):
+Measured with `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on
+{marked(row["measured"][:10], "kernels-cost.date")}
+(`{in_words(row["machine"])}`; source version of the core: {row["core"]}):
 
-{table(row)}
+{marked_table(table(row), "kernels-cost")}
 
 - A pair is one Gaussian blended into one pixel.
-- Frame 0: {_scene_words(row["frame_0"])}.
-- Cloud: {_scene_words(row["cloud"])}.
+- Frame 0: {_scene_words(row["frame_0"], "frame_0")}.
+- Cloud: {_scene_words(row["cloud"], "cloud")}.
 - Rasterizer times cover projection, depth sorting, tile lists, blending, and their backward passes. "Arithmetic only"
   covers the exp and multiply-add operations for the same number of pairs, in cache, with four channels.
 - "Counting all lanes" treats every pixel of the visited 4×4 blocks as a pair.
@@ -281,18 +287,20 @@ Measured with `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernel
 
 Median seconds per update, by stage:
 
-|{names}|
-|{"---|" * len(stages)}
-|{seconds}|
+{marked_table(by_stage, "kernels-stages")}
 
 {END}"""
 
 
-def _scene_words(on: Row) -> str:
+def _scene_words(on: Row, name: str) -> str:
     width, height = on["picture"]
+    gaussians = marked(f"{on['gaussians']:,}", f"kernels-cost.{name}_gaussians")
+    pairs = marked(f"{on['pairs_per_view']:,.0f}", f"kernels-cost.{name}_pairs")
+    filled = marked(f"{100 * on['lanes_filled']:.0f}", f"kernels-cost.{name}_filled")
     return (
-        f"{on['gaussians']:,} Gaussians, {on['views']} images of {width}×{height} with an average of "
-        f"{on['pairs_per_view']:,.0f} pairs; {100 * on['lanes_filled']:.0f}% of the lanes are pairs"
+        f"{gaussians} Gaussians, {on['views']} images of {width}×{height}\n"
+        f"  with an average of {pairs} pairs;\n"
+        f"  {filled}% of the lanes are pairs"
     )
 
 

@@ -27,6 +27,7 @@ def paper(
     """Reproduces the paper's experiments on captures and reports where the results agree with the paper's figures.
 
     Rows that are missing in the frontier study are measured first, beginning with the cheapest.
+    After writing a page in docs/, record its figures: `scripts/figures.py page docs/paper-tables.md COMMAND`.
 
     Example: scripts/bench paper captures/robot --page docs/paper-tables.md
     """

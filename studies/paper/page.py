@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from client.cli.scores import Column, Row, Store, markdown
 from studies.frontier.frontier import UPDATES, Variant
 from studies.frontier.tradeoff import read_points
 from studies.machine import core_version, provenance
+from studies.marks import marked, marked_days, marked_table
 from studies.paper.figures import SCENES
 from studies.paper.paper import (
     EXPERIMENTS,
@@ -24,12 +26,14 @@ from studies.paper.paper import (
 
 DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ari": 3}
 """Number of decimals shown for each score."""
+AGREEMENT = "paper-agreement"
+"""Name of the record of the table that compares all claims."""
 
 
 def write_paper_page(
     out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES, quality: Path | None = None
 ) -> str:
-    """Writes the page from the rows of the study and returns its text.
+    """Writes the page from the rows of the study, with figures marked for ``scripts/figures.py``. Returns its text.
 
     Args:
         out: frontier study folder.
@@ -96,14 +100,25 @@ def section(
         mean = _mean([own[name] for name in shared])
         paper = _mean([side.paper[name] for name in shared]) if side.paper else None
         lines.append("| " + " | ".join([side.name, *cells, _cell(mean, paper, digits)]) + " |")
-    note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times")
+    note = experiment.note.format(
+        ratio="–" if ratio is None else f"{marked(f'{ratio:.2f}', f'{record_name(experiment)}.iteration_ratio')} times"
+    )
     parts = [
         f"## {experiment.title}",
         f"Source: {experiment.source}." + (f" Score:{unit}." if unit else ""),
-        "\n".join(lines),
+        marked_table("\n".join(lines), record_name(experiment)),
         note,
     ]
     return "\n\n".join(part for part in parts if part)
+
+
+def record_name(experiment: Experiment) -> str:
+    """Returns the name of the record of an experiment's table.
+
+    >>> record_name(EXPERIMENTS[0])
+    'paper-online-comparison-psnr'
+    """
+    return "paper-" + "-".join(re.findall(r"\w+", experiment.title.partition(":")[0].lower()))
 
 
 def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
@@ -126,10 +141,19 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
                     "agreeing captures": f"{outcome.same_sign} of {len(outcome.captures)}" if measured else None,
                 }
             )
+    named = {
+        "comparisons": len(outcomes),
+        "sign_and_size": counts["sign and size"],
+        "sign": counts["sign"],
+        "none": counts["no"],
+        "not_measured": len(outcomes) - len(known),
+    }
+    words = {name: marked(str(count), f"{AGREEMENT}.{name}") for name, count in named.items()}
     return (
-        f"Of {len(outcomes)} comparisons, {counts['sign and size']} agree in sign and size, {counts['sign']} only in "
-        f"sign, {counts['no']} disagree, and {len(outcomes) - len(known)} are not measured.\n\n"
-        + markdown(rows, [Column(name, name) for name in rows[0]])
+        f"Of {words['comparisons']} comparisons, {words['sign_and_size']} agree in sign and size,\n"
+        f"{words['sign']} only in sign, {words['none']} disagree,\n"
+        f"and {words['not_measured']} are not measured.\n\n"
+        + marked_table(markdown(rows, [Column(name, name) for name in rows[0]]), AGREEMENT)
     )
 
 
@@ -168,6 +192,9 @@ def _mean(values: Sequence[float]) -> float | None:
 def _provenance(out: Path, captures: Sequence[str]) -> str:
     rows = [row for row in Store(out).rows() if "error" not in row and row["capture"] in captures]
     when, machines, cores = provenance(rows)
+    older = ""
     if cores != core_version():
-        when += ", with earlier versions of the method ([accuracy-and-time.md](accuracy-and-time.md) has newer figures)"
-    return f"Measured: {when}. Machine: {machines}."
+        older = (
+            ", with earlier versions of the method\n([accuracy-and-time.md](accuracy-and-time.md) has newer figures)"
+        )
+    return f"Measured: {marked_days(when, AGREEMENT)}{older}.\nMachine: `{machines}`."

@@ -179,7 +179,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         (Claim("better images", "Entangled", "Separate", 1),),
         "The paper shows only an image of its wheel. With separate covariance (`update.covariance`), the cascade moves "
         "only the means, and only a Gaussian's own ΔR and Δs change its covariance. ΔR and Δs are optimized from the "
-        "start (`update.deltas_start` 0), not only after 40% of the iterations.",
+        "start (`update.deltas_start` 0), not only after `40%` of the iterations.",
     ),
     Experiment(
         "Tracking: 2D MTE of the best candidate", "table 3", "mte_2d_oracle",

@@ -73,6 +73,8 @@ def table(
 
     Only rows with the settings of the current presets are used. If several rows qualify, the one with the most frames
     is used.
+
+    After writing docs/quality.md with --out, record its figures: `scripts/figures.py page docs/quality.md COMMAND`.
     """
     from studies.quality.targets import compare, count_words, page, read_study, target_table
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +13,7 @@ import numpy as np
 from client.cli.scores import Row, Store, markdown
 from scas4d_core.presets import preset
 from studies.machine import provenance
+from studies.marks import marked, marked_days, marked_table
 from studies.quality.quality import OBJECT_CAPTURES
 from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
 
@@ -210,12 +211,22 @@ def target_table(verdicts: Sequence[Verdict]) -> str:
     return "\n".join(lines)
 
 
-def count_words(verdicts: Sequence[Verdict]) -> str:
-    """Returns a sentence with the numbers of targets that are reached, missed and not measured."""
+def count_words(verdicts: Sequence[Verdict], mark: Callable[[str, str], str] = lambda text, _: text) -> str:
+    """Returns a sentence with the numbers of targets that are reached, missed and not measured.
+
+    Args:
+        verdicts: the targets and their figures.
+        mark: returns a number with its name in the page.
+    """
     compared = [verdict for verdict in verdicts if verdict.target.threshold is not None]
     reached, missed = (sum(verdict.reached is answer for verdict in compared) for answer in (True, False))
     unknown = len(compared) - reached - missed
-    return f"Of {len(compared)} targets, {reached} are reached, {missed} missed and {unknown} not measured"
+    counts = {"targets": len(compared), "reached": reached, "missed": missed, "unknown": unknown}
+    words = {name: mark(str(count), f"quality-targets.{name}") for name, count in counts.items()}
+    return (
+        f"Of {words['targets']} targets, {words['reached']} are reached, {words['missed']} missed and "
+        f"{words['unknown']} not measured"
+    )
 
 
 def read_study(folder: Path) -> dict[tuple[str, str], Row]:
@@ -229,7 +240,10 @@ def read_study(folder: Path) -> dict[tuple[str, str], Row]:
 
 
 def page(rows: Rows) -> str:
-    """Returns a Markdown page with the commands, machine and date, the table of targets, and the underlying rows."""
+    """Returns a Markdown page with the commands, machine and date, the table of targets, and the underlying rows.
+
+    Its figures are marked for ``scripts/figures.py``.
+    """
     verdicts = compare(rows)
     days, machines, cores = provenance(rows.values())
     runs = [(name, run) for name, run in RUNS.items() if run.preset == "scas4d" and not run.changes]
@@ -245,8 +259,8 @@ scripts/bench kernels CAPTURES/robot --store out/quality --out docs/kernels.md
 scripts/bench table out/quality --out docs/quality.md
 ```
 
-- Measured: {days}.
-- Machine: {machines}.
+- Measured: {marked_days(days, "quality-targets")}.
+- Machine: `{machines}`.
 - Source versions of the core: {cores}.
 
 An iteration is a forward and a backward pass over one training view. Results are averaged over the test cameras and the
@@ -255,16 +269,16 @@ in `scas4d_core/metrics/`. Because the machine is shared, times on other pages d
 
 ## Targets
 
-{count_words(verdicts)}.
+{count_words(verdicts, marked)}.
 
-{target_table(verdicts)}
+{marked_table(target_table(verdicts), "quality-targets")}
 
 ## Rows
 
 These runs use the default preset. The study folder also contains all other runs and the seconds per stage.
 *MB* is the peak memory of a process that also scores all frames. The memory target excludes scoring.
 
-{markdown(behind) if behind else "None yet."}
+{marked_table(markdown(behind), "quality-rows") if behind else "None yet."}
 """
 
 

@@ -103,10 +103,13 @@ def test_at_equal_seconds_the_curve_is_read_between_its_points(tmp_path):
     assert at_100.lead == pytest.approx(
         made_psnr(Variant("", "scas4d", 50)) - made_psnr(Variant("", "dynamic3dgs", 100))
     )
-    assert equal_words(compared).startswith("`scas4d` is ahead at 10 of 10 budgets; the smallest lead is +3.08 dB.")
+    name = "accuracy-equal-time"
+    words = f"`scas4d` is ahead at 10<!-- {name}.ahead --> of 10<!-- {name}.budgets --> budgets;\n"
+    assert equal_words(compared).startswith(f"{words}the smallest lead is +3.08<!-- {name}.smallest --> dB.")
     assert equal_table(compared).splitlines()[2].startswith("| robot | +")
     behind = [frontier_lead(one, -1.0) for one in compared[:1]] + compared[1:]
-    assert "ahead at 9 of 10 budgets; the smallest lead is -1.00 dB" in equal_words(behind)
+    assert f"ahead at 9<!-- {name}.ahead --> of 10" in equal_words(behind)
+    assert f"the smallest lead is -1.00<!-- {name}.smallest --> dB" in equal_words(behind)
 
 
 def frontier_lead(one, lead):
@@ -165,7 +168,10 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
             assert picture.width > 900
             drawn = (0x88, 0xCC, 0xEE) if name == "stages" else (0, 0x72, 0xB2)  # a stage, or the line of scas4d
             assert (colours == drawn).all(axis=1).sum() > 500
-    assert "ahead at 10 of 10 budgets" in text
+    assert "ahead at 10<!-- accuracy-equal-time.ahead --> of 10" in text
+    assert "- Measured: 2026-01-02<!-- accuracy-iterations.date -->." in text
+    for name in ("recommended", "equal-time", "iterations", "layers"):
+        assert f"\n<!-- table: accuracy-{name} -->\n| " in text
     for words, label in (("Views per iteration", "50 iterations of 2 views"), ("Covariance", "separate covariance")):
         table = text.split(f"**{words}**\n\n")[1].split("\n\n")[0]
         assert f"| {label} |" in table

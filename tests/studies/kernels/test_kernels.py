@@ -128,5 +128,7 @@ def test_the_page_says_what_was_measured():
     assert "| update-to-rasterizer ratio | 3.50 | × | ≤ 3 × | **missed** |" in text
     assert "| parallel regions per iteration | 12.4 |  |  |  |" in text
     assert "| peak memory | 1500 | MB | < 1500 MB | **missed** |" in text
-    assert "448 Gaussians, 2 images of 48×48" in text
-    assert "(A Processor, 2 cores, 1 thread used; source version of the core: 0123abcd)" in text
+    assert "448<!-- kernels-cost.frame_0_gaussians --> Gaussians, 2 images of 48×48" in text
+    assert "\n2026-01-02<!-- kernels-cost.date -->\n(`A Processor, 2 cores, 1 thread used`;" in text
+    assert "\n<!-- table: kernels-cost -->\n| | median |" in text
+    assert "\n<!-- table: kernels-stages -->\n| cascade |" in text

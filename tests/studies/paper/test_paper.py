@@ -131,7 +131,7 @@ def test_the_command_writes_every_experiment(tmp_path):
     for experiment in EXPERIMENTS:
         assert (f"\n## {experiment.title}\n" in text) == (experiment.score != "ssim")
         assert f"\n| {experiment.title} | " in text
-    assert "not measured" not in text.split("## Online comparison")[0].replace("and 0 are not measured", "")
+    assert "not measured" not in text.split("## Online comparison")[0].replace("are not measured", "")
     ours, base = made_psnr(DEFAULT), made_psnr(BASE_100)
     assert f"| Ours, 100 | {ours:.2f} (29.46) | {ours:.2f} (31.68) | {ours:.2f} (30.57) |" in text
     assert (
@@ -141,4 +141,9 @@ def test_the_command_writes_every_experiment(tmp_path):
     other = made_psnr(variant("separate covariance"))
     gain_of_map = f"Entangled – Separate | {ours - other:+.2f} | – | sign | 2 of 2 |"
     assert f"| Entangled vs. separate covariance | better images | {gain_of_map}" in text
-    assert "takes 0.50 times as long as a `scas4d` iteration" in text
+    times = "0.50<!-- paper-equal-wall-clock-time-psnr.iteration_ratio --> times"
+    assert f"takes {times} as long as a `scas4d` iteration" in text
+    assert "Measured: 2026-01-02<!-- paper-agreement.date -->, with earlier" in text
+    assert "21<!-- paper-agreement.comparisons --> comparisons" in text
+    for name in ("agreement", "number-of-layers", "tracking"):
+        assert f"\n<!-- table: paper-{name} -->\n| " in text

@@ -199,8 +199,11 @@ def test_the_command_writes_the_page(tmp_path):
     assert done.output == target_table(verdicts) + "\n\n" + count_words(verdicts) + ".\n"
     text = (tmp_path / "docs" / "quality.md").read_text()
     assert text == page(read_study(study))
-    assert "- Measured: 2026-01-02." in text
-    assert "- Machine: A Processor, 2 cores, 1 thread used, 8 GB RAM, Linux." in text
+    assert "- Measured: 2026-01-02<!-- quality-targets.date -->." in text
+    assert "- Machine: `A Processor, 2 cores, 1 thread used, 8 GB RAM, Linux`." in text
+    assert "5<!-- quality-targets.reached --> are reached, 2<!-- quality-targets.missed --> missed" in text
+    assert "\n<!-- table: quality-targets -->\n| metric |" in text
+    assert "\n<!-- table: quality-rows -->\n| capture |" in text
     assert "| update PSNR | robot | ≥ 31.00 dB | 31.38 | reached | 2 of 4 |" in text
     assert "| update-to-rasterizer ratio | robot | ≤ 3.00 × | 3.25 | **missed** | – |" in text
     assert "| robot | scas4d | 100 | – | 20,000 | 2 | 36.00 | 31.38 |" in text
