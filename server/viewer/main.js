@@ -240,10 +240,10 @@ function showMoment() {
   const report = timeline.draw();
   figures.choose(report?.index ?? null);
   if (!page.rig) return;
-  const reports = inOrder().filter((one) => one.state === "committed");
+  const reports = inOrder();
   const index = page.frame ?? reports.at(-1)?.index;
-  const measured = reports.filter((one) => Object.keys(one.cameras ?? {}).length && one.index <= index);
-  showCameras($("cameras"), $("camera-summary"), page.rig.cameras.map((camera) => camera.name), measured.at(-1), lookFrom);
+  const measured = reports.findLast((one) => one.state === "committed" && one.index <= index && Object.keys(one.cameras ?? {}).length);
+  showCameras($("cameras"), $("camera-summary"), page.rig.cameras.map((camera) => camera.name), measured, lookFrom);
 }
 
 // The picture.

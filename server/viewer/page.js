@@ -18,20 +18,47 @@ export function node(name, attributes = {}, ...children) {
 /** Adds a capital letter and a full stop to a text. */
 export const sentence = (text) => text && text[0].toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
 
+/** Reports of finished frames, keyed by index; the list in order is made only after a change. */
+class Reports extends Map {
+  #ordered = null;
+  #readable = null;
+
+  set(index, report) {
+    this.#ordered = this.#readable = null;
+    return super.set(index, report);
+  }
+
+  clear() {
+    this.#ordered = this.#readable = null;
+    super.clear();
+  }
+
+  get ordered() {
+    return (this.#ordered ??= [...this.values()].sort((a, b) => a.index - b.index));
+  }
+
+  get readable() {
+    return (this.#readable ??= this.ordered.filter((report) => report.state === "committed" && !report.deleted));
+  }
+}
+
 export const page = {
   scene: null, // id
   stream: null,
   status: null,
   rig: null,
-  reports: new Map(), // reports of finished frames, keyed by index
+  reports: new Reports(),
   frame: null, // index of the chosen frame; null follows the newest
   tracks: [],
   lost: false, // whether the connection is lost
   opened: 0, // number of times a scene was opened or closed; tells answers for a restarted reconstruction from earlier ones
 };
 
-export const inOrder = () => [...page.reports.values()].sort((a, b) => a.index - b.index);
-export const readable = () => inOrder().filter((report) => report.state === "committed" && !report.deleted);
+/** Reports of all finished frames in order. */
+export const inOrder = () => page.reports.ordered;
+
+/** Reports of the frames that can be shown, in order. */
+export const readable = () => page.reports.readable;
 
 /**
  * Covers the view with a message.

@@ -17,6 +17,16 @@ export function step(span, count) {
   return power * ([1, 2, 5].find((k) => k * power >= rough) ?? 10);
 }
 
+/** The point with the largest value at each place, since thousands of bars would cover each other. */
+function highest(points, placeOf) {
+  const found = new Map();
+  for (const point of points) {
+    const place = placeOf(point);
+    if (!(found.get(place)?.value >= point.value)) found.set(place, point);
+  }
+  return found.values();
+}
+
 export class Chart {
   /**
    * @param svg element to draw into
@@ -31,6 +41,7 @@ export class Chart {
       if (point) pick(point.index);
     });
     this.note = element("title", {});
+    this.cursor = element("line", { class: "chosen" });
     svg.addEventListener("pointermove", (event) => {
       const point = this.nearest(event);
       const why = point && [point.fault, point.rejected, point.change].filter((one) => one).join("; ");
@@ -50,8 +61,17 @@ export class Chart {
   }
 
   choose(index) {
+    if (this.chosen === index) return;
     this.chosen = index;
-    this.draw();
+    this.mark();
+  }
+
+  /** Moves the line at the chosen frame. */
+  mark() {
+    this.cursor.setAttribute("visibility", this.chosen === null ? "hidden" : "visible");
+    if (this.chosen === null || !this.cursor.parentNode) return;
+    const x = this.x({ index: this.chosen });
+    for (const end of ["x1", "x2"]) this.cursor.setAttribute(end, x);
   }
 
   nearest(event) {
@@ -105,13 +125,12 @@ export class Chart {
     for (let index = Math.ceil(this.first / every) * every; index < this.first + this.count; index += every) {
       element("text", { x: this.x({ index }), y: clientHeight - 3, class: "label" }, this.svg).textContent = index;
     }
-    if (this.chosen !== null) {
-      const x = this.x({ index: this.chosen });
-      element("line", { x1: x, x2: x, y1: TOP, y2: TOP + height, class: "chosen" }, this.svg);
-    }
+    for (const [end, value] of [["y1", TOP], ["y2", TOP + height]]) this.cursor.setAttribute(end, value);
+    this.svg.append(this.cursor);
+    this.mark();
     if (this.kind === "bars") {
       const wide = Math.max(1, Math.min(14, 0.7 * this.width / this.count));
-      for (const point of known) {
+      for (const point of highest(known, (one) => Math.round(this.x(one)))) {
         const top = clipped(point.value) ? TOP - 4 : y(point.value);
         element("rect", { x: this.x(point) - wide / 2, width: wide, y: top, rx: Math.min(1.5, wide / 3),
           height: TOP + height - top, class: clipped(point.value) ? "bar beyond" : "bar" }, this.svg);

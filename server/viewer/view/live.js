@@ -340,12 +340,13 @@ export class LiveView {
   draw() {
     const box = this.canvas.parentElement.getBoundingClientRect();
     const dense = window.devicePixelRatio || 1;
-    this.overlay.width = Math.round(box.width * dense);
-    this.overlay.height = Math.round(box.height * dense);
-    if (!this.shown) return;
+    const [width, height] = [Math.round(box.width * dense), Math.round(box.height * dense)];
+    if (this.overlay.width !== width || this.overlay.height !== height) Object.assign(this.overlay, { width, height });
     const context = this.overlay.getContext("2d");
+    context.clearRect(0, 0, width, height);
+    if (!this.shown) return;
     const camera = readCamera(this.shown.camera);
-    const [sx, sy] = [this.overlay.width / camera.width, this.overlay.height / camera.height];
+    const [sx, sy] = [width / camera.width, height / camera.height];
     const place = (point) => {
       const seen = project(camera, point);
       return seen && [seen[0] * sx, seen[1] * sy];
