@@ -6,7 +6,8 @@ from importlib.util import find_spec
 
 SERVER = (
     *("numba", "scipy", "sklearn", "threadpoolctl", "plyfile", "pycolmap", "flip_evaluator"),
-    *("fastapi", "uvicorn", "pydantic_settings", "prometheus_client", "httptools", "blake3", "python_multipart"),
+    *("fastapi", "uvicorn", "pydantic_settings", "itsdangerous"),
+    *("prometheus_client", "httptools", "blake3", "python_multipart"),
 )
 """Modules installed by the extra `server`."""
 EXPORTS = ("gsply", "pxr")

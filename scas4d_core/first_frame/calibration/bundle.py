@@ -4,18 +4,21 @@ The matches do not determine the position, orientation and scale of the rig. Oth
 freedom, such as a slight bend of a ring of cameras, are nearly undetermined. Here, a Cauchy loss
 pulls each camera towards its calibrated pose. The camera thus keeps the calibrated value of every
 degree of freedom that the matches do not determine, and a camera that is far off does not pull
-other cameras along. pycolmap triangulates the points. The bundle adjustment of pycolmap has no such
-loss, and moved the cameras of an exact rig by a median of 0.6 pixels (`robot`, 2026-11-23).
+other cameras along. pycolmap triangulates the points, and SciPy minimizes the loss. The bundle
+adjustment of pycolmap has no such loss, and moved the cameras of an exact rig by a median of 0.6
+pixels (`robot`, 2026-11-23).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.optimize import least_squares
+from scipy.sparse import block_array, csr_array, eye_array, kron
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
@@ -35,7 +38,7 @@ scale is the median displacement of the rig if the displacement is larger."""
 MIN_ANGLE_DEG = 1.0
 """Minimum triangulation angle in degrees. Rays at smaller angles hardly constrain depth."""
 MAX_STEPS = 40
-"""Maximum number of Levenberg-Marquardt steps per round."""
+"""Maximum number of evaluated steps per round."""
 MIN_RELATIVE_GAIN = 1e-5
 """Relative decrease of the loss below which a round ends."""
 
@@ -71,12 +74,16 @@ def bundle_adjust(
         seed: random seed of RANSAC.
     """
     current, trust = list(cameras), MIN_PRIOR_SCALE
+    moves = np.zeros((len(cameras), 7 if focal else 6))
     for bound in BOUNDS:
         seen, points = _triangulate_tracks(current, tracks, bound, seed)
         if len(points):
-            bundle = _BundleAdjustment(cameras, seen, focal, trust)
-            current = bundle.solve(current, points)
-            trust = max(MIN_PRIOR_SCALE, bundle.median_prior_distance(current, points))
+            depths = _median_depths(current, seen, points)
+            pixels = _pixels_per_unit(current, depths)[:, : moves.shape[1]]
+            moves = _adjust(cameras, moves, seen, points, pixels / trust, float(np.median(depths)))
+            current = [_moved(camera, move) for camera, move in zip(cameras, moves, strict=True)]
+            distances = np.linalg.norm(moves * pixels, axis=1)[np.unique(seen.camera)]
+            trust = max(MIN_PRIOR_SCALE, float(np.median(distances)))
     return current
 
 
@@ -114,154 +121,89 @@ def _triangulate_tracks(
     return seen, np.array(points).reshape(-1, 3)
 
 
-class _BundleAdjustment:
-    """Levenberg-Marquardt over poses and points, which eliminates the points (Schur complement).
+def _median_depths(cameras: Sequence[Camera], seen: Observations, points: Float) -> Float:
+    """Returns the [V] median depth of each camera's points, or 1 for cameras without points."""
+    depths = np.ones(len(cameras))
+    for index in np.unique(seen.camera):
+        own = points[seen.point[seen.camera == index]]
+        depths[index] = max(float(np.median(cameras[index].to_camera(own)[:, 2])), 1e-9)
+    return depths
+
+
+def _pixels_per_unit(cameras: Sequence[Camera], depths: Float) -> Float:
+    """Returns the image displacement in pixels that one unit of each parameter causes, [V, 7]."""
+    # The focal length is weighted at a typical distance from the image centre.
+    return np.array([[c.fx] * 3 + [c.fx / depth] * 3 + [c.width / 4] for c, depth in zip(cameras, depths, strict=True)])
+
+
+def _adjust(
+    cameras: Sequence[Camera], moves: Float, seen: Observations, points: Float, prior: Float, length: float
+) -> Float:
+    """Minimizes the loss over the parameters of the cameras and the points.
 
     Args:
-        given: calibrated cameras.
+        cameras: calibrated cameras.
+        moves: parameters [V, 6 or 7] to start with, as in ``_moved``.
         seen: observed features.
-        focal: whether to adjust focal lengths.
-        trust: scale of the Cauchy loss of the calibration prior, in pixels.
+        points: points [P, 3] to start with.
+        prior: weight of each parameter in the calibration prior, [V, 6 or 7].
+        length: unit of length of the variables, so that the unit of the world does not matter.
+
+    Returns:
+        The parameters, [V, 6 or 7].
     """
+    rotations = np.array([c.rotation for c in cameras])[seen.camera]
+    places = np.einsum("mij,mj->mi", rotations, points[seen.point] - np.array([c.centre for c in cameras])[seen.camera])
+    lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
+    units = np.array([1, 1, 1, length, length, length, 1])[: moves.shape[1]]
 
-    def __init__(self, given: Sequence[Camera], seen: Observations, focal: bool, trust: float) -> None:
-        self.given, self.seen, self.focal, self.trust = given, seen, focal, trust
-        self.size = 7 if focal else 6
-        self.count = len(given)
-
-    def solve(self, cameras: list[Camera], points: Float) -> list[Camera]:
-        """Returns the cameras after the last step that reduced the loss."""
-        depth = self._depths(cameras, points)
-        damping, loss = 1e-3, self._loss(cameras, points, depth)
-        for _ in range(MAX_STEPS):
-            moves, shifts = self._step(cameras, points, depth, damping)
-            trial, places = [_apply_step(c, move) for c, move in zip(cameras, moves, strict=True)], points + shifts
-            trial_loss = self._loss(trial, places, depth)
-            if trial_loss < loss:
-                gain, cameras, points, loss = (loss - trial_loss) / loss, trial, places, trial_loss
-                damping = max(damping / 5, 1e-9)
-                if gain < MIN_RELATIVE_GAIN:
-                    break
-            elif (damping := damping * 10) > 1e6:
-                break
-        return cameras
-
-    def median_prior_distance(self, cameras: list[Camera], points: Float) -> float:
-        """Returns the median image displacement of the adjusted cameras, in pixels.
-
-        The displacement is the change of a camera from its calibration. Cameras without features
-        are ignored.
-        """
-        pulls = np.linalg.norm(self._prior_residuals(cameras, self._depths(cameras, points))[0], axis=1)
-        return float(np.median(pulls[np.unique(self.seen.camera)]))
-
-    def _depths(self, cameras: Sequence[Camera], points: Float) -> Float:
-        """Returns the [V] median depth of each camera's points, or 1 for cameras without points."""
-        depths = np.ones(self.count)
-        for index, camera in enumerate(cameras):
-            own = points[self.seen.point[self.seen.camera == index]]
-            if len(own):
-                depths[index] = max(float(np.median(camera.to_camera(own)[:, 2])), 1e-9)
-        return depths
-
-    def _residuals(self, cameras: Sequence[Camera], points: Float) -> tuple[Float, Float, Float]:
-        """Returns the reprojection errors [M, 2] and their Jacobians.
-
-        The Jacobians are [M, 2, 6 or 7] for cameras and [M, 2, 3] for points.
-        """
-        seen = self.seen
-        rotation = np.array([c.rotation for c in cameras])[seen.camera]
-        shift = np.array([c.translation for c in cameras])[seen.camera]
-        lens = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])[seen.camera]
-        place = np.einsum("mij,mj->mi", rotation, points[seen.point]) + shift
-        x, y, z = place.T
+    def residuals(variables: Float) -> Float:
+        move, shifts = variables[: moves.size].reshape(moves.shape) * units, variables[moves.size :].reshape(-1, 3)
+        turns = Rotation.from_rotvec(move[:, :3]).as_matrix()[seen.camera]
+        place = places + np.einsum("mij,mj->mi", rotations, shifts[seen.point] * length)
+        place = np.einsum("mij,mj->mi", turns, place) + move[seen.camera, 3:6]
+        focal = lenses[:, :2] * np.exp(move[:, 6:].sum(axis=1, keepdims=True))
         with np.errstate(divide="ignore", invalid="ignore"):
-            offset = np.stack([lens[:, 0] * x / z, lens[:, 1] * y / z], axis=1)
-            by_place = np.zeros((len(z), 2, 3))
-            by_place[:, 0, 0], by_place[:, 1, 1] = lens[:, 0] / z, lens[:, 1] / z
-            by_place[:, :, 2] = -offset / z[:, None]
-        miss = offset + lens[:, 2:] - seen.pixel
-        miss[z <= 0] = np.inf  # a step that puts a point behind a camera is rejected
-        columns = [by_place @ -_cross(place), by_place, *([offset[:, :, None]] if self.focal else [])]
-        return miss, np.concatenate(columns, axis=2), by_place @ rotation
+            miss = focal[seen.camera] * place[:, :2] / place[:, 2:] + lenses[seen.camera, 2:] - seen.pixel
+        miss[place[:, 2] <= 0] = np.inf  # a step that puts a point behind a camera is rejected
+        return np.concatenate([miss.ravel() / NOISE, (move * prior).ravel()])
 
-    def _prior_residuals(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
-        """Returns the change of each camera from its calibration, in pixels, [V, 6 or 7].
+    # The Cauchy loss applies to the length of each feature's error and of each camera's parameters, not to each value.
+    count, size = moves.shape
+    features = len(seen.pixel)
+    group = np.concatenate([np.repeat(np.arange(features), 2), np.repeat(features + np.arange(count), size)])
+    sizes = np.bincount(group)
 
-        The second result is the number of pixels per unit of each parameter, [V, 6 or 7].
-        """
-        rows, units = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
-        for index, (before, now) in enumerate(zip(self.given, cameras, strict=True)):
-            units[index, :3], units[index, 3:6] = now.fx, now.fx / depth[index]
-            rows[index, :3] = Rotation.from_matrix(now.rotation @ before.rotation.T).as_rotvec()
-            rows[index, 3:6] = -now.rotation @ (now.centre - before.centre)
-            if self.focal:
-                units[index, 6] = now.width / 4  # a typical distance from the image centre
-                rows[index, 6] = np.log(now.fx / before.fx)
-        return rows * units, units
+    def cauchy(squares: Float) -> Float:
+        total = np.bincount(group, squares)
+        # Without its second derivative, each step solves reweighted least squares.
+        return np.stack([np.log1p(total) / sizes, 1 / (1 + total), np.zeros(len(total))])[:, group]
 
-    def _loss(self, cameras: Sequence[Camera], points: Float, depth: Float) -> float:
-        miss = (self._residuals(cameras, points)[0] ** 2).sum(1) / NOISE**2
-        pull = (self._prior_residuals(cameras, depth)[0] ** 2).sum(1) / self.trust**2
-        return float(np.log1p(miss).sum() + np.log1p(pull).sum())
-
-    def _step(self, cameras: Sequence[Camera], points: Float, depth: Float, damping: float) -> tuple[Float, Float]:
-        """Returns the camera updates [V, 6 or 7] and the point updates [P, 3]."""
-        seen, size, count = self.seen, self.size, len(points)
-        miss, by_camera, by_point = self._residuals(cameras, points)
-        weight = 1 / (1 + (miss**2).sum(1) / NOISE**2) / NOISE**2
-        heavy = by_camera * weight[:, None, None]
-        blocks = np.zeros((self.count, size, size))
-        slope = np.zeros((self.count, size))
-        np.add.at(blocks, seen.camera, np.einsum("mki,mkj->mij", heavy, by_camera))
-        np.add.at(slope, seen.camera, np.einsum("mki,mk->mi", heavy, miss))
-        pull, units = self._prior_residuals(cameras, depth)
-        trust = (1 / (1 + (pull**2).sum(1) / self.trust**2) / self.trust**2)[:, None]
-        diagonal = np.arange(size)
-        blocks[:, diagonal, diagonal] += trust * units**2
-        slope += trust * units * pull
-        own, point_slope = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        np.add.at(own, seen.point, np.einsum("mki,mkj->mij", by_point * weight[:, None, None], by_point))
-        np.add.at(point_slope, seen.point, np.einsum("mki,mk->mi", by_point * weight[:, None, None], miss))
-        for array in (blocks, own):
-            corner = np.arange(array.shape[1])
-            array[:, corner, corner] *= 1 + damping
-        own += np.eye(3) * 1e-12 * np.trace(own, axis1=1, axis2=2).max()
-        inverse = np.linalg.inv(own)
-        cross = np.einsum("mki,mkj->mij", heavy, by_point)  # [M, 6 or 7, 3]
-        coupled = _sparse(cross, seen, self.count, count)
-        through = _sparse(cross @ inverse[seen.point], seen, self.count, count)
-        matrix = -(through @ coupled.T).toarray()
-        for index in range(self.count):
-            rows = slice(size * index, size * (index + 1))
-            matrix[rows, rows] += blocks[index]
-        right = -slope.reshape(-1) + through @ point_slope.reshape(-1)
-        moves = np.linalg.solve(matrix, right)
-        rest = -point_slope.reshape(-1) - coupled.T @ moves
-        shifts = np.einsum("pij,pj->pi", inverse, rest.reshape(-1, 3))
-        return moves.reshape(self.count, size), shifts
+    by_camera = csr_array((np.ones(features), (np.arange(features), seen.camera)), shape=(features, count))
+    by_point = csr_array((np.ones(features), (np.arange(features), seen.point)), shape=(features, len(points)))
+    blocks: Any = [
+        [kron(by_camera, np.ones((2, size))), kron(by_point, np.ones((2, 3)))],
+        [eye_array(moves.size), None],
+    ]
+    start = np.concatenate([(moves / units).ravel(), np.zeros(points.size)])
+    solution: Any = least_squares(
+        residuals,
+        start,
+        jac_sparsity=block_array(blocks),
+        x_scale="jac",
+        loss=cauchy,  # type: ignore[arg-type]  # scipy-stubs 1.17 expects a second argument, which SciPy never passes
+        ftol=MIN_RELATIVE_GAIN,
+        max_nfev=MAX_STEPS,
+    )
+    adjusted: Float = solution.x[: moves.size].reshape(moves.shape) * units
+    return adjusted
 
 
-def _sparse(blocks: Float, seen: Observations, cameras: int, points: int) -> csr_array:
-    """Assembles blocks [M, s, 3] at (camera, point) into a matrix [s · cameras, 3 · points]."""
-    size = blocks.shape[1]
-    rows = np.broadcast_to(size * seen.camera[:, None, None] + np.arange(size)[:, None], blocks.shape)
-    columns = np.broadcast_to(3 * seen.point[:, None, None] + np.arange(3), blocks.shape)
-    return csr_array((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size * cameras, 3 * points))
+def _moved(camera: Camera, move: Float) -> Camera:
+    """Returns a camera with changed parameters.
 
-
-def _cross(vectors: Float) -> Float:
-    """Returns [M, 3, 3] cross-product matrices: [v] w = v × w."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-
-
-def _apply_step(camera: Camera, move: Float) -> Camera:
-    """Returns a camera after an update [6 or 7] of its parameters.
-
-    The values are the rotation vector and the translation in camera axes, and the log of the factor
-    of the focal length if there is a seventh value.
+    ``move`` contains the rotation vector and the translation in camera axes, and the log of the factor of the focal
+    length if there is a seventh value.
     """
     turn = Rotation.from_rotvec(move[:3]).as_matrix()
     pose, intrinsics = np.eye(4), camera.intrinsics.copy()

@@ -178,8 +178,9 @@ def test_a_stream_ends_with_its_link(running, owner, scenes):
 def test_a_token_that_was_changed_opens_nothing(running, owner, scenes):
     shown, hidden = scenes
     token = owner.share(shown).token
+    text, _, signature = token.rpartition(".")
     others = (
-        token[:-1] + ("A" if token[-1] != "A" else "B"),
+        f"{text}.{'A' if signature[0] != 'A' else 'B'}{signature[1:]}",
         token.replace(shown, hidden),
         token.replace(shown, "*"),
         re.sub(r"\.(\d+)\.", lambda found: f".{int(found[1]) + 1}.", token),

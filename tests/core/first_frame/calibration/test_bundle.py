@@ -1,4 +1,4 @@
-"""Bundle adjustment: faults are found back, what is right stays, derivatives are those of the residuals."""
+"""Bundle adjustment: faults are found back, what is right stays, the prior is in pixels."""
 
 from __future__ import annotations
 
@@ -77,37 +77,22 @@ def elsewhere_of(camera):
     return made_matches.Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
 
 
-def test_derivatives_are_those_of_the_residuals():
-    """Against central differences, of the camera's seven numbers and of the point's three."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (4, 3))
-    who, what = np.array([0, 1, 1, 2]), np.array([0, 1, 2, 3])
-    seen = bundle.Observations(who, what, rng.uniform(0, 200, (4, 2)))
-    problem = bundle._BundleAdjustment(RING, seen, True, bundle.MIN_PRIOR_SCALE)
-    _, by_camera, by_point = problem._residuals(RING, points)
-    step = 1e-6
-    for column in range(7):
-        move = np.eye(7)[column] * step
-        up, down = (
-            problem._residuals([bundle._apply_step(camera, sign * move) for camera in RING], points)[0]
-            for sign in (1, -1)
-        )
-        np.testing.assert_allclose(by_camera[:, :, column], (up - down) / (2 * step), rtol=1e-5, atol=1e-4)
-    for column in range(3):
-        shift = np.eye(3)[column] * step
-        up, down = (problem._residuals(RING, points + sign * shift)[0] for sign in (1, -1))
-        np.testing.assert_allclose(by_point[:, :, column], (up - down) / (2 * step), rtol=1e-5, atol=1e-4)
+def test_the_prior_counts_the_pixels_by_which_a_camera_moves_what_it_sees():
+    """A turn, a shift and a longer lens move what is seen by about as many pixels as the prior says."""
+    depths = np.full(len(RING), 3.0)
+    units = bundle._pixels_per_unit(RING, depths)
+    for column in (0, 1, 3, 4):
+        move = np.eye(6)[column] * 3 / units[0, column]
+        moved = [bundle._moved(RING[0], move), *RING[1:]]
+        np.testing.assert_allclose(made_matches.off_by(RING, moved), [3] + [0] * 8, atol=0.5)
+    corner = RING[0].centre + RING[0].rotation.T @ [3 * RING[0].width / 4 / RING[0].fx, 0, 3]  # half-way to the edge
+    longer = bundle._moved(RING[0], np.eye(7)[6] * 3 / units[0, 6])
+    before, after = (camera.project(corner[None])[0] for camera in (RING[0], longer))
+    np.testing.assert_allclose(after - before, [[3, 0]], atol=0.1)
 
 
-def test_the_pull_grows_as_the_camera_moves_what_it_sees():
-    """A turn by 3 px and a shift by as much pull by 3 px."""
-    problem = bundle._BundleAdjustment(
-        RING, bundle.Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))), False, 0.5
-    )
-    depth = np.full(len(RING), 3.0)
-    given = [made_matches.turned(RING[0], 3), *RING[1:]]
-    np.testing.assert_allclose(
-        np.linalg.norm(problem._prior_residuals(given, depth)[0], axis=1), [3] + [0] * 8, atol=1e-6
-    )
-    shifted = [bundle._apply_step(RING[0], np.array([0, 0, 0, 0.03, 0, 0])), *RING[1:]]
-    np.testing.assert_allclose(np.linalg.norm(problem._prior_residuals(shifted, depth)[0], axis=1)[0], 3.0, rtol=1e-6)
+def test_exact_features_turn_a_camera_back_exactly():
+    """The prior of the turned camera leaves less than 0.02 px."""
+    exact = build_tracks(made_matches.matches_of(RING, noise=0, wrong=0))
+    given = [made_matches.turned(camera, 4) if camera.name == "c3" else camera for camera in RING]
+    assert made_matches.off_by(RING, bundle_adjust(given, exact)).max() < 0.02
