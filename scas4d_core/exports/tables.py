@@ -20,7 +20,6 @@ from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
 from scas4d_core.exports.track_rows import check_ids_found
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.part_motion import PartMotion
-from scas4d_core.query.tracks import Tracks
 
 TRACK_COLUMNS = ("frame", "time", "id", "x", "y", "z", "confidence")
 POSE_COLUMNS = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "residual")
@@ -149,46 +148,6 @@ class PoseTable(_Table):
             (index, _text(time, 15), pose.part, *map(_text, (*pose.position, *pose.quaternion, pose.residual)))
             for pose in self._motion.poses(gaussians)
         )
-
-
-def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
-    """Writes queried tracks with their confidence.
-
-    A point has no row for a frame in which the point is absent. The column ``id`` contains the
-    Gaussian with the largest weight for each point, so two points may share an id.
-
-    Args:
-        path: path of the file.
-        tracks: tracks of Q points over T frames.
-        times: [T] times in seconds.
-
-    Raises:
-        InputError: if the file cannot be written.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> tracks = Tracks(np.array([[[0.0, 1, 2]]]), np.array([[0.5]]), np.array([3]), np.array([7]))
-    >>> with TemporaryDirectory() as folder:
-    ...     write_tracks(f"{folder}/a.csv", tracks, [0.25])
-    ...     Path(f"{folder}/a.csv").read_text().splitlines()[1]
-    '7,0.25,3,0,1,2,0.5'
-    """
-    table = _Table(path, TRACK_COLUMNS)
-    try:
-        for t, (index, time) in enumerate(zip(tracks.indices.tolist(), np.asarray(times, np.float64), strict=True)):
-            there = np.flatnonzero(np.isfinite(tracks.positions[t]).all(axis=1))
-            table.write(
-                (
-                    index,
-                    _text(time),
-                    int(tracks.ids[q]),
-                    *map(_text, (*tracks.positions[t, q], tracks.confidence[t, q])),
-                )
-                for q in there
-            )
-        table.finish()
-    except BaseException:
-        table.discard()
-        raise
 
 
 def _text(value: float, digits: int = 12) -> str:
