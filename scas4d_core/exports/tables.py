@@ -16,41 +16,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
+from scas4d_core.exports.atomic_files import AtomicWriter, translate_write_errors
 from scas4d_core.exports.track_rows import check_ids_found
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.part_motion import PartMotion
 
-TRACK_COLUMNS = ("frame", "time", "id", "x", "y", "z", "confidence")
-POSE_COLUMNS = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "residual")
 
-
-class _Table:
+class _Table(AtomicWriter):
     """A CSV file that is written incrementally under a temporary name."""
 
-    def __init__(self, path: Path | str, columns: Sequence[str]) -> None:
-        self.path = Path(path)
-        self._stack = ExitStack()
-        try:
-            beside = self._stack.enter_context(atomic_path(self.path))
-            self._file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
-            self._rows = csv.writer(self._file, lineterminator="\n")
-            self._rows.writerow(columns)
-        except BaseException as error:
-            if not self._stack.__exit__(type(error), error, error.__traceback__):
-                raise
+    columns: Sequence[str]
+
+    def _open(self, stack: ExitStack, beside: Path) -> None:
+        file = stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
+        self._rows = csv.writer(file, lineterminator="\n")
+        self._rows.writerow(self.columns)
 
     def write(self, rows: Iterable[Sequence[Any]]) -> None:
         with translate_write_errors(self.path):
             self._rows.writerows(rows)
-
-    def finish(self) -> None:
-        """Renames the file to its final name."""
-        self._stack.close()
-
-    def discard(self) -> None:
-        """Deletes the incomplete file."""
-        self._stack.__exit__(Exception, Exception("given up"), None)
 
 
 class TrackTable(_Table):
@@ -76,8 +60,10 @@ class TrackTable(_Table):
     7,0.5,0,0,0,2,
     """
 
+    columns = ("frame", "time", "id", "x", "y", "z", "confidence")
+
     def __init__(self, path: Path | str, world: WorldFrame, ids: ArrayLike | None = None) -> None:
-        super().__init__(path, TRACK_COLUMNS)
+        super().__init__(path)
         self._world = world
         self._ids = None if ids is None else np.unique(np.asarray(ids, np.int64))
         self._found = np.zeros(0 if self._ids is None else len(self._ids), np.bool_)
@@ -131,8 +117,10 @@ class PoseTable(_Table):
     0,0,0,0,0,3,1,0,0,0,0
     """
 
+    columns = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "residual")
+
     def __init__(self, path: Path | str, world: WorldFrame, labels: NDArray[Any]) -> None:
-        super().__init__(path, POSE_COLUMNS)
+        super().__init__(path)
         self._world, self._labels = world, labels
         self._motion: PartMotion | None = None
 
