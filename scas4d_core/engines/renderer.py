@@ -275,10 +275,10 @@ def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians
         after: state Θ_t of the same Gaussians.
         share: fraction of the motion to add. A negative fraction moves the state back.
     """
-    from scas4d_core.kernels.states import extrapolate_rows  # deferred import, because it loads the kernels
 
-    means, factors = np.empty_like(after.means), np.empty_like(after.factors)
-    for old, new, result in ((before.means, after.means, means), (before.factors, after.factors, factors)):
-        flat = (array.reshape(len(result), -1) for array in (old, new))
-        extrapolate_rows(*flat, after.moving, np.float32(share), result.reshape(len(result), -1))
-    return after.replace(means=means, factors=factors)
+    def moved(old: Array, new: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):  # Gaussians that are held back may not be finite
+            farther = new + np.float32(share) * (new - old)
+        return np.where(after.moving.reshape(-1, *[1] * (new.ndim - 1)), farther, new)
+
+    return after.replace(means=moved(before.means, after.means), factors=moved(before.factors, after.factors))

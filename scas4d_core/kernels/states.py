@@ -1,4 +1,4 @@
-"""Kernels that check and move whole states once per frame. All loops visit the Gaussians row by row."""
+"""Kernels that check whole states once per frame. All loops visit the Gaussians row by row."""
 
 from __future__ import annotations
 
@@ -59,59 +59,6 @@ def find_implausible(
 
 
 @kernel
-def axes_are_within(squares, rows, lengths, least, most):
-    """Returns whether all axes of the moving Gaussians are within their bounds; false if a length is not finite.
-
-    Args:
-        squares: [M, 3] squared axis lengths.
-        rows: [M] rows of the moving Gaussians.
-        lengths: [N, 3] axis lengths to which the bounds are relative.
-        least, most: bounds of an axis, relative to its length.
-    """
-    within = True
-    for i in range(len(rows)):
-        for k in range(3):
-            shortest, longest = least * lengths[rows[i], k], most * lengths[rows[i], k]
-            within &= shortest * shortest <= squares[i, k] <= longest * longest
-    return within
-
-
-@kernel
-def find_finite(means, factors, rows, finite):
-    """Marks the Gaussians whose mean and factor are finite.
-
-    Args:
-        means, factors: [N, 3] and [N, 3, 3] arrays of the state.
-        rows: [M] rows to check.
-        finite: [M] bool output.
-    """
-    for i in range(len(rows)):
-        fine = True
-        for k in range(3):
-            fine &= np.isfinite(means[rows[i], k])
-            for j in range(3):
-                fine &= np.isfinite(factors[rows[i], k, j])
-        finite[i] = fine
-
-
-@kernel
-def count_votes(gathered, least, share, asked, says):
-    """Counts the cameras that see each Gaussian, and those that see it in changed pixels; call it for each camera.
-
-    Args:
-        gathered: [N, 2] float32 blended weight of each Gaussian in all pixels of a camera, and in changed ones.
-        least: weight above which the camera sees a Gaussian.
-        share: share of the weight in changed pixels above which the camera sees the Gaussian change.
-        asked, says: [N] int64 numbers of cameras, which are increased.
-    """
-    for row in range(len(gathered)):
-        total = gathered[row, 0]
-        sees = total > least
-        asked[row] += sees
-        says[row] += sees and gathered[row, 1] > share * total
-
-
-@kernel
 def find_outside(means, factors, rows, poses, lenses, widths, outside):
     """Marks the Gaussians that are outside all images, including their extent.
 
@@ -144,38 +91,3 @@ def find_outside(means, factors, rows, poses, lenses, widths, outside):
             if -border < u < lens[4] + border and -border < v < lens[5] + border:
                 outside[row] = False
                 break
-
-
-@kernel
-def extrapolate_rows(before, after, moving, share, result):
-    """Writes states moved further along the motion between two states.
-
-    Args:
-        before, after: [N, K] float32 values in the two states.
-        moving: [N] bool; the values of all other rows are those of ``after``.
-        share: share of the motion to add.
-        result: [N, K] float32 output.
-    """
-    for row in range(len(moving)):
-        for k in range(before.shape[1]):
-            now = after[row, k]
-            result[row, k] = now + share * (now - before[row, k]) if moving[row] else now
-
-
-@kernel
-def rotate_rows(turns, which, vectors, rotated):
-    """Rotates vectors by the quaternions (1, r)/|(1, r)|.
-
-    Args:
-        turns: [K, 3] float64 r = axis · tan(angle/2).
-        which: [M] int32 row of ``turns`` for each vector.
-        vectors: [M, 3] float64 vectors.
-        rotated: [M, 3] float64 output.
-    """
-    for i in range(len(which)):
-        r, v = turns[which[i]], vectors[i]
-        x, y, z = r[1] * v[2] - r[2] * v[1], r[2] * v[0] - r[0] * v[2], r[0] * v[1] - r[1] * v[0]
-        scale = 1 + (r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
-        rotated[i, 0] = v[0] + 2 * (x + (r[1] * z - r[2] * y)) / scale
-        rotated[i, 1] = v[1] + 2 * (y + (r[2] * x - r[0] * z)) / scale
-        rotated[i, 2] = v[2] + 2 * (z + (r[0] * y - r[1] * x)) / scale
