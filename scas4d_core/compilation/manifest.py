@@ -85,7 +85,6 @@ KERNELS = (
         "kernels.balance.distribute i1 i",
         "kernels.tiles.share_pairs s1 i s1 i1 i1",
         "kernels.pictures.fill_planes y3 f3",
-        "kernels.pictures.row_differences y3 i",
     ),
     *_of(
         KernelGroup.ENTANGLED,
@@ -108,7 +107,6 @@ KERNELS = (
         "kernels.pictures.mark_changes y3 y3 i i f2",
         "kernels.states.find_implausible f2 f3 f2 f3 f2 f2 i1 f f f b1 f2",
         "kernels.deform.load_blocks f2 f3 i2 f4 f2",
-        "kernels.states.find_outside f2 f3 i1 d3 d2 d b1",
     ),
     *_of(
         KernelGroup.SEPARATE,

@@ -1,8 +1,6 @@
-"""Kernels that check whole states once per frame. All loops visit the Gaussians row by row."""
+"""Kernel that checks whole states once per frame. Its loops visit the Gaussians row by row."""
 
 from __future__ import annotations
-
-from math import sqrt
 
 import numpy as np
 
@@ -56,38 +54,3 @@ def find_implausible(
         fine &= moved <= farthest and abs(turned - np.float32(1)) < np.float32(0.01)
         fine &= not np.sign(_determinant(old_factors[row])) * np.sign(_determinant(factors[row])) < 0
         bad[row] |= not fine
-
-
-@kernel
-def find_outside(means, factors, rows, poses, lenses, widths, outside):
-    """Marks the Gaussians that are outside all images, including their extent.
-
-    Args:
-        means, factors: [N, 3] and [N, 3, 3] float32 means and covariance factors, in metres.
-        rows: [M] rows to check.
-        poses: [C, 3, 4] float64 world-to-camera transforms.
-        lenses: [C, 6] float64 fx, fy, cx, cy, width, height.
-        widths: extent of a Gaussian in standard deviations.
-        outside: [N] bool output; only the entries of ``rows`` are written.
-    """
-    for row in rows:
-        longest = np.float32(0)
-        for k in range(3):
-            square = np.float32(0)
-            for j in range(3):
-                square += factors[row, j, k] * factors[row, j, k]
-            longest = max(longest, square)
-        extent = widths * sqrt(longest)
-        x, y, z = means[row, 0], means[row, 1], means[row, 2]
-        outside[row] = True
-        for camera in range(len(poses)):
-            pose, lens = poses[camera], lenses[camera]
-            depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-            if not depth > 0:
-                continue
-            u = lens[0] * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + lens[2]
-            v = lens[1] * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + lens[3]
-            border = lens[0] * extent / depth
-            if -border < u < lens[4] + border and -border < v < lens[5] + border:
-                outside[row] = False
-                break

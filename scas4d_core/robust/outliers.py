@@ -161,6 +161,7 @@ class Past:
         error = dict(zip(arrays["probe_views"].tolist(), arrays["error"].tolist(), strict=True))
         last = dict(zip(arrays["last_brightness.names"].tolist(), arrays["last_brightness"].tolist(), strict=True))
         watch, timing = _rows(arrays, "camera_figures.names", "camera_figures"), _rows(arrays, "timing.names", "timing")
+        watch = {name: row for name, row in watch.items() if len(row) == CAMERA_FIGURES}  # else of an earlier version
         return cls(
             places, bright, outs, level,
             int(updates), int(rejected), fitted, int(behind), int(iterations), error, light, int(light_frames),

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scas4d_core.kernels.states import (
-    find_implausible,
-    find_outside,
-)
+from scas4d_core.kernels.states import find_implausible
 
 
 @pytest.mark.parametrize(
@@ -39,13 +36,3 @@ def test_a_mirrored_factor_is_marked() -> None:
         bad, np.empty((2, 3), np.float32),
     )  # fmt: skip
     np.testing.assert_array_equal(bad, [False, True])
-
-
-def test_gaussians_behind_or_beside_all_cameras_are_outside() -> None:
-    pose = np.eye(4)[None, :3]  # looks along z from the origin
-    lens = np.array([[100.0, 100, 50, 50, 100, 100]])
-    means = np.array([[0, 0, 2], [0, 0, -2], [2, 0, 2], [1.02, 0, 2], [5, 0, 2]], np.float32)
-    factors = np.tile(0.02 * np.eye(3, dtype=np.float32), (5, 1, 1))
-    outside = np.zeros(5, np.bool_)
-    find_outside(means, factors, np.arange(4), pose, lens, 3.0, outside)
-    np.testing.assert_array_equal(outside, [False, True, True, False, False])  # the last row was not asked for
