@@ -64,7 +64,6 @@ def decode_image(
     source: Source,
     *,
     size: Size | None = None,
-    image_scale: float = 1.0,
     bit_depth: int | None = None,
     name: str | None = None,
 ) -> NDArray[np.uint8]:
@@ -72,9 +71,7 @@ def decode_image(
 
     Args:
         source: image file, as bytes or as a path.
-        size: required (width, height) of the file in pixels, before scaling; not checked if None.
-        image_scale: scale factor. The image is resized by area averaging to the size that
-            `Camera.scaled` returns.
+        size: required (width, height) of the file in pixels; not checked if None.
         bit_depth: number of bits that the values of a 16-bit file use (see `find_bit_depth`). If None,
             16-bit files are rejected.
         name: name of the image in error messages; defaults to the path.
@@ -90,13 +87,8 @@ def decode_image(
     >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
     >>> decode_image(file.getvalue(), size=(4, 2)).shape
     (2, 4, 3)
-    >>> decode_image(file.getvalue(), image_scale=0.5)
-    array([[[255, 128,   0],
-            [255, 128,   0]]], dtype=uint8)
     """
-    name = name or _name(source)
-    rgb = _PictureFile(source, name, size).rgb(bit_depth)
-    return resize_area(rgb, scaled_size((rgb.shape[1], rgb.shape[0]), image_scale))
+    return _PictureFile(source, name or _name(source), size).rgb(bit_depth)
 
 
 def check_image(source: Source, *, size: Size | None = None, name: str | None = None) -> None:
@@ -123,13 +115,10 @@ def check_image(source: Source, *, size: Size | None = None, name: str | None = 
         picture.rgb(bit_depth=None)
 
 
-def decode_mask(
-    source: Source, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
-) -> NDArray[np.uint8]:
+def decode_mask(source: Source, *, size: Size | None = None, name: str | None = None) -> NDArray[np.uint8]:
     """Decodes a foreground mask. The arguments and errors are those of `decode_image`.
 
-    A pixel is foreground if the stored value of any channel is nonzero. A pixel of a scaled mask is
-    foreground if at least half of its area is foreground.
+    A pixel is foreground if the stored value of any channel is nonzero.
 
     Returns:
         Mask [H, W] uint8, 1 on the foreground and 0 elsewhere.
@@ -143,8 +132,7 @@ def decode_mask(
     foreground = values != 0
     if foreground.ndim == 3:
         foreground = foreground.any(axis=-1)
-    mask = np.array(foreground, dtype=np.uint8)
-    return resize_mask(mask, scaled_size((mask.shape[1], mask.shape[0]), image_scale))
+    return np.array(foreground, dtype=np.uint8)
 
 
 def check_mask(source: Source, *, size: Size | None = None, name: str | None = None) -> None:
@@ -160,14 +148,13 @@ def check_mask(source: Source, *, size: Size | None = None, name: str | None = N
     _PictureFile(source, name or _name(source), size, mask=True).stored()
 
 
-def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
+def decode_labels(source: bytes | Path, *, size: Size, target: Size) -> NDArray[np.uint8]:
     """Decodes an 8-bit single-channel label image, and resizes it by sampling.
 
     Args:
         source: image file, as bytes or as a path.
         size: required (width, height) of the file in pixels.
         target: (width, height) of the result; each pixel takes the label at its centre.
-        name: name of the image in error messages; defaults to the path.
 
     Returns:
         Labels [H, W] uint8.
@@ -180,7 +167,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
     >>> decode_labels(file.getvalue(), size=(4, 1), target=(2, 1))
     array([[3, 7]], dtype=uint8)
     """
-    name = name or _name(source)
+    name = _name(source)
     stored = _PictureFile(source, name, size, mask=True).stored()
     if stored.ndim != 2 or stored.dtype != np.uint8:
         raise ImageError(f"{name}: labels must have a single 8-bit channel; got {stored.dtype} [{stored.shape}]")

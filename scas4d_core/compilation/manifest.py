@@ -85,7 +85,6 @@ KERNELS = (
         "kernels.balance.distribute i1 i",
         "kernels.tiles.share_pairs s1 i s1 i1 i1",
         "kernels.pictures.fill_planes y3 f3",
-        "kernels.pictures.row_differences y3 i",
     ),
     *_of(
         KernelGroup.ENTANGLED,
@@ -106,14 +105,8 @@ KERNELS = (
         "kernels.turns.turn_neighbourhoods f2 f2 i2 d3",
         "kernels.turns.shortest_axes f3 d2",
         "kernels.pictures.mark_changes y3 y3 i i f2",
-        "kernels.states.axes_are_within f2 i1 f2 f f",
         "kernels.states.find_implausible f2 f3 f2 f3 f2 f2 i1 f f f b1 f2",
         "kernels.deform.load_blocks f2 f3 i2 f4 f2",
-        "kernels.states.find_finite f2 f3 i1 b1",
-        "kernels.states.count_votes f2 f f i1 i1",
-        "kernels.states.find_outside f2 f3 i1 d3 d2 d b1",
-        "kernels.states.extrapolate_rows f2 f2 b1 f f2",
-        "kernels.states.rotate_rows d2 s1 d2 d2",
     ),
     *_of(
         KernelGroup.SEPARATE,

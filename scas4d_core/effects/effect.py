@@ -45,6 +45,8 @@ class Effect:
         on_above: the effect is switched on if ``Evidence.share`` is at least this value.
         off_below: the effect is switched off if ``Evidence.share`` is below this value.
         without_masks: whether the effect can be on in a scene whose first frame has no masks.
+        positive_setting: learning rate or weight in the update settings that must be above 0, such as "rate_colour" or
+            "weights.rigidity"; empty if the effect has none.
         committed_arrays: names of the effect's arrays in ``Attempt.carried`` that are committed with each frame. They
             should be small. Only these arrays and those from ``first_frame_arrays`` survive the loss of a checkpoint.
     """
@@ -58,11 +60,15 @@ class Effect:
     on_above: float = 0.0
     off_below: float = 0.0
     without_masks: bool = True
+    positive_setting: str = ""
     committed_arrays: tuple[str, ...] = ()
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Returns the problem and its remedy if the effect cannot be on with these settings, or None if it can."""
-        return None
+        key = self.positive_setting
+        if not key or attrgetter(key)(settings.update) > 0:
+            return None
+        return f"update.{key} is 0", f"use a {'weight' if key.startswith('weights.') else 'rate'} above 0"
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
         """Returns the arrays from frame 0 that the effect needs in later frames, or None if it does not need any.
@@ -109,22 +115,6 @@ class Effect:
     def register(self, builder: PlanBuilder) -> None:
         """Adds the effect's part to the updates of a scene; called only if the effect is on."""
         raise NotImplementedError
-
-
-Refusal = tuple[str, str]
-"""The description of a problem, and its remedy."""
-
-
-def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
-    """Returns the problem and its remedy if a learning rate or weight of the update is 0, otherwise None.
-
-    Args:
-        settings: settings of the scene.
-        key: name of the rate or weight in the update settings, such as "rate_colour" or "weights.rigidity".
-    """
-    if attrgetter(key)(settings.update) > 0:
-        return None
-    return f"update.{key} is 0", f"use a {'weight' if key.startswith('weights.') else 'rate'} above 0"
 
 
 @cache

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
+from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 
@@ -52,11 +52,6 @@ def levels(values: Array) -> NDArray[np.uint8]:
     """
     rounded: NDArray[np.uint8] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     return rounded
-
-
-def picture_levels(picture: Picture, opacity: bool) -> NDArray[np.uint8]:
-    """Implements ``Renderer.render_levels`` for renderers whose pictures are in host memory."""
-    return levels(1 - picture.transmittance if opacity else np.moveaxis(picture.features[:LABEL], 0, -1))
 
 
 def psnr_of(squares: float, pixels: int) -> float:
@@ -206,7 +201,17 @@ class Renderer(Protocol):
         """Returns a state moved further along its motion; see ``extrapolated``."""
 
     def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
-        """Returns a state whose normals rotated with their neighbourhoods; see ``with_turned_normals``."""
+        """Returns a state whose normals rotated with their neighbourhoods since an earlier state.
+
+        Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a
+        surface, and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the
+        same result.
+
+        Args:
+            before: state Θ_{t−1}.
+            after: state Θ_t with gloss.
+            near: neighbourhoods of the Gaussians with gloss.
+        """
 
     def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
         """Finds the ``BLOCK``-pixel blocks of each camera's image that the supports of moving Gaussians intersect.
@@ -229,25 +234,6 @@ class Renderer(Protocol):
 
         Returns:
             One [⌈H / every⌉, ⌈W / every⌉] array for each camera.
-        """
-
-
-class ResidualRenderer(Protocol):
-    """Renderer that computes the residuals of one view at a time."""
-
-    def residuals(
-        self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
-    ) -> tuple[Array, Array]:
-        """Sums the residuals of a view, weighted by each Gaussian's blending weights.
-
-        Args:
-            state: Gaussians to render.
-            view: training view.
-            learnt: [N] uint8 mask of the Gaussians whose sums are needed.
-            most: maximum magnitude of a residual, for RGB in [0, 1]. Larger residuals are clipped.
-
-        Returns:
-            [N, 3] weighted sums of the RGB residuals before exposure, and [N] sums of the weights, in pixels.
         """
 
 
@@ -281,24 +267,6 @@ def pair_counts(renderer: Renderer, state: Gaussians, cameras: Sequence[CameraAr
     return PairCounts(float(pairs.mean()), int(np.searchsorted(below, 0.99 * len(pairs))))
 
 
-def colour_steps(
-    renderer: ResidualRenderer,
-    state: Gaussians,
-    subsets: Sequence[Sequence[TrainingView]],
-    learnt: NDArray[np.uint8],
-    most: float,
-) -> Gaussians:
-    """Implements ``Renderer.step_colours`` for renderers that compute residuals on the host."""
-    for views in subsets:
-        sums, weights = np.zeros((len(state), 3)), np.full(len(state), PRIOR_PIXELS)
-        for view in views:
-            more, seen = renderer.residuals(state, view, learnt, most)
-            sums += more
-            weights += seen
-        state = state.replace(colours=state.colours + (sums / weights[:, None]).astype(np.float32))
-    return state
-
-
 def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
     """Returns a state moved further along the motion between two states; only means and factors change.
 
@@ -307,40 +275,10 @@ def extrapolated(before: Gaussians, after: Gaussians, share: float) -> Gaussians
         after: state Θ_t of the same Gaussians.
         share: fraction of the motion to add. A negative fraction moves the state back.
     """
-    from scas4d_core.kernels.states import extrapolate_rows  # deferred import, because it loads the kernels
 
-    means, factors = np.empty_like(after.means), np.empty_like(after.factors)
-    for old, new, result in ((before.means, after.means, means), (before.factors, after.factors, factors)):
-        flat = (array.reshape(len(result), -1) for array in (old, new))
-        extrapolate_rows(*flat, after.moving, np.float32(share), result.reshape(len(result), -1))
-    return after.replace(means=means, factors=factors)
+    def moved(old: Array, new: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):  # Gaussians that are held back may not be finite
+            farther = new + np.float32(share) * (new - old)
+        return np.where(after.moving.reshape(-1, *[1] * (new.ndim - 1)), farther, new)
 
-
-def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (``kernels.turns``).
-
-    Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a surface,
-    and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the same result.
-
-    Args:
-        before, after: [N, 3] positions of the Gaussians in the two states, in metres.
-        near: [M, k] rows of the Gaussians in each neighbourhood.
-    """
-    from scas4d_core.kernels.turns import turn_neighbourhoods  # deferred import, because it loads the kernels
-
-    turns = np.empty((len(near), 3, 3))
-    turn_neighbourhoods(before, after, near, turns)
-    return turns
-
-
-def with_turned_normals(before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
-    """Returns a state whose normals rotated with their neighbourhoods since an earlier state; only the gloss changes.
-
-    Args:
-        before: state Θ_{t−1}.
-        after: state Θ_t with gloss.
-        near: neighbourhoods of the Gaussians with gloss.
-    """
-    assert after.gloss is not None
-    turns = neighbourhood_turns(before.means, after.means, near.rows)
-    return after.replace(gloss=np.einsum("nij,nj->ni", turns, after.gloss).astype(np.float32))
+    return after.replace(means=moved(before.means, after.means), factors=moved(before.factors, after.factors))

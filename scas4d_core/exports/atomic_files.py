@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,38 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # do not mask the original error
             beside.unlink(missing_ok=True)
+
+
+class AtomicWriter:
+    """Base class of writers whose file appears under its final name once it is complete.
+
+    Args:
+        path: path of the file; an existing file is replaced.
+
+    Attributes:
+        path: same as the argument.
+
+    Raises:
+        InputError: if the folder or the file cannot be written.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        with ExitStack() as stack:
+            self._open(stack, stack.enter_context(atomic_path(self.path)))
+            self._stack = stack.pop_all()
+
+    def _open(self, stack: ExitStack, beside: Path) -> None:
+        """Opens the temporary file ``beside``, and whatever else ``stack`` must close."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Completes the file and renames it to its final name."""
+        self._stack.close()
+
+    def discard(self) -> None:
+        """Deletes the incomplete file."""
+        self._stack.__exit__(Exception, Exception("given up"), None)
 
 
 def check_writable(path: Path | str) -> None:

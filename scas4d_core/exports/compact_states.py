@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.errors import InputError
-from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
+from scas4d_core.exports.atomic_files import AtomicWriter, translate_write_errors
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.part_motion import part_labels
 
 Colour = tuple[float, float, float]
 
 
-class CompactSequence:
+class CompactSequence(AtomicWriter):
     """Writer of a compact 4D file, frame by frame. ``finish`` gives the file its final name.
 
     Args:
@@ -54,18 +54,14 @@ class CompactSequence:
         frames_per_second: float | None = None,
         background: Colour = (0.0, 0.0, 0.0),
     ) -> None:
-        self.path = Path(path)
+        self._head = FileHeader(world, background=background, rig=rig, frames_per_second=frames_per_second)
         self._labels = labels
         self._latest = -1
         self._count = 0
-        self._stack = ExitStack()
-        head = FileHeader(world, background=background, rig=rig, frames_per_second=frames_per_second)
-        try:
-            beside = self._stack.enter_context(atomic_path(self.path))
-            self._writer = self._stack.enter_context(CompactWriter(beside, head))
-        except BaseException as error:
-            if not self._stack.__exit__(type(error), error, error.__traceback__):
-                raise
+        super().__init__(path)
+
+    def _open(self, stack: ExitStack, beside: Path) -> None:
+        self._writer = stack.enter_context(CompactWriter(beside, self._head))
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Adds a frame, given its index, its time in seconds, and its state in the internal world.
@@ -87,8 +83,4 @@ class CompactSequence:
         if self._labels is not None and self._count:
             with translate_write_errors(self.path):
                 self._writer.add_parts(self._latest, part_labels(self._labels, self._count))
-        self._stack.close()
-
-    def discard(self) -> None:
-        """Deletes the incomplete file."""
-        self._stack.__exit__(Exception, Exception("given up"), None)
+        super().finish()

@@ -6,7 +6,7 @@ import re
 import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError
-from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
+from scas4d_core.exports.atomic_files import AtomicWriter, translate_write_errors
 from scas4d_core.exports.compact_states import Colour, CompactSequence
 from scas4d_core.exports.formats import Format, check_suffix, format_of
 from scas4d_core.exports.gltf import write_glb
@@ -210,44 +210,25 @@ class _Folder:
         """Keeps the complete files."""
 
 
-class _Zip:
+class _Zip(AtomicWriter):
     """Numbered files in an uncompressed ``.zip``.
 
     Each file is first written to a temporary folder, which contains at most one file at a time.
     """
 
     def __init__(self, path: Path, format: Format, world: WorldFrame) -> None:
-        self._path = path
-        self._output = _zip_written(path)
-        self._archive = self._output.__enter__()
-        try:
-            with translate_write_errors(path):
-                self._beside = tempfile.TemporaryDirectory(prefix=".part-", dir=path.parent)
-            self._folder = _Folder(Path(self._beside.name), format, world)
-        except BaseException as error:
-            self._output.__exit__(type(error), error, error.__traceback__)
-            raise
+        self._format, self._world = format, world
+        super().__init__(path)
+
+    def _open(self, stack: ExitStack, beside: Path) -> None:
+        self._archive = stack.enter_context(zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED))
+        temporary = stack.enter_context(tempfile.TemporaryDirectory(prefix=".part-", dir=beside.parent))
+        self._folder = _Folder(Path(temporary), self._format, self._world)
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Adds the file of a frame."""
         self._folder.add(index, time, gaussians)
         file = self._folder.path_of(index)
-        with translate_write_errors(self._path):
+        with translate_write_errors(self.path):
             self._archive.write(file, file.name)
             file.unlink()
-
-    def finish(self) -> None:
-        """Completes the archive and renames it to its final name."""
-        self._beside.cleanup()
-        self._output.__exit__(None, None, None)
-
-    def discard(self) -> None:
-        """Deletes the incomplete archive."""
-        self._beside.cleanup()
-        self._output.__exit__(Exception, Exception("given up"), None)
-
-
-@contextmanager
-def _zip_written(path: Path) -> Iterator[zipfile.ZipFile]:
-    with atomic_path(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED) as archive:
-        yield archive

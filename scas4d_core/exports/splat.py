@@ -1,4 +1,4 @@
-"""Writes and reads the ``.splat`` format of antimatter15/splat (its ``convert.py`` and ``main.js``).
+"""Writes the ``.splat`` format of antimatter15/splat (its ``convert.py`` and ``main.js``).
 
 A file has no header. Each Gaussian has 32 bytes, little-endian: position 3×float32, scale 3×float32
 (linear standard deviations), RGBA 4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. Axes and
@@ -14,11 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.errors import InputError
 from scas4d_core.exports.atomic_files import atomic_path
 from scas4d_core.exports.cloud import cloud_of
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.query.ply import Splats
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 """Layout of one Gaussian, 32 bytes."""
@@ -42,9 +40,8 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> with TemporaryDirectory() as folder:
     ...     write_splat(f"{folder}/a.splat", state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
-    ...     back = read_splat(f"{folder}/a.splat")
-    >>> back.means, back.colours
-    (array([[0., 0., 4.]]), array([[1., 0., 0.]]))
+    ...     np.fromfile(f"{folder}/a.splat", ROW)["means"]
+    array([[0., 0., 4.]], dtype=float32)
     """
     of = cloud_of(gaussians, world).splats
     order = np.argsort(-np.prod(of.scales, axis=1) * of.opacities, kind="stable")
@@ -57,37 +54,3 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
     rows["rotation"] = np.clip(np.rint(turns * np.where(largest > 0, -128, 128) + 128), 0, 255)
     with atomic_path(path) as beside:
         rows.tofile(beside)
-
-
-def read_splat(path: Path | str) -> Splats:
-    """Reads a ``.splat`` file in row order; rotations are normalized.
-
-    Raises:
-        InputError: if the file does not exist, or its size is not a multiple of 32 bytes.
-
-    >>> read_splat("README.md")
-    Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md is not a .splat file (... bytes is not a multiple of 32); ...
-    """
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path} is not a .splat file ({error.strerror})", "use the path of a readable file"
-        ) from error
-    if len(content) % ROW.itemsize:
-        raise InputError(
-            f"{path} is not a .splat file ({len(content)} bytes is not a multiple of {ROW.itemsize})",
-            "use a complete, uncompressed file",
-        )
-    rows = np.frombuffer(content, ROW)
-    turns = rows["rotation"].astype(np.float64) - 128
-    length = np.linalg.norm(turns, axis=1, keepdims=True)
-    rgba = rows["rgba"].astype(np.float64) / 255
-    return Splats(
-        means=rows["means"].astype(np.float64),
-        scales=rows["scales"].astype(np.float64),
-        rotations=np.where(length > 0, turns / np.where(length > 0, length, 1), [1.0, 0, 0, 0]),
-        opacities=rgba[:, 3],
-        colours=rgba[:, :3],
-    )

@@ -1,10 +1,9 @@
-"""Writes and reads the SPZ format (Niantic, github.com/nianticlabs/spz) with the gsply package.
+"""Writes the SPZ format (Niantic, github.com/nianticlabs/spz) with the gsply package.
 
-Versions 3 (gzip) and 4 (zstd) are written, and versions 1 to 4 are read. As SPZ's README states,
-axes are RUB: x right, y up, z backward, that is, the user's world rotated by 180° about x. gsply
-does not convert axes, so this module does. Lengths are in metres, because the value ranges of the
-format are designed for metres. The format quantizes as follows, according to gsply 0.4.6 and
-Niantic's ``load-spz.cc``:
+Versions 3 (gzip) and 4 (zstd) are written. As SPZ's README states, axes are RUB: x right, y up,
+z backward, that is, the user's world rotated by 180° about x. gsply does not convert axes, so this
+module does. Lengths are in metres, because the value ranges of the format are designed for metres.
+The format quantizes as follows, according to gsply 0.4.6 and Niantic's ``load-spz.cc``:
 
 - positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m, with the largest number of fractional bits f for which the frame fits;
 - scales: the logarithm in one byte, 16 steps per factor of e: ±3.2%, clipped below 45 µm or above 379 m;
@@ -24,7 +23,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.exports.atomic_files import atomic_path, import_optional
 from scas4d_core.exports.cloud import Cloud, cloud_of
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.query.ply import OPACITY_MARGIN, SH_DEGREE_0, Splats
+from scas4d_core.query.ply import OPACITY_MARGIN
 
 VERSIONS = (3, 4)
 """Versions that gsply can write: most viewers support 3, and recent ones also support 4."""
@@ -91,38 +90,3 @@ def fractional_bits(cloud: Cloud) -> int:
         f"a Gaussian is {farthest:.3g} m from the origin of the user's world, but SPZ allows at most {2**22:,} m",
         "move the origin of the calibration near the scene, or export as ply or glb",
     )
-
-
-def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
-    """Reads an SPZ file of version 1 to 4, ignoring harmonics above degree 0, and converts it to OpenCV axes.
-
-    Args:
-        path: path of the file.
-        metres_per_unit: metres per length unit of the returned splats.
-
-    Raises:
-        InputError: if gsply is missing, or cannot read the file.
-
-    >>> read_spz("README.md")
-    Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md is not an SPZ file (...); ...
-    """
-    gsply = import_optional("gsply", "spz")
-    try:
-        data = gsply.read_spz(path)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path} is not an SPZ file ({error})", "use a complete .spz file of version 1 to 4"
-        ) from error
-    means, logs, quaternions, logits, base = (
-        np.asarray(column, np.float64)
-        for column in (data.means, data.scales, data.quats, data.opacities.reshape(-1), data.sh0)
-    )
-    given = Splats(
-        means=means,
-        scales=np.exp(logs),
-        rotations=quaternions,
-        opacities=1 / (1 + np.exp(-logits)),
-        colours=0.5 + SH_DEGREE_0 * base,
-    )
-    return Cloud(given, base[:, None], np.arange(len(given))).half_turned().scaled(1 / metres_per_unit).splats

@@ -16,42 +16,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
+from scas4d_core.exports.atomic_files import AtomicWriter, translate_write_errors
 from scas4d_core.exports.track_rows import check_ids_found
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.part_motion import PartMotion
-from scas4d_core.query.tracks import Tracks
-
-TRACK_COLUMNS = ("frame", "time", "id", "x", "y", "z", "confidence")
-POSE_COLUMNS = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "residual")
 
 
-class _Table:
+class _Table(AtomicWriter):
     """A CSV file that is written incrementally under a temporary name."""
 
-    def __init__(self, path: Path | str, columns: Sequence[str]) -> None:
-        self.path = Path(path)
-        self._stack = ExitStack()
-        try:
-            beside = self._stack.enter_context(atomic_path(self.path))
-            self._file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
-            self._rows = csv.writer(self._file, lineterminator="\n")
-            self._rows.writerow(columns)
-        except BaseException as error:
-            if not self._stack.__exit__(type(error), error, error.__traceback__):
-                raise
+    columns: Sequence[str]
+
+    def _open(self, stack: ExitStack, beside: Path) -> None:
+        file = stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
+        self._rows = csv.writer(file, lineterminator="\n")
+        self._rows.writerow(self.columns)
 
     def write(self, rows: Iterable[Sequence[Any]]) -> None:
         with translate_write_errors(self.path):
             self._rows.writerows(rows)
-
-    def finish(self) -> None:
-        """Renames the file to its final name."""
-        self._stack.close()
-
-    def discard(self) -> None:
-        """Deletes the incomplete file."""
-        self._stack.__exit__(Exception, Exception("given up"), None)
 
 
 class TrackTable(_Table):
@@ -77,8 +60,10 @@ class TrackTable(_Table):
     7,0.5,0,0,0,2,
     """
 
+    columns = ("frame", "time", "id", "x", "y", "z", "confidence")
+
     def __init__(self, path: Path | str, world: WorldFrame, ids: ArrayLike | None = None) -> None:
-        super().__init__(path, TRACK_COLUMNS)
+        super().__init__(path)
         self._world = world
         self._ids = None if ids is None else np.unique(np.asarray(ids, np.int64))
         self._found = np.zeros(0 if self._ids is None else len(self._ids), np.bool_)
@@ -132,8 +117,10 @@ class PoseTable(_Table):
     0,0,0,0,0,3,1,0,0,0,0
     """
 
+    columns = ("frame", "time", "part", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "residual")
+
     def __init__(self, path: Path | str, world: WorldFrame, labels: NDArray[Any]) -> None:
-        super().__init__(path, POSE_COLUMNS)
+        super().__init__(path)
         self._world, self._labels = world, labels
         self._motion: PartMotion | None = None
 
@@ -149,46 +136,6 @@ class PoseTable(_Table):
             (index, _text(time, 15), pose.part, *map(_text, (*pose.position, *pose.quaternion, pose.residual)))
             for pose in self._motion.poses(gaussians)
         )
-
-
-def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
-    """Writes queried tracks with their confidence.
-
-    A point has no row for a frame in which the point is absent. The column ``id`` contains the
-    Gaussian with the largest weight for each point, so two points may share an id.
-
-    Args:
-        path: path of the file.
-        tracks: tracks of Q points over T frames.
-        times: [T] times in seconds.
-
-    Raises:
-        InputError: if the file cannot be written.
-
-    >>> from tempfile import TemporaryDirectory
-    >>> tracks = Tracks(np.array([[[0.0, 1, 2]]]), np.array([[0.5]]), np.array([3]), np.array([7]))
-    >>> with TemporaryDirectory() as folder:
-    ...     write_tracks(f"{folder}/a.csv", tracks, [0.25])
-    ...     Path(f"{folder}/a.csv").read_text().splitlines()[1]
-    '7,0.25,3,0,1,2,0.5'
-    """
-    table = _Table(path, TRACK_COLUMNS)
-    try:
-        for t, (index, time) in enumerate(zip(tracks.indices.tolist(), np.asarray(times, np.float64), strict=True)):
-            there = np.flatnonzero(np.isfinite(tracks.positions[t]).all(axis=1))
-            table.write(
-                (
-                    index,
-                    _text(time),
-                    int(tracks.ids[q]),
-                    *map(_text, (*tracks.positions[t, q], tracks.confidence[t, q])),
-                )
-                for q in there
-            )
-        table.finish()
-    except BaseException:
-        table.discard()
-        raise
 
 
 def _text(value: float, digits: int = 12) -> str:

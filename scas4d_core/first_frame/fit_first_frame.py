@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.engines.choose import resolve_device
-from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.fit_schedule import REPORTED_SHORTFALL, FitProgress
 from scas4d_core.first_frame.glossy import fit_with_gloss_trial
 from scas4d_core.first_frame.initial_points import initial_points
@@ -24,7 +23,7 @@ from scas4d_core.first_frame.static_scene import first_trainer
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.progress import Progress
 from scas4d_core.robust.checks import axis_lengths
-from scas4d_core.settings import SceneSettings, Settings, StaticSettings
+from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -120,46 +119,6 @@ class FirstFrame:
         masked = bool(report["masked"])
         exposures = {name: np.array(exposure, np.float32) for name, exposure in report["exposures"].items()}
         return cls(masked, exposures, axis_lengths(history.gaussians(first)), history.background)
-
-
-def fit_static_scene(
-    factory: ViewFactory,
-    views: list[TrainingView],
-    positions: NDArray[np.float64],
-    colours: NDArray[np.float32],
-    foreground: NDArray[np.float32] | None,
-    scene: SceneSettings,
-    settings: StaticSettings,
-    progress: Callable[[FitProgress], None] | None = None,
-) -> StaticResult:
-    """Fits the Gaussians Θ_0 to the views of frame 0, starting from a point cloud.
-
-    Args:
-        factory: factory that creates the scene's views.
-        views: views of frame 0. Their exposures are learnt in place.
-        positions: [P, 3] point positions in metres, in the internal world.
-        colours: [P, 3] point colours in [0, 1].
-        foreground: [P] foreground label of each point in [0, 1], or None.
-        scene: settings of the scene.
-        settings: fit settings for frame 0.
-        progress: function called after each iteration.
-
-    Raises:
-        ValueError: if the point cloud is empty.
-
-    >>> from scas4d_core.captures import open_capture
-    >>> capture = open_capture("samples/robot", image_scale=0.25)
-    >>> factory, cloud = ViewFactory(capture.rig), capture.points
-    >>> views = factory.views(capture.frame(0), {})
-    >>> few = StaticSettings(iterations=20, max_gaussians=1000)
-    >>> fitted = fit_static_scene(
-    ...     factory, views, cloud.positions, cloud.colours, cloud.foreground, SceneSettings(), few
-    ... )
-    >>> fitted.losses[-1] < fitted.losses[0], len(fitted.gaussians) <= 1000
-    (True, True)
-    """
-    trainer = first_trainer(factory, views, positions, colours, foreground, scene, settings)
-    return trainer.result(trainer.train(progress))
 
 
 def fit_first_frame(

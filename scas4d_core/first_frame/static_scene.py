@@ -297,9 +297,14 @@ def first_trainer(
 ) -> StaticTrainer:
     """Creates a trainer whose initial Gaussians are the points of a cloud.
 
-    For the other arguments, see ``fit_static_scene``.
-
     Args:
+        factory: factory that creates the scene's views.
+        views: views of frame 0. Their exposures are learnt in place.
+        positions: [P, 3] point positions in metres, in the internal world.
+        colours: [P, 3] point colours in [0, 1].
+        foreground: [P] foreground label of each point in [0, 1], or None.
+        scene: settings of the scene.
+        settings: fit settings for frame 0.
         limit: time limit of frame 0, or None for no limit.
         stage: region that contains the scene, in the internal world. Outside of this region, only
             one camera must see a Gaussian. None if there are no surroundings.

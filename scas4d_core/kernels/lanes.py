@@ -9,6 +9,7 @@ array. Results do not depend on the loop vectorizer of the compiler.
 from __future__ import annotations
 
 import operator
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,10 @@ COUNT = 16
 """Number of lanes in a ``Lanes`` value."""
 
 emitted: Any = intrinsic
-"""Decorator for functions that emit LLVM instructions into kernels."""
+"""Decorator for functions that emit LLVM instructions into kernels, and whose types depend on those of the arguments.
+See ``instruction`` for all others."""
+ARRAY = "array"
+"""Type of an argument of an ``instruction`` that is a C-contiguous float32 array of any shape."""
 
 _FLOAT, _BYTE = ir.FloatType(), ir.IntType(8)
 _INT, _BIT, _LONG = ir.IntType(32), ir.IntType(1), ir.IntType(64)
@@ -82,35 +86,35 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
     return _filled(builder, value)
 
 
-def _operator(function: Any, result: Any, method: str, *how: str) -> None:
-    """Registers an operator for two ``Lanes``, or a ``Lanes`` and a float32.
+def _operator(function: Any, result: Any, operands: tuple[Any, ...], method: str, *how: str) -> None:
+    """Registers an operator. A float32 can replace one of two operands that are ``Lanes``.
 
     Args:
         function: function of the module ``operator``.
         result: type of the result.
+        operands: one or two equal types.
         method: name of the method of LLVM's IR builder that emits the instruction.
         how: arguments of the method that precede the operands.
     """
+    own = operands[0]
+    accepted = (own, types.float32) if own == lanes_type else (own,)
 
     class Template(AbstractTemplate):
         key = function
 
         def generic(self, arguments: Any, keywords: Any) -> Any:
-            if (
-                len(arguments) == 2
-                and lanes_type in arguments
-                and all(a in (lanes_type, types.float32) for a in arguments)
-            ):
-                return signature(result, lanes_type, lanes_type)
+            if len(arguments) == len(operands) and own in arguments and all(a in accepted for a in arguments):
+                return signature(result, *operands)
             return None
 
     infer_global(function)(Template)
 
-    @lower_builtin(function, lanes_type, lanes_type)
+    @lower_builtin(function, *operands)
     def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return getattr(builder, method)(*how, *arguments)
 
 
+_TWO = (lanes_type, lanes_type)
 for _names, _method in (
     (("add", "iadd"), "fadd"),
     (("sub", "isub"), "fsub"),
@@ -118,111 +122,99 @@ for _names, _method in (
     (("truediv",), "fdiv"),
 ):
     for _name in _names:
-        _operator(getattr(operator, _name), lanes_type, _method)
+        _operator(getattr(operator, _name), lanes_type, _TWO, _method)
 for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
-    _operator(getattr(operator, _name), mask_type, "fcmp_ordered", _sign)
-_operator(operator.ne, mask_type, "fcmp_unordered", "!=")  # NaN is not equal to any number
+    _operator(getattr(operator, _name), mask_type, _TWO, "fcmp_ordered", _sign)
+_operator(operator.ne, mask_type, _TWO, "fcmp_unordered", "!=")  # NaN is not equal to any number
+_operator(operator.neg, lanes_type, (lanes_type,), "fneg")
+_operator(operator.and_, mask_type, (mask_type, mask_type), "and_")
 
 
-class _Negative(AbstractTemplate):
-    key = operator.neg
-
-    def generic(self, arguments: Any, keywords: Any) -> Any:
-        return signature(lanes_type, lanes_type) if tuple(arguments) == (lanes_type,) else None
-
-
-infer_global(operator.neg)(_Negative)
+def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
+    """Returns a pointer to the first value of an array."""
+    if not (isinstance(array_type, types.Array) and array_type.dtype == types.float32 and array_type.layout == "C"):
+        raise TypeError(f"Lanes can only be loaded from and stored to C-contiguous float32 arrays, not {array_type}")
+    return cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
 
 
-@lower_builtin(operator.neg, lanes_type)
-def _lower_negative(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.fneg(arguments[0])
+def instruction(result: Any, *arguments: Any) -> Any:
+    """Returns a decorator for functions that emit LLVM instructions into kernels.
+
+    The decorated function receives LLVM's IR builder, followed by the LLVM value of each argument. Of an ``ARRAY``, the
+    value is a pointer to its first value.
+
+    Args:
+        result: Numba type of the result.
+        arguments: Numba types of the arguments.
+    """
+
+    def decorate(emit: Any) -> Any:
+        @wraps(emit)  # Numba takes the names of the arguments from the function's signature
+        def typed(typing_context: Any, *given: Any) -> Any:
+            def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                values = [
+                    _data(context, builder, kind, value) if wanted == ARRAY else value
+                    for wanted, kind, value in zip(arguments, given, values, strict=True)
+                ]
+                made = emit(builder, *values)
+                return context.get_dummy_value() if result == types.void else made
+
+            kinds = [kind if wanted == ARRAY else wanted for wanted, kind in zip(arguments, given, strict=True)]
+            return result(*kinds), generate
+
+        return intrinsic(typed)
+
+    return decorate
 
 
-class _And(AbstractTemplate):
-    key = operator.and_
-
-    def generic(self, arguments: Any, keywords: Any) -> Any:
-        return signature(mask_type, *arguments) if tuple(arguments) == (mask_type, mask_type) else None
-
-
-infer_global(operator.and_)(_And)
-
-
-@lower_builtin(operator.and_, mask_type, mask_type)
-def _lower_and(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.and_(*arguments)
-
-
-@emitted
-def choose(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
+@instruction(lanes_type, mask_type, lanes_type, lanes_type)
+def choose(builder: Any, mask: Any, yes: Any, no: Any) -> Any:
     """Selects ``yes`` in lanes where the mask is set, and ``no`` in all others."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.select(*arguments)
-
-    return lanes_type(mask_type, lanes_type, lanes_type), generate
+    return builder.select(mask, yes, no)
 
 
-@emitted
-def any_of(typing_context: Any, mask: Any) -> Any:
+@instruction(types.boolean, mask_type)
+def any_of(builder: Any, mask: Any) -> Any:
     """Returns whether the mask is set in any lane."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        bits = builder.bitcast(arguments[0], ir.IntType(COUNT))
-        return builder.icmp_unsigned("!=", bits, ir.IntType(COUNT)(0))
-
-    return types.boolean(mask_type), generate
+    return builder.icmp_unsigned("!=", builder.bitcast(mask, ir.IntType(COUNT)), ir.IntType(COUNT)(0))
 
 
-def _extreme(sign: str) -> Any:
-    def typed(typing_context: Any, x: Any, y: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return builder.select(builder.fcmp_ordered(sign, *arguments), *arguments)
-
-        return lanes_type(lanes_type, lanes_type), generate
-
-    return typed
+@instruction(lanes_type, lanes_type, lanes_type)
+def minimum(builder: Any, x: Any, y: Any) -> Any:
+    """Returns the smaller value in each lane; y if one of them is NaN."""
+    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
 
 
-minimum = emitted(_extreme("<"))
-maximum = emitted(_extreme(">"))
+@instruction(lanes_type, lanes_type, lanes_type)
+def maximum(builder: Any, x: Any, y: Any) -> Any:
+    """Returns the larger value in each lane; y if one of them is NaN."""
+    return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
 
 def _unary(name: str) -> Any:
-    def typed(typing_context: Any, x: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return _call(builder, f"llvm.{name}.v{COUNT}f32", _FLOATS, arguments)
-
-        return lanes_type(lanes_type), generate
-
-    return typed
+    return instruction(lanes_type, lanes_type)(
+        lambda builder, x: _call(builder, f"llvm.{name}.v{COUNT}f32", _FLOATS, [x])
+    )
 
 
-floor = emitted(_unary("floor"))
-nearest = emitted(_unary("rint"))
-square_root = emitted(_unary("sqrt"))
-magnitude = emitted(_unary("fabs"))
+floor = _unary("floor")
+nearest = _unary("rint")
+square_root = _unary("sqrt")
+magnitude = _unary("fabs")
 
 
 def _fixed(values: Any) -> Any:
-    def typed(typing_context: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return _constant(values)
-
-        return lanes_type(), generate
-
-    return typed
+    return instruction(lanes_type)(lambda builder: _constant(values))
 
 
 ACROSS = 4
 """Side length of a block in pixels. The pixels of a block form one ``Lanes`` in row-major order."""
 
-block_columns = emitted(_fixed([k % ACROSS for k in range(COUNT)]))
-block_rows = emitted(_fixed([k // ACROSS for k in range(COUNT)]))
+block_columns = _fixed([k % ACROSS for k in range(COUNT)])
+block_rows = _fixed([k // ACROSS for k in range(COUNT)])
 
-_eight_columns = emitted(_fixed([ACROSS * (k % 8) for k in range(COUNT)]))
-ends = emitted(_fixed([-1.0] * 8 + [1.0] * 8))
+_eight_columns = _fixed([ACROSS * (k % 8) for k in range(COUNT)])
+ends = _fixed([-1.0] * 8 + [1.0] * 8)
 """Returns -1 in the first eight lanes and 1 in the others."""
 
 
@@ -232,56 +224,33 @@ def ramp(start):
     return _eight_columns() + start
 
 
-@emitted
-def fill(typing_context: Any, value: Any) -> Any:
+@instruction(lanes_type, types.float32)
+def fill(builder: Any, value: Any) -> Any:
     """Broadcasts a float32 to all lanes."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _filled(builder, arguments[0])
-
-    return lanes_type(types.float32), generate
+    return _filled(builder, value)
 
 
-def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
-    if not (isinstance(array_type, types.Array) and array_type.dtype == types.float32 and array_type.layout == "C"):
-        raise TypeError(f"Lanes can only be loaded from and stored to C-contiguous float32 arrays, not {array_type}")
-    return cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
+def _place(builder: Any, array: Any, index: Any) -> Any:
+    return builder.bitcast(builder.gep(array, [index]), _FLOATS.as_pointer())
 
 
-def _place(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = _data(context, builder, array_type, array)
-    return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
+def _places(builder: Any, array: Any, index: Any, stride: Any) -> list[Any]:
+    return [builder.gep(array, [builder.add(index, builder.mul(stride, _LONG(k)))]) for k in range(COUNT)]
 
 
-def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any, stride: Any) -> list[Any]:
-    data = _data(context, builder, array_type, array)
-    return [builder.gep(data, [builder.add(index, builder.mul(stride, _LONG(k)))]) for k in range(COUNT)]
-
-
-@emitted
-def load(typing_context: Any, array: Any, index: Any) -> Any:
+@instruction(lanes_type, ARRAY, types.int64)
+def load(builder: Any, array: Any, index: Any) -> Any:
     """Loads sixteen values of a float32 array, starting at a flat index.
 
     The address need not be aligned. Bounds are not checked.
     """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = _place(context, builder, signature.args[0], *arguments)
-        return builder.load(place, align=4)
-
-    return lanes_type(array, types.int64), generate
+    return builder.load(_place(builder, array, index), align=4)
 
 
-@emitted
-def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
+@instruction(types.void, ARRAY, types.int64, lanes_type)
+def store(builder: Any, array: Any, index: Any, value: Any) -> Any:
     """Stores the lanes in an array, starting at a flat index."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = _place(context, builder, signature.args[0], *arguments[:2])
-        builder.store(arguments[2], place, align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, lanes_type), generate
+    builder.store(value, _place(builder, array, index), align=4)
 
 
 def _first(builder: Any, count: Any) -> Any:
@@ -293,45 +262,30 @@ def _first(builder: Any, count: Any) -> Any:
     return builder.icmp_signed("<", ir.Constant(_INTS, list(range(COUNT))), whole)
 
 
-@emitted
-def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
+@instruction(lanes_type, ARRAY, types.int64, types.int64)
+def load_first(builder: Any, array: Any, index: Any, count: Any) -> Any:
     """Loads the first ``count`` values of sixteen, or all values if ``count`` is 16 or more.
 
     The other lanes are 0, and their values are not read.
     """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = _place(context, builder, signature.args[0], *arguments[:2])
-        given = [place, _INT(4), _first(builder, arguments[2]), _constant([0] * COUNT)]
-        return _call(builder, f"llvm.masked.load.v{COUNT}f32.p0", _FLOATS, given)
-
-    return lanes_type(array, types.int64, types.int64), generate
+    given = [_place(builder, array, index), _INT(4), _first(builder, count), _constant([0] * COUNT)]
+    return _call(builder, f"llvm.masked.load.v{COUNT}f32.p0", _FLOATS, given)
 
 
-@emitted
-def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
+@instruction(types.void, ARRAY, types.int64, types.int64, lanes_type)
+def store_first(builder: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
     """Stores the first ``count`` lanes, or all lanes if ``count`` is 16 or more."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = _place(context, builder, signature.args[0], *arguments[:2])
-        given = [arguments[3], place, _INT(4), _first(builder, arguments[2])]
-        _call(builder, f"llvm.masked.store.v{COUNT}f32.p0", ir.VoidType(), given)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, types.int64, lanes_type), generate
+    given = [value, _place(builder, array, index), _INT(4), _first(builder, count)]
+    _call(builder, f"llvm.masked.store.v{COUNT}f32.p0", ir.VoidType(), given)
 
 
-@emitted
-def only_first(typing_context: Any, value: Any, count: Any) -> Any:
+@instruction(lanes_type, lanes_type, types.int64)
+def only_first(builder: Any, value: Any, count: Any) -> Any:
     """Keeps the first ``count`` lanes and sets the others to 0.
 
     If ``count`` is 16 or more, all lanes are kept.
     """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.select(_first(builder, arguments[1]), arguments[0], _constant([0] * COUNT))
-
-    return lanes_type(lanes_type, types.int64), generate
+    return builder.select(_first(builder, count), value, _constant([0] * COUNT))
 
 
 @inline
@@ -346,32 +300,23 @@ def aligned(array):
     return -(array.ctypes.data // 4) & (COUNT - 1)
 
 
-@emitted
-def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
+@instruction(lanes_type, ARRAY, types.int64, types.int64)
+def gather(builder: Any, array: Any, index: Any, stride: Any) -> Any:
     """Loads sixteen values of a float32 array with a stride, starting at a flat index.
 
     With the number of columns as the stride, the values are a column of sixteen rows.
     """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        value = ir.Constant(_FLOATS, ir.Undefined)
-        for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments)):
-            value = builder.insert_element(value, builder.load(place), _INT(lane))
-        return value
-
-    return lanes_type(array, types.int64, types.int64), generate
+    value = ir.Constant(_FLOATS, ir.Undefined)
+    for lane, place in enumerate(_places(builder, array, index, stride)):
+        value = builder.insert_element(value, builder.load(place), _INT(lane))
+    return value
 
 
-@emitted
-def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
+@instruction(types.void, ARRAY, types.int64, types.int64, lanes_type)
+def scatter(builder: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
     """Stores the lanes in an array with a stride, starting at a flat index."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments[:3])):
-            builder.store(builder.extract_element(arguments[3], _INT(lane)), place)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, types.int64, lanes_type), generate
+    for lane, place in enumerate(_places(builder, array, index, stride)):
+        builder.store(builder.extract_element(value, _INT(lane)), place)
 
 
 def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> list[Any]:
@@ -487,15 +432,11 @@ def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
     return types.void(array, types.int64), generate
 
 
-@emitted
-def _times_power_of_two(typing_context: Any, value: Any, whole: Any) -> Any:
+@instruction(lanes_type, lanes_type, lanes_type)
+def _times_power_of_two(builder: Any, value: Any, whole: Any) -> Any:
     """Returns ``value`` · 2^``whole``, computed by integer addition to the exponent bits."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        steps = builder.shl(builder.fptosi(arguments[1], _INTS), ir.Constant(_INTS, [23] * COUNT))
-        return builder.bitcast(builder.add(builder.bitcast(arguments[0], _INTS), steps), _FLOATS)
-
-    return lanes_type(lanes_type, lanes_type), generate
+    steps = builder.shl(builder.fptosi(whole, _INTS), ir.Constant(_INTS, [23] * COUNT))
+    return builder.bitcast(builder.add(builder.bitcast(value, _INTS), steps), _FLOATS)
 
 
 @inline
@@ -554,58 +495,45 @@ def log2(x):
     return y * t + exponent
 
 
-@emitted
-def column_bits(typing_context: Any, ends: Any) -> Any:
+@instruction(types.uint64, lanes_type)
+def column_bits(builder: Any, ends: Any) -> Any:
     """Converts ranges of pixel rows to a 64-bit block mask, with a byte per block column and a bit per block row.
 
     Block column k (of 8) covers the pixel rows from the value of lane k to the value of lane k + 8.
     The values are integers. If the first row exceeds the last row, the column is empty. Rows
     outside 0…31 are ignored.
     """
+    eight = ir.VectorType(_INT, 8)
+    nothing = ir.Constant(_INTS, ir.Undefined)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        eight = ir.VectorType(_INT, 8)
-        nothing = ir.Constant(_INTS, ir.Undefined)
+    def all_of(value: int) -> Any:
+        return ir.Constant(eight, [value] * 8)
 
-        def all_of(value: int) -> Any:
-            return ir.Constant(eight, [value] * 8)
-
-        whole = builder.fptosi(arguments[0], _INTS)
-        first = builder.shuffle_vector(whole, nothing, ir.Constant(eight, list(range(8))))
-        last = builder.shuffle_vector(whole, nothing, ir.Constant(eight, list(range(8, 16))))
-        first = builder.select(builder.icmp_signed(">", first, all_of(0)), first, all_of(0))
-        last = builder.select(builder.icmp_signed("<", last, all_of(31)), last, all_of(31))
-        some = builder.icmp_signed("<=", first, last)
-        two = all_of(2)
-        ones = builder.sub(builder.shl(two, builder.ashr(last, two)), builder.shl(all_of(1), builder.ashr(first, two)))
-        kept = builder.select(some, ones, all_of(0))
-        return builder.bitcast(builder.trunc(kept, ir.VectorType(ir.IntType(8), 8)), _LONG)
-
-    return types.uint64(lanes_type), generate
+    whole = builder.fptosi(ends, _INTS)
+    first = builder.shuffle_vector(whole, nothing, ir.Constant(eight, list(range(8))))
+    last = builder.shuffle_vector(whole, nothing, ir.Constant(eight, list(range(8, 16))))
+    first = builder.select(builder.icmp_signed(">", first, all_of(0)), first, all_of(0))
+    last = builder.select(builder.icmp_signed("<", last, all_of(31)), last, all_of(31))
+    some = builder.icmp_signed("<=", first, last)
+    two = all_of(2)
+    ones = builder.sub(builder.shl(two, builder.ashr(last, two)), builder.shl(all_of(1), builder.ashr(first, two)))
+    kept = builder.select(some, ones, all_of(0))
+    return builder.bitcast(builder.trunc(kept, ir.VectorType(ir.IntType(8), 8)), _LONG)
 
 
-@emitted
-def lowest_bit(typing_context: Any, bits: Any) -> Any:
+@instruction(types.int64, types.uint64)
+def lowest_bit(builder: Any, bits: Any) -> Any:
     """Returns the index of the lowest set bit. The argument must not be 0."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], _BIT(1))
-
-    return types.int64(types.uint64), generate
+    return builder.cttz(bits, _BIT(1))
 
 
-@emitted
-def sum_of(typing_context: Any, value: Any) -> Any:
+@instruction(types.float32, lanes_type)
+def sum_of(builder: Any, value: Any) -> Any:
     """Returns the sum over the lanes."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        total = arguments[0]
-        for length in (8, 4, 2, 1):
-            swapped = [k ^ length for k in range(COUNT)]
-            total = builder.fadd(total, builder.shuffle_vector(total, total, ir.Constant(_INTS, swapped)))
-        return builder.extract_element(total, _INT(0))
-
-    return types.float32(lanes_type), generate
+    for length in (8, 4, 2, 1):
+        swapped = [k ^ length for k in range(COUNT)]
+        value = builder.fadd(value, builder.shuffle_vector(value, value, ir.Constant(_INTS, swapped)))
+    return builder.extract_element(value, _INT(0))
 
 
 @emitted

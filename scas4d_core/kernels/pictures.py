@@ -1,4 +1,4 @@
-"""Kernels for 8-bit images: conversion to float planes, changed pixels, and differences along rows."""
+"""Kernels for 8-bit images: conversion to float planes, and changed pixels."""
 
 from __future__ import annotations
 
@@ -65,25 +65,3 @@ def mark_changes(before, now, most, reach, changed):
             for column in range(width):
                 changed[near, column] = max(changed[near, column], np.float32(wide[column]))
     return differs
-
-
-@kernel
-def row_differences(image, every):
-    """Returns the sums of the absolute first and second differences along every ``every``-th row.
-
-    Args:
-        image: [H, W, 3] uint8 image.
-        every: stride of the rows.
-    """
-    first, second = np.int64(0), np.int64(0)
-    height, width, _ = image.shape
-    for row in range(0, height, every):
-        for channel in range(CHANNELS):
-            before = np.int32(0)
-            for column in range(1, width):
-                step = np.int32(image[row, column, channel]) - np.int32(image[row, column - 1, channel])
-                first += abs(step)
-                if column > 1:
-                    second += abs(step - before)
-                before = step
-    return first, second

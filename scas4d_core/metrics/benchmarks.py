@@ -2,7 +2,7 @@
 
 Both benchmarks report the average Jaccard (AJ), the fraction of positions within thresholds (δ_avg) and the occlusion
 accuracy (OA). They differ in their thresholds: back-projected pixels of one camera, or distances in the scene.
-The query frame is excluded, and lost positions (NaN) are farther away than any threshold.
+The first frame is the query frame, which is excluded, and lost positions (NaN) are farther away than any threshold.
 """
 
 from __future__ import annotations
@@ -47,8 +47,6 @@ def benchmark_scores(
     seen: NDArray[np.bool_],
     visible: NDArray[np.bool_],
     thresholds: NDArray[Any],
-    *,
-    query: int = 0,
 ) -> BenchmarkScores:
     """Returns the scores of tracks by the definitions of TAPVid-3D, pooled over tracks and frames.
 
@@ -57,17 +55,15 @@ def benchmark_scores(
         seen: [T, Q] predicted visibility.
         visible: [T, Q] true visibility.
         thresholds: [K, T, Q] thresholds in the unit of the errors, or an array that broadcasts to this shape.
-        query: index in T of the query frame, which is excluded.
 
     >>> errors = np.array([[0.0, 0.0], [0.5, 3.0]])
     >>> everywhere = np.ones((2, 2), bool)
     >>> benchmark_scores(errors, everywhere, everywhere, np.array([1, 4]).reshape(2, 1, 1))
     BenchmarkScores(average_jaccard=0.6666666666666666, within=0.75, occlusion_accuracy=1.0)
     """
-    frames = np.arange(len(errors)) != query
-    seen, visible = seen[frames], visible[frames]
+    seen, visible = seen[1:], visible[1:]
     with np.errstate(invalid="ignore"):
-        near = (errors < np.broadcast_to(thresholds, (len(thresholds), *errors.shape)))[:, frames]
+        near = (errors < np.broadcast_to(thresholds, (len(thresholds), *errors.shape)))[:, 1:]
     true_positives = (near & seen & visible).sum(axis=(1, 2))
     false_positives = (seen & ~(near & visible)).sum(axis=(1, 2))
     if not visible.any():
@@ -98,7 +94,7 @@ def scaled_thresholds(extent: float) -> NDArray[np.float64]:
     return thresholds[:, None, None]
 
 
-def survival(errors: NDArray[Any], extent: float, *, query: int = 0) -> float:
+def survival(errors: NDArray[Any], extent: float) -> float:
     """Returns the mean fraction of frames before a track fails for the first time.
 
     A track fails if its error exceeds 50 cm, scaled from the size of a person to the extent, or if it is lost.
@@ -106,24 +102,21 @@ def survival(errors: NDArray[Any], extent: float, *, query: int = 0) -> float:
     Args:
         errors: [T, Q] distances from the true positions, NaN if lost.
         extent: extent of the subject, in the unit of the errors.
-        query: index in T of the query frame, which is excluded.
 
     >>> survival(np.array([[0.0, 0.0], [0.1, 0.9], [np.nan, 0.1]]), extent=1.0)
     0.25
     """
-    frames = np.arange(len(errors)) != query
     with np.errstate(invalid="ignore"):
-        alive = errors[frames] <= extent * SURVIVAL_CENTIMETRES / PERSON_CENTIMETRES
+        alive = errors[1:] <= extent * SURVIVAL_CENTIMETRES / PERSON_CENTIMETRES
     return float(np.logical_and.accumulate(alive, axis=0).mean()) if alive.size else math.nan
 
 
-def mean_trajectory_error(errors: NDArray[Any], visible: NDArray[np.bool_], *, query: int = 0) -> float:
+def mean_trajectory_error(errors: NDArray[Any], visible: NDArray[np.bool_]) -> float:
     """Returns the error MTE of MVTracker: the median of each track over its visible frames, averaged over tracks.
 
     Args:
         errors: [T, Q] distances from the true positions, NaN if lost.
         visible: [T, Q] true visibility. Tracks that are visible only in the query frame are ignored.
-        query: index in T of the query frame, which is excluded.
 
     Returns:
         Error in the unit of the errors, infinite if a track is mostly lost, NaN if there are no tracks.
@@ -132,7 +125,7 @@ def mean_trajectory_error(errors: NDArray[Any], visible: NDArray[np.bool_], *, q
     2.5
     """
     counted = visible.copy()
-    counted[query] = False
+    counted[0] = False
     finite = np.where(np.isfinite(errors), errors, np.inf)
     medians = [np.median(finite[counted[:, k], k]) for k in np.flatnonzero(counted.any(axis=0))]
     return float(np.mean(medians)) if medians else math.nan

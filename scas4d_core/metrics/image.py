@@ -22,8 +22,8 @@ SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
-LPIPS_BACKBONES = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
-"""File names of the torchvision weights that the lpips package loads from the torch.hub cache."""
+LPIPS_WEIGHTS = "vgg16-397923af.pth"
+"""File name of the torchvision weights that the lpips package loads from the torch.hub cache."""
 
 
 @dataclass(frozen=True)
@@ -133,19 +133,20 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
     return Score(float(error))
 
 
-def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Score:
-    """Returns the learned perceptual distance LPIPS (Zhang et al. 2018). No weights are downloaded.
+def lpips(image: NDArray[Any], truth: NDArray[Any]) -> Score:
+    """Returns the learned perceptual distance LPIPS (Zhang et al. 2018) with VGG, as for 3D Gaussian Splatting.
+
+    No weights are downloaded.
 
     Args:
         image: [H, W, 3] rendered image.
         truth: [H, W, 3] ground-truth image.
-        backbone: "vgg", as reported for 3D Gaussian Splatting, or "alex".
 
     Returns:
         The score, 0 for equal images. Its value is None if a required package or the weights are not installed.
 
     Raises:
-        ValueError: if the shapes differ, if an image has an invalid dtype or value, or if the backbone is unknown.
+        ValueError: if the shapes differ, or if an image has an invalid dtype or value.
 
     >>> picture = np.full((64, 64, 3), 0.5)
     >>> score = lpips(picture, picture)
@@ -153,26 +154,24 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
     True
     """
     first, second = _pair(image, truth)
-    if backbone not in LPIPS_BACKBONES:
-        raise ValueError(f"unknown LPIPS backbone {backbone!r}; choose one of {', '.join(LPIPS_BACKBONES)}")
     try:
         torch = importlib.import_module("torch")
         importlib.import_module("torchvision")
         importlib.import_module("lpips")
     except ImportError as fault:
         return Score(None, f"{fault.name} is not installed; run pip install lpips")
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_BACKBONES[backbone]
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_WEIGHTS
     if not weights.is_file():
         return Score(None, f"weights file {weights} not found; copy it there (it is never downloaded)")
-    network = _lpips_network(backbone)
+    network = _lpips_network()
     with torch.no_grad():
         tensors = [torch.from_numpy(p.astype(np.float32)).permute(2, 0, 1)[None] * 2 - 1 for p in (first, second)]
         return Score(float(network(*tensors)))
 
 
 @cache
-def _lpips_network(backbone: str) -> Any:
-    return importlib.import_module("lpips").LPIPS(net=backbone, verbose=False).eval()
+def _lpips_network() -> Any:
+    return importlib.import_module("lpips").LPIPS(net="vgg", verbose=False).eval()
 
 
 def _window_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Metrics that compare point tracks with ground truth.
 
 If a track has no finite position in a frame, because it is lost or behind the camera, its error is one image diagonal
-in 2D and infinity in 3D. The query frame is excluded, because its positions are given.
+in 2D and infinity in 3D. The first frame is the query frame, which is excluded, because its positions are given.
 """
 
 from __future__ import annotations
@@ -41,8 +41,6 @@ def median_trajectory_error(
     truth: NDArray[Any],
     counted: NDArray[np.bool_],
     diagonal: float,
-    *,
-    query: int = 0,
 ) -> float:
     """Returns the 2D median trajectory error (MTE) in % of the image diagonal.
 
@@ -56,7 +54,6 @@ def median_trajectory_error(
         counted: [T, Q] bool mask of the positions to evaluate, i.e. those visible in the camera. Tracks without such
             positions are ignored.
         diagonal: image diagonal in pixels.
-        query: index in T of the query frame, which is excluded from the error.
 
     Returns:
         Error in %, or NaN if there are no positions to evaluate.
@@ -70,7 +67,7 @@ def median_trajectory_error(
     5.0
     """
     errors = _percent_of_diagonal(tracks, truth, diagonal)
-    medians = _medians(errors, _without_query(counted, errors.shape, query))
+    medians = _medians(errors, _without_query(counted, errors.shape))
     return float(np.mean(medians)) if len(medians) else math.nan
 
 
@@ -78,23 +75,18 @@ def oracle_tracks(
     candidates: NDArray[Any],
     truth: NDArray[Any],
     counted: NDArray[np.bool_],
-    *,
-    radius: float = ORACLE_RADIUS_PX,
-    query: int = 0,
 ) -> NDArray[np.float64]:
     """Returns oracle tracks, which follow the best candidate near each point, as defined in the paper.
 
-    Among the candidates near a point in the query frame, the oracle selects the one with the smallest error. The oracle
-    uses the ground truth, so the ``median_trajectory_error`` of these tracks is a bound on the accuracy of centroids
-    and does not measure tracking. Report this error together with the error of the actual tracks.
+    Among the candidates within ``ORACLE_RADIUS_PX`` of a point in the query frame, the oracle selects the one with the
+    smallest error. Without a candidate there, a case that the paper does not specify, it uses the nearest one. The
+    oracle uses the ground truth, so the ``median_trajectory_error`` of these tracks is a bound on the accuracy of
+    centroids and does not measure tracking. Report this error together with the error of the actual tracks.
 
     Args:
         candidates: [T, N, 2] positions of all Gaussian centroids in pixels, NaN behind the camera.
         truth: [T, Q, 2] true positions in pixels.
         counted: [T, Q] bool mask of the positions to evaluate.
-        radius: radius around the true point in the query frame, in pixels. If it contains no candidate, the nearest
-            candidate is used. The paper does not specify this case.
-        query: index in T of the query frame, in which candidates are selected.
 
     Returns:
         [T, Q, 2] tracks of the selected candidates.
@@ -110,15 +102,15 @@ def oracle_tracks(
     """
     if candidates.ndim != 3 or candidates.shape[0] != truth.shape[0] or candidates.shape[2] != 2:
         raise ValueError(f"candidates must have shape [T={truth.shape[0]}, N, 2]; got {candidates.shape}")
-    present = np.flatnonzero(np.isfinite(candidates[query]).all(axis=-1))
+    present = np.flatnonzero(np.isfinite(candidates[0]).all(axis=-1))
     if len(present) == 0:
         raise ValueError("no candidate is in front of the camera in the query frame")
-    tree = cKDTree(candidates[query, present])
-    counts = _without_query(counted, truth.shape[:2], query)
+    tree = cKDTree(candidates[0, present])
+    counts = _without_query(counted, truth.shape[:2])
     chosen = np.empty(truth.shape, dtype=np.float64)
     for point in range(truth.shape[1]):
-        near = tree.query_ball_point(truth[query, point], radius)
-        rows = present[near] if near else present[[int(tree.query(truth[query, point])[1])]]
+        near = tree.query_ball_point(truth[0, point], ORACLE_RADIUS_PX)
+        rows = present[near] if near else present[[int(tree.query(truth[0, point])[1])]]
         paths = candidates[:, rows].astype(np.float64)
         best = 0
         if counts[:, point].any():
@@ -199,8 +191,6 @@ def error_by_confidence(
     confidence: NDArray[Any],
     moving: NDArray[np.bool_],
     extent: float,
-    *,
-    query: int = 0,
     groups: int = 4,
 ) -> list[float]:
     """Returns the median 3D error of each group of positions, in % of the extent, most confident group first.
@@ -214,7 +204,6 @@ def error_by_confidence(
         confidence: [T, P] confidence of each predicted position.
         moving: [P] bool mask of the points to evaluate.
         extent: extent of the scene in user units; see ``track_error_3d``.
-        query: index in T of the query frame, which is excluded from the error.
         groups: number of groups. If positions cannot be divided evenly, the least confident ones are ignored. With
             fewer positions than groups, all errors are NaN.
 
@@ -229,8 +218,8 @@ def error_by_confidence(
     """
     if confidence.shape != tracks.shape[:2]:
         raise ValueError(f"confidence must have shape [T, P] = {tracks.shape[:2]}; got {confidence.shape}")
-    track_error_3d(tracks, truth, moving, extent, query=query)  # validates the arguments
-    chosen = np.ix_(np.arange(len(truth)) != query, moving)
+    track_error_3d(tracks, truth, moving, extent)  # validates the arguments
+    chosen = np.ix_(np.arange(len(truth)) != 0, moving)
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)[chosen].ravel()
     distances = np.where(np.isfinite(distances), distances, np.inf) * (100.0 / extent)
     order = np.argsort(-confidence[chosen].ravel(), kind="stable")
@@ -264,7 +253,7 @@ def calibration_error(confidence: NDArray[Any], correct: NDArray[np.bool_], bins
     return float(np.abs(excess).sum() / correct.size)
 
 
-def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
+def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
     """Returns the fraction of correct visibility predictions in [0, 1], called occlusion accuracy in TAP-Vid.
 
     The fraction is NaN if there is no frame other than the query frame.
@@ -272,7 +261,6 @@ def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], 
     Args:
         predicted: [T, Q] bool predicted visibility.
         truth: [T, Q] bool true visibility.
-        query: index in T of the query frame, which is excluded from the accuracy.
 
     Raises:
         ValueError: if the shapes differ.
@@ -283,8 +271,7 @@ def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], 
     """
     if predicted.shape != truth.shape or truth.ndim != 2:
         raise ValueError(f"predicted and truth must both have shape [T, Q]; got {predicted.shape} and {truth.shape}")
-    frames = np.arange(len(truth)) != query
-    right = predicted[frames] == truth[frames]
+    right = predicted[1:] == truth[1:]
     return float(right.mean()) if right.size else math.nan
 
 
@@ -298,11 +285,11 @@ def _percent_of_diagonal(tracks: NDArray[Any], truth: NDArray[Any], diagonal: fl
     return percent
 
 
-def _without_query(counted: NDArray[np.bool_], shape: tuple[int, ...], query: int) -> NDArray[np.bool_]:
+def _without_query(counted: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     if counted.shape != shape:
         raise ValueError(f"counted must have shape [T, Q] = {shape}; got {counted.shape}")
     counts = counted.astype(np.bool_)
-    counts[query] = False
+    counts[0] = False
     return counts
 
 

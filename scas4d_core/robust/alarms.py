@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome, degraded_text
-from scas4d_core.kernels.pictures import row_differences
 from scas4d_core.robust.lens_dirt import ShiftedRegion
 from scas4d_core.robust.outliers import LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
 from scas4d_core.update.result import CameraFit
@@ -410,12 +409,8 @@ def sharpness_of(picture: NDArray[np.uint8]) -> float:
     image without texture.
     """
     every = max(1, len(picture) // ROWS)
-    first, second = row_differences(np.ascontiguousarray(picture), every)
-    rows, width, channels = picture[::every].shape
-    slope, bend = (
-        total / (rows * steps * channels) if steps > 0 else 0.0
-        for total, steps in ((first, width - 1), (second, width - 2))
-    )
+    first = np.diff(picture[::every].astype(np.int16), axis=1)
+    slope, bend = (float(np.abs(steps).mean()) if steps.size else 0.0 for steps in (first, np.diff(first, axis=1)))
     return log(bend / slope) if slope > FLAT and bend > 0 else nan
 
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.kernels.states import axes_are_within, find_implausible
+from scas4d_core.kernels.states import find_implausible
 from scas4d_core.robust.outliers import Past, unless_most
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
@@ -285,8 +285,6 @@ def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: A
         squares: [M, 3] squared axis lengths.
         first: [N, 3] axis lengths in frame 0.
     """
-    if axes_are_within(squares, rows, first, np.float32(SHRUNK), np.float32(STRETCHED)):
-        return after, 0
     least, most = np.square(SHRUNK * first[rows]), np.square(STRETCHED * first[rows])
     which, axis = np.nonzero((squares < least) | (squares > most))
     if not len(which):

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.compact import FileError
+from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.chunks import Chunks
 from scas4d_core.storage.faults import UnreadableFrameError, other_format
 from scas4d_core.storage.frame_arrays import Arrays, Stamp
@@ -200,13 +201,13 @@ class FrameFiles:
         if written != FORMAT:
             raise other_format(f"state folder {self.directory.name}", written, FORMAT)
 
-    def read_fixed(self, names: Sequence[str]) -> Arrays:
-        """Reads arrays that all frames share.
+    def read_fixed(self) -> Arrays:
+        """Reads the arrays that all frames share.
 
         Raises:
             UnreadableFrameError: if the file and its copy are damaged or missing.
         """
-        return self._either(self.fixed, self.fixed_copy, names)
+        return self._either(self.fixed, self.fixed_copy, FIXED)
 
     def write_born(self, index: int, arrays: Mapping[str, Any]) -> None:
         """Writes the arrays of the Gaussians born in a frame to a file and its copy.

@@ -77,7 +77,7 @@ class FramesReader:
         if foreign := files.chunks.foreign:
             raise OtherFormatError("; ".join(foreign))
         if history._stamps:
-            history._fixed = files.read_fixed(FIXED)
+            history._fixed = files.read_fixed()
         return history
 
     def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
@@ -113,7 +113,7 @@ class FramesReader:
                 added.append(index)
             self._stamps[index] = listed[index]
         if added and not self._fixed:
-            self._fixed = self._files.read_fixed(FIXED)
+            self._fixed = self._files.read_fixed()
         return added, gone
 
     def older_than_newest(self, newest: int, after: int) -> list[int]:

@@ -124,9 +124,9 @@ class ProbeViews:
         """
         return self._errors(self._compared, moved, learnt, state_next)
 
-    def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
-        """Returns ``errors`` on full-size images."""
-        return self._errors(self._whole, moved, learnt)
+    def full_size_errors(self, *, learnt: bool) -> dict[str, float]:
+        """Returns the ``errors`` of the deformed state on full-size images."""
+        return self._errors(self._whole, moved=True, learnt=learnt)
 
     def _errors(self, views: Sequence[int], moved: bool, learnt: bool, state_next: bool = False) -> dict[str, float]:
         if not self._names:
@@ -360,7 +360,7 @@ class BestState:
 
     def _full_size_error(self, learnt: bool, left_out: Mapping[str, str]) -> float:
         """Returns the mean error on full-size images of all cameras not in ``left_out``, or infinity for NaN."""
-        errors = self._probes.full_size_errors(moved=True, learnt=learnt)
+        errors = self._probes.full_size_errors(learnt=learnt)
         return _nan_to_inf(mean_error(errors, [name for name in errors if name not in left_out]))
 
     def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:

@@ -20,7 +20,7 @@ from scas4d_core.kernels.patch_matches import LEVELS, fit_clusters, match_patche
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.update.best_state import spread_cameras
 from scas4d_core.update.view_factory import ViewFactory
-from scas4d_core.update.warm_start import rotate, rotate_by
+from scas4d_core.update.warm_start import rotate
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -117,8 +117,8 @@ def _followed_by(
     for table, starts in zip(result.clusters[1:], hierarchy.starts[1:], strict=True):
         parents = hierarchy.labels[0][starts[:-1]]
         for columns in (slice(0, 3), slice(3, 6)):
-            table[:, columns] = rotate_by(turns, parents, table[:, columns].astype(np.float64))
-    result.deltas[:, :3] = rotate_by(turns, hierarchy.labels[0], result.deltas[:, :3].astype(np.float64))
+            table[:, columns] = rotate(turns[parents], table[:, columns].astype(np.float64))
+    result.deltas[:, :3] = rotate(turns[hierarchy.labels[0]], result.deltas[:, :3].astype(np.float64))
     return result
 
 

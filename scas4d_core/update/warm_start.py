@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scas4d_core.engines.engine import Tables
 from scas4d_core.engines.freedom import Freedom
 from scas4d_core.gaussians import Gaussians, quaternion_products
-from scas4d_core.kernels.states import rotate_rows
 from scas4d_core.structure.hierarchy import Hierarchy
 
 Array = NDArray[np.float32]
@@ -33,13 +32,10 @@ LONGEST_PREDICTION = 3.0
 
 def rotate(r: Float, vectors: Float) -> Float:
     """Returns vectors [K, 3] rotated by the quaternions (1, r)/|(1, r)|, with r [K, 3] = axis · tan(angle/2)."""
-    return rotate_by(r, np.arange(len(vectors), dtype=np.int32), vectors)
-
-
-def rotate_by(r: Float, which: NDArray[np.int32], vectors: Float) -> Float:
-    """Returns ``rotate(r[which], vectors)``."""
-    rotated = np.empty_like(vectors)
-    rotate_rows(r, which, vectors, rotated)
+    with np.errstate(over="ignore", invalid="ignore"):  # an update may diverge; see ``Motion.finite``
+        cross = np.cross(r, vectors)
+        scale = 1 + np.square(r).sum(axis=1, keepdims=True)
+        rotated: Float = vectors + 2 * (cross + np.cross(r, cross)) / scale
     return rotated
 
 
@@ -99,11 +95,11 @@ class Motion:
         for k in reversed(range(len(turns))):
             labels = hierarchy.labels[k]
             if own:
-                rest = rotate_by(turns[k], labels, rest)
+                rest = rotate(turns[k][labels], rest)
             for below in range(k + 1, len(turns)):
                 parents = labels[hierarchy.starts[below][:-1]]
-                turns[below] = rotate_by(turns[k], parents, turns[below])
-                shifts[below] = rotate_by(turns[k], parents, shifts[below])
+                turns[below] = rotate(turns[k][parents], turns[below])
+                shifts[below] = rotate(turns[k][parents], shifts[below])
             shifts[k] = rotate(turns[k], shifts[k])
         return cls(turns, shifts, rest, own_turns, seconds)
 
@@ -145,8 +141,8 @@ def motion_between(
         apart[empty] = 0
         turns[-1], shifts[-1] = turn, shift + rotate(turn, apart) - apart
         middle = _averages(there, labels, known, count)[labels]
-        led = rotate_by(turn, labels, there - middle) + middle + _averages(now - there, labels, known, count)[labels]
-        rest = np.where(known[:, None], rotate_by(turn, labels, now - led), 0.0)
+        led = rotate(turn[labels], there - middle) + middle + _averages(now - there, labels, known, count)[labels]
+        rest = np.where(known[:, None], rotate(turn[labels], now - led), 0.0)
     return Motion(turns, shifts, rest, np.zeros_like(rest), seconds)
 
 

@@ -31,6 +31,8 @@ from studies.exports.gltf import open_gltf
 
 Float = NDArray[np.float64]
 Y_UP = np.array([1.0, -1.0, -1.0])
+IN_METRES = {"spz", "spz4", "glb", "glb-parts"}
+"""Formats in metres; all others are in the user's unit."""
 SPLAT = "KHR_gaussian_splatting"
 TITLE, GAP = 24, 12
 """Height of a title and gap between images on a contact sheet, in pixels."""
@@ -118,8 +120,7 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
             chosen = history.indices if labels is not None else [index]  # an asset contains the whole motion
             coming = ((each, history.time(each), history.gaussians(each)) for each in chosen)
             (file,) = export_sequence(coming, name, out, world=world, parts=labels)
-            metres = FORMATS[name].unit.startswith("metre")
-            cloud = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
+            cloud = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres=name in IN_METRES)
             views = _rendered(cloud, world, history, cameras)
             psnr = float(np.mean([metrics.psnr(b, a) for a, b in zip(exact, views, strict=True)]))
             left, right = (pictures.eight_bit(each[0]) for each in (exact, views))

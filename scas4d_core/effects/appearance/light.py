@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence, FrameObservation
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.settings import Settings
 
 # The thresholds are based on these measured changes per frame: at most 0.032 on the five objects (on robot, which turns
 # fastest and whose shading therefore changes under constant light), 0.012 on stage with its moving shadows, 0.023 to
@@ -81,10 +80,6 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
 class Light(Effect):
     """Adapts colours faster while the lighting changes."""
 
-    def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if ``rate_colour`` is 0."""
-        return refusal_at_zero(settings, "rate_colour")
-
     def evidence(self, seen: FrameObservation) -> Evidence | None:
         """Returns how much the colours change together from one frame to the next."""
         if not seen.views:
@@ -110,4 +105,5 @@ EFFECT = Light(
     auto=True,
     on_above=0.035,
     off_below=0.02,
+    positive_setting="rate_colour",
 )

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.update.parts import PlanBuilder
-
-if TYPE_CHECKING:
-    from scas4d_core.settings import Settings
 
 
 @dataclass(frozen=True)
 class MovingColour(Effect):
     """Learns the RGB colours of moving Gaussians with the learning rate ``rate_colour``."""
-
-    def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if ``rate_colour`` is 0."""
-        return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:
         """Makes the colours of moving Gaussians learnable."""
@@ -31,4 +23,5 @@ EFFECT = MovingColour(
     description="The colours of moving Gaussians follow the images slowly, because shading changes as objects rotate.",
     disambiguation="The mean absolute colour change is a loss term, so colours do not compensate for motion or gains.",
     cost="one Adam step over RGB per iteration, shared with the other colours",
+    positive_setting="rate_colour",
 )

@@ -8,18 +8,14 @@ remaining residual as a change in appearance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scas4d_core.effects.appearance.closed_form import follow_pictures
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
-
-if TYPE_CHECKING:
-    from scas4d_core.settings import Settings
 
 
 class ShadingPart(UpdatePart):
@@ -40,10 +36,6 @@ class ShadingPart(UpdatePart):
 class Shading(Effect):
     """Updates the colours of moving Gaussians in closed form."""
 
-    def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if ``rate_colour`` is 0."""
-        return refusal_at_zero(settings, "rate_colour")
-
     def register(self, builder: PlanBuilder) -> None:
         """Adds a ``ShadingPart`` to the updates."""
         builder.parts.append(ShadingPart(builder))
@@ -55,4 +47,5 @@ EFFECT = Shading(
     description="The colours of moving Gaussians follow the images once per frame, as objects rotate in the light.",
     disambiguation="Changes only moving Gaussians, once the motion of the frame is known and camera gains are removed.",
     cost="one rendering of each view per frame, with its blending weights",
+    positive_setting="rate_colour",
 )

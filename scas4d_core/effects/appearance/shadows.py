@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.appearance.closed_form import follow_pictures
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.engines.renderer import BLOCK
 from scas4d_core.engines.views import SIDE
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.engines.renderer import Renderer
     from scas4d_core.engines.views import CameraArrays, TrainingView
-    from scas4d_core.settings import Settings
 
 Mask = NDArray[np.bool_]
 
@@ -74,10 +73,6 @@ class ShadowsPart(UpdatePart):
 @dataclass(frozen=True)
 class Shadows(Effect):
     """Updates the colours of static Gaussians in closed form."""
-
-    def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if ``rate_static_colour`` is 0."""
-        return refusal_at_zero(settings, "rate_static_colour")
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
         """Returns a [h, w, 4] float16 array per view, or None if only a few Gaussians are static.
@@ -165,4 +160,5 @@ EFFECT = Shadows(
     auto=True,
     on_above=0.02,
     off_below=0.005,
+    positive_setting="rate_static_colour",
 )

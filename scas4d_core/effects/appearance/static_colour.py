@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.update.parts import PlanBuilder
-
-if TYPE_CHECKING:
-    from scas4d_core.settings import Settings
 
 
 @dataclass(frozen=True)
 class StaticColour(Effect):
     """Learns the RGB colours of static Gaussians with the learning rate ``rate_static_colour``."""
-
-    def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if ``rate_static_colour`` is 0."""
-        return refusal_at_zero(settings, "rate_static_colour")
 
     def register(self, builder: PlanBuilder) -> None:
         """Makes the colours of static Gaussians learnable, which requires full images."""
@@ -33,4 +25,5 @@ EFFECT = StaticColour(
     disambiguation="The mean absolute colour change is a loss term, so colours do not compensate for motion or gains.",
     cost="full-image rendering and one Adam step over RGB per iteration",
     auto=True,
+    positive_setting="rate_static_colour",
 )

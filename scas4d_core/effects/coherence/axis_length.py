@@ -6,22 +6,14 @@ Kernel: ``kernels.deltas``; reference: ``engines.torch.losses.scale_loss``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.update.parts import PlanBuilder
-
-if TYPE_CHECKING:
-    from scas4d_core.settings import Settings
 
 
 @dataclass(frozen=True)
 class AxisLength(Effect):
     """The axis length term of the loss, weighted by ``weights.scale``."""
-
-    def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Returns a refusal if ``weights.scale`` is 0."""
-        return refusal_at_zero(settings, "weights.scale")
 
     def register(self, builder: PlanBuilder) -> None:
         """Adds the loss term to the plan, with its weight from the settings."""
@@ -34,4 +26,5 @@ EFFECT = AxisLength(
     description="Axes longer than both 2 cm and their length in frame 0 are penalized.",
     disambiguation="The limits come from frame 0.",
     cost="none measurable: it is part of the cascade's backward pass",
+    positive_setting="weights.scale",
 )

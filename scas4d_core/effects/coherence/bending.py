@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence, FrameObservation
 from scas4d_core.update.parts import PlanBuilder
 
@@ -99,7 +99,7 @@ class Bending(Effect):
         mode = settings.effects.get("rotation", "auto")
         if mode != "auto":
             return f"effects.rotation is '{mode}'", "set effects.rotation to 'auto'"
-        return refusal_at_zero(settings, "weights.rotation")
+        return super().refusal(settings)
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
         """Returns the relative rotation between neighbourhoods from one frame to the next."""
@@ -125,4 +125,5 @@ EFFECT = Bending(
     auto=True,
     on_above=0.018,
     off_below=0.012,
+    positive_setting="weights.rotation",
 )

@@ -130,7 +130,7 @@ def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
     if len(cells) == 0:
         return Hull(np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.int64), voxel)
     # Gaps between distant objects are reduced to one empty layer, so that the grid stays small.
-    close = np.stack([_without_gaps(column) for column in cells.T], axis=1)
+    close = np.stack([without_gaps(column) for column in cells.T], axis=1)
     shape = close.max(axis=0) + 2
     if np.prod(shape) > MAX_CELLS:
         return _hull(cells[:0], origin, voxel)
@@ -147,10 +147,10 @@ def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
     return Hull((origin + cells * voxel)[kept], ~inner[at][kept], things[kept], voxel)
 
 
-def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
+def without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
     """Returns positions along an axis, renumbered from 1 with one empty position per gap.
 
-    >>> _without_gaps(np.array([7, -900, 8, 30]))
+    >>> without_gaps(np.array([7, -900, 8, 30]))
     array([3, 1, 4, 6])
     """
     known, which = np.unique(places, return_inverse=True)

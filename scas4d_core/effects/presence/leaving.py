@@ -43,12 +43,21 @@ def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
         state: state Θ_t.
         rig: cameras in the internal world, including excluded cameras, which may be accepted again.
     """
-    from scas4d_core.kernels.states import find_outside  # deferred import, because it loads the kernels
-
-    poses = np.array([camera.world_to_camera[:3] for camera in rig.cameras])
-    lenses = np.array([(one.fx, one.fy, one.cx, one.cy, one.width, one.height) for one in rig.cameras], np.float64)
+    rows = np.flatnonzero(state.moving)
+    longest = np.fmax.reduce(np.square(state.factors).sum(axis=1), axis=1, initial=0)
+    extents = WIDTHS * np.sqrt(longest).astype(np.float64)
+    for camera in rig.cameras:  # most Gaussians are inside the first image
+        pose, extent = camera.world_to_camera, extents[rows]
+        x, y, z = state.means[rows].astype(np.float64).T
+        across, down, depth = (pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3] for k in range(3))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            u, v = camera.fx * across / depth + camera.cx, camera.fy * down / depth + camera.cy
+            border = camera.fx * extent / depth
+        inside = (depth > 0) & (u > -border) & (u < camera.width + border)
+        inside &= (v > -border) & (v < camera.height + border)
+        rows = rows[~inside]
     outside = np.zeros(len(state), np.bool_)
-    find_outside(state.means, state.factors, np.flatnonzero(state.moving), poses, lenses, WIDTHS, outside)
+    outside[rows] = True
     return outside
 
 

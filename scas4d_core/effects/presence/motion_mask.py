@@ -161,8 +161,6 @@ def find_moving(
         before, now: views of the two frames; cameras in only one of them are ignored.
         renderer: renderer that accumulates pixel values onto Gaussians.
     """
-    from scas4d_core.kernels.states import count_votes  # deferred import, because it loads the kernels
-
     earlier = {view.name: view for view in before}
     changes = [(view, _changed_between(earlier[view.name], view)) for view in now if view.name in earlier]
     says = np.zeros(len(gaussians), np.int64)
@@ -171,8 +169,10 @@ def find_moving(
         return says > 0
     for view, changed in changes:
         planes = np.stack([np.ones_like(changed), changed])
-        gathered = np.ascontiguousarray(renderer.gather(gaussians, view.camera, planes))
-        count_votes(gathered, np.float32(SEEN_PIXELS), np.float32(IN_CHANGE), asked, says)
+        total, in_change = renderer.gather(gaussians, view.camera, planes).T
+        sees = total > np.float32(SEEN_PIXELS)
+        asked += sees
+        says += sees & (in_change > np.float32(IN_CHANGE) * total)
     moving: NDArray[np.bool_] = (says >= 2) & (says > MAJORITY * asked)
     return moving
 

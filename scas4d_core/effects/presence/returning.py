@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from scas4d_core.effects.presence.carving import Hull, footprint
+from scas4d_core.effects.presence.carving import Hull, footprint, without_gaps
 from scas4d_core.effects.presence.novelty import measure_novelty
 from scas4d_core.gaussians import Gaussians
 
@@ -93,12 +93,7 @@ def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
     if not len(means):
         return []
     cells = np.floor((means - means.min(axis=0)) / apart).astype(np.int64)
-    places: list[NDArray[np.int64]] = []
-    for axis in range(3):  # gaps between objects are reduced to one empty cell
-        values = np.unique(cells[:, axis])
-        steps = np.minimum(np.diff(values, prepend=values[0]), 2)
-        places.append(np.cumsum(steps)[np.searchsorted(values, cells[:, axis])])
-    at = tuple(places)
+    at = tuple(without_gaps(column) for column in cells.T)
     grid = np.zeros([int(one.max()) + 1 for one in at], np.bool_)
     grid[at] = True
     numbers = label(grid, np.ones((3, 3, 3)))[0][at]

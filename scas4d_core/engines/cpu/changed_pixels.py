@@ -146,7 +146,7 @@ class ChangedPixels(CpuRenderer):
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``ResidualRenderer.residuals``. Renders only changed pixels if ``learnt`` is the moving Gaussians."""
+        """See ``HostRenderer.residuals``. Renders only changed pixels if ``learnt`` is the moving Gaussians."""
         if not np.array_equal(learnt, self._is_moving):
             return super().residuals(state, view, learnt, most)
         count, shown = len(state), features_seen(state, view.camera)

@@ -21,7 +21,6 @@ from scas4d_core.kernels.deform import CARRIED, block_sums, deform, deform_backw
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.jit import threads
 from scas4d_core.kernels.lanes import COUNT
-from scas4d_core.kernels.states import find_finite
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
 
@@ -103,8 +102,8 @@ class CpuDeformation:
     def start(self, previous: Gaussians) -> None:
         """Loads the state Θ_{t−1} to be deformed. Its static Gaussians remain unchanged."""
         moving = self.hierarchy.rows
-        sound = np.empty(len(moving), np.bool_)
-        find_finite(np.ascontiguousarray(previous.means), np.ascontiguousarray(previous.factors), moving, sound)
+        sound = np.array(np.isfinite(previous.means[moving]).all(axis=1))
+        sound &= np.isfinite(previous.factors[moving]).all(axis=(1, 2))
         self.held_back = moving[~sound]
         self._held = previous.means[self.held_back], previous.factors[self.held_back]
         means, factors = previous.means, previous.factors

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -11,18 +11,14 @@ from numpy.typing import NDArray
 from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
+from scas4d_core.engines.host_renderer import HostRenderer
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import (
     CHANNELS,
     Comparison,
     Gradients,
-    Neighbourhoods,
     Picture,
-    colour_steps,
-    extrapolated,
-    picture_levels,
     psnr_of,
-    with_turned_normals,
 )
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
@@ -39,7 +35,7 @@ def no_lap(stage: str) -> None:
     """Default ``lap`` callback, which does nothing."""
 
 
-class CpuRenderer:
+class CpuRenderer(HostRenderer):
     """The CPU implementation of ``Renderer``, which also computes the image and mask losses of iterations.
 
     Args:
@@ -99,18 +95,6 @@ class CpuRenderer:
         given = (state.means, state.factors, state.opacities, shown, camera, background)
         return self.rasterizer.forward(*given, depth_channel)
 
-    def render_each(
-        self, shots: Sequence[tuple[Gaussians, CameraArrays]], *, depth_channel: int = -1
-    ) -> Iterator[Picture]:
-        """See ``Renderer.render_each``."""
-        return (self.render(state, camera, depth_channel=depth_channel) for state, camera in shots)
-
-    def render_levels(
-        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
-    ) -> NDArray[np.uint8]:
-        """See ``Renderer.render_levels``."""
-        return picture_levels(self.render(state, camera, background=background), opacity)
-
     def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
         """See ``Renderer.compare``."""
         compared = []
@@ -132,27 +116,13 @@ class CpuRenderer:
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``ResidualRenderer.residuals``."""
+        """See ``HostRenderer.residuals``."""
         tiles_x, tiles_y = tile_grid(view.camera)
         drawing = Drawing(np.full(tiles_x * tiles_y, 2**64 - 1, np.uint64), learnt)
         shown = features_seen(state, view.camera)
         given = (state.means, state.factors, state.opacities, shown, view.camera, self._background)
         self.rasterizer.forward(*given, drawing=drawing)
         return self._lacking(view, most)
-
-    def step_colours(
-        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
-    ) -> Gaussians:
-        """See ``Renderer.step_colours``."""
-        return colour_steps(self, state, subsets, learnt, most)
-
-    def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-        """See ``Renderer.extrapolate``."""
-        return extrapolated(before, after, share)
-
-    def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
-        """See ``Renderer.turn_normals``."""
-        return with_turned_normals(before, after, near)
 
     def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
         """See ``Renderer.reached``."""
@@ -246,7 +216,7 @@ class CpuRenderer:
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
 
     def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
-        """Returns the sums of ``ResidualRenderer.residuals`` for the last rendering."""
+        """Returns the sums of ``HostRenderer.residuals`` for the last rendering."""
         height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from scas4d_core.engines.host_renderer import HostRenderer
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import (
     BLOCK,
     Comparison,
-    Neighbourhoods,
     Picture,
-    colour_steps,
-    extrapolated,
-    picture_levels,
-    with_turned_normals,
 )
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import colours_seen, no_turns
@@ -32,7 +28,7 @@ TILE = 32
 """Tile size in pixels. ``reached`` pads images to whole tiles."""
 
 
-class TorchRenderer:
+class TorchRenderer(HostRenderer):
     """The reference implementation of ``Renderer``.
 
     Args:
@@ -59,18 +55,6 @@ class TorchRenderer:
         picture = self._drawn(state, camera, shown, background)
         return Picture(picture.features.permute(2, 0, 1).float().numpy(), (1 - picture.alpha).float().numpy())
 
-    def render_each(
-        self, shots: Sequence[tuple[Gaussians, CameraArrays]], *, depth_channel: int = -1
-    ) -> Iterator[Picture]:
-        """See ``Renderer.render_each``."""
-        return (self.render(state, camera, depth_channel=depth_channel) for state, camera in shots)
-
-    def render_levels(
-        self, state: Gaussians, camera: CameraArrays, background: Array, *, opacity: bool
-    ) -> NDArray[np.uint8]:
-        """See ``Renderer.render_levels``."""
-        return picture_levels(self.render(state, camera, background=background), opacity)
-
     def compare(self, state: Gaussians, views: Sequence[TrainingView]) -> list[Comparison]:
         """See ``Renderer.compare``."""
         return [self._compared(state, view) for view in views]
@@ -95,27 +79,13 @@ class TorchRenderer:
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``ResidualRenderer.residuals``."""
+        """See ``HostRenderer.residuals``."""
         shown = self.render(state, view.camera).features[:LABEL]
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         more = np.clip((view.target[:LABEL] - offset) / gain - shown, -most, most)
         sums = self.gather(state, view.camera, np.concatenate([more, np.ones_like(more[:1])]))
         sums *= learnt[:, None]
         return sums[:, :LABEL], sums[:, LABEL]
-
-    def step_colours(
-        self, state: Gaussians, subsets: Sequence[Sequence[TrainingView]], learnt: NDArray[np.uint8], most: float
-    ) -> Gaussians:
-        """See ``Renderer.step_colours``."""
-        return colour_steps(self, state, subsets, learnt, most)
-
-    def extrapolate(self, before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-        """See ``Renderer.extrapolate``."""
-        return extrapolated(before, after, share)
-
-    def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
-        """See ``Renderer.turn_normals``."""
-        return with_turned_normals(before, after, near)
 
     def reached(self, state: Gaussians, cameras: Sequence[CameraArrays]) -> list[NDArray[np.bool_]]:
         """See ``Renderer.reached``. A block is marked if a support contains one of its pixel centres."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.merging import SPACING, average_per_cell, merge_candidates
+from scas4d_core.first_frame.points.merging import SPACING, average_per_cell, labelled_share, merge_candidates
 from scas4d_core.first_frame.points.stereo import (
     MIN_NEIGHBOURS,
     DepthMap,
@@ -134,16 +134,8 @@ def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -
 
     A foreground point is inside the masks of most cameras that observed the point.
     """
-    points = triangulated.positions
-    said, yes = np.zeros(len(points)), np.zeros(len(points))
-    for view, seen in zip(views, triangulated.views.T, strict=True):
-        if view.mask is None:
-            continue
-        column, line, _, inside = pixels_inside(view.camera, points)
-        said += inside & seen
-        yes += inside & seen & view.mask[line, column]
-    result: Bool = yes > 0.5 * np.maximum(said, 1)
-    return result
+    share = labelled_share(views, triangulated.positions, triangulated.views.T)
+    return np.zeros(len(triangulated.positions), dtype=bool) if share is None else share > 0.5
 
 
 def _stereo(

@@ -88,7 +88,7 @@ def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, l
     if not limit.bounded:
         return efforts[0]
     tiny = [halved(view, PACE_WIDTH) for view in views]
-    paced = next((i for i in range(len(tiny)) if len(neighbours_of(tiny, i, middle, NEIGHBOURS)) > 1), None)
+    paced = next((i for i in range(len(tiny)) if len(neighbours_of(tiny, i, middle)) > 1), None)
     if paced is None:
         return efforts[0]
     began, camera = limit.clock(), tiny[paced].camera
@@ -132,7 +132,7 @@ def _pixels(view: PosedPicture, width: int) -> int:
     return columns * rows
 
 
-def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
+def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float) -> list[int]:
     """Returns the indices of the views to compare with a view.
 
     These are the views whose rays to the scene centre have the smallest angles to the ray of the
@@ -142,13 +142,12 @@ def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, coun
         views: all views.
         index: index of the view to compare.
         middle: [3] scene centre.
-        count: maximum number of neighbours.
     """
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
     fit = [i for i in np.argsort(angle, kind="stable") if i != index and MIN_ANGLE_DEG <= angle[i] <= MAX_ANGLE_DEG]
-    return [int(i) for i in fit[:count]]
+    return [int(i) for i in fit[:NEIGHBOURS]]
 
 
 def depth_maps(
@@ -211,7 +210,7 @@ def _match(
     seed: int,
 ) -> Float:
     """Returns the depth [H, W] of one view, or 0 for unreliable matches; see ``depth_maps``."""
-    chosen = neighbours_of(views, index, middle, NEIGHBOURS)
+    chosen = neighbours_of(views, index, middle)
     camera = views[index].camera
     if len(chosen) < fewest:
         return np.zeros(greys[index].shape)

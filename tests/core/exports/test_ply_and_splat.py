@@ -6,7 +6,7 @@ from export_cases import corner
 from plyfile import PlyData
 
 from scas4d_core.errors import InputError
-from scas4d_core.exports.splat import read_splat, write_splat
+from scas4d_core.exports.splat import ROW, write_splat
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import write_ply
 
@@ -54,11 +54,6 @@ def test_splat_by_numpy(tmp_path):
     )
     truth = corner.wanted(state).rows(sorted_rows(state))
     corner.assert_same(found, truth, means=2e-5, covariances=0.02, colours=0.5 / 254, opacities=0.5 / 254)
-    back = read_splat(tmp_path / "a.splat")
-    np.testing.assert_allclose(back.means, found.means)
-    np.testing.assert_allclose(back.covariances(), found.covariances)
-    np.testing.assert_allclose(back.colours, found.colours)
-    np.testing.assert_allclose(back.opacities, found.opacities)
 
 
 def test_splat_holds_no_rotation_at_all_exactly(tmp_path):
@@ -73,20 +68,15 @@ def test_splat_of_gloss_has_the_mean_colour_and_none_of_the_retired(tmp_path):
     left = state.rows(state.present)
     colours = corner.wanted(left).colours
     assert np.abs(colours - left.colours).max() > 0.05  # gloss shows
-    back = read_splat(tmp_path / "a.splat")
-    np.testing.assert_allclose(back.colours, np.clip(colours[sorted_rows(left)], 0, 1), atol=0.5 / 254)
+    back = np.fromfile(tmp_path / "a.splat", ROW)["rgba"][:, :3] / 255
+    np.testing.assert_allclose(back, np.clip(colours[sorted_rows(left)], 0, 1), atol=0.5 / 254)
 
 
-def test_splat_that_cannot_be_read_or_written(tmp_path):
-    (tmp_path / "cut.splat").write_bytes(bytes(40))
-    with pytest.raises(InputError, match=r"cut\.splat is not a \.splat file \(40 bytes"):
-        read_splat(tmp_path / "cut.splat")
-    with pytest.raises(InputError, match=r"none\.splat is not a \.splat file \(No such file"):
-        read_splat(tmp_path / "none.splat")
+def test_splat_that_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match=r"out '.*a\.splat' cannot be written"):
         write_splat(tmp_path / "no" / "a.splat", corner.state(), corner.WORLD)
     state = corner.state()
     broken = state.replace(means=np.where(np.arange(10)[:, None] == 3, np.nan, state.means))
     with pytest.raises(InputError, match=r"rows \[3\], ids \[53\]"):
         write_splat(tmp_path / "b.splat", broken, corner.WORLD)
-    assert [path.name for path in tmp_path.iterdir()] == ["cut.splat"]
+    assert not list(tmp_path.iterdir())

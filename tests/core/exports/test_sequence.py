@@ -11,13 +11,13 @@ from export_cases import corner, moving
 
 from scas4d_core.errors import InputError
 from scas4d_core.exports import FORMATS, export_sequence
-from scas4d_core.exports.formats import table
 from scas4d_core.exports.sequence import FRAME_WRITERS
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import read_ply
 
 ROOT = Path(__file__).parents[3]
 NUMBERED = [name for name, each in FORMATS.items() if each.numbered]
+PACKAGES = {"spz": ("gsply",), "spz4": ("gsply", "zstandard"), "usd": ("pxr",)}
 WHOLE = [name for name, each in FORMATS.items() if not each.numbered]
 
 
@@ -25,9 +25,8 @@ WHOLE = [name for name, each in FORMATS.items() if not each.numbered]
 def _packages(request):
     """Formats whose package is missing are skipped."""
     name = getattr(request.node, "callspec", None) and request.node.callspec.params.get("format")
-    for package in FORMATS[name].package.split(", ") if name and FORMATS[name].package else ():
-        module = {"usd-core": "pxr"}.get(package, package)
-        pytest.importorskip(module, reason=f"{name} needs {package}: pip install 'scas4d[exports]'")
+    for package in PACKAGES.get(name, ()):
+        pytest.importorskip(package, reason=f"{name} needs {package}: pip install 'scas4d[exports]'")
 
 
 def states(count=3, first=12):
@@ -189,8 +188,15 @@ def test_from_a_compact_file(tmp_path):
     np.testing.assert_allclose(read_ply(paths[2]).means, truth, atol=2e-5)
 
 
-def test_the_page_has_the_table():
+def test_the_page_lists_the_formats():
+    """The table has the names, suffixes and kinds of output; formats that differ only in their names share a row."""
     page = (ROOT / "docs" / "exports.md").read_text()
-    assert table() in page
-    rows = re.findall(r"^\| ((?:`[a-z0-9-]+`(?:, )?)+) \| `\.", page, re.M)
-    assert {name for row in rows for name in re.findall(r"[a-z0-9-]+", row)} == set(FORMATS)
+    rows = re.findall(
+        r"^\| ((?:`[a-z0-9-]+`(?:, )?)+) \| ((?:`\.[a-z0-9]+` ?)+) \| (one file(?: per frame)?) \|", page, re.M
+    )
+    listed = {
+        name: (tuple(re.findall(r"`(\.\w+)`", suffixes)), kind == "one file per frame")
+        for names, suffixes, kind in rows
+        for name in re.findall(r"[a-z0-9-]+", names)
+    }
+    assert listed == {name: (each.suffixes, each.numbered) for name, each in FORMATS.items()}

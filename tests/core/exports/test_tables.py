@@ -7,9 +7,8 @@ import pytest
 from export_cases import corner, moving
 
 from scas4d_core.errors import InputError
-from scas4d_core.exports.tables import PoseTable, TrackTable, write_tracks
+from scas4d_core.exports.tables import PoseTable, TrackTable
 from scas4d_core.gaussians import quaternions_to_matrices
-from scas4d_core.query.tracks import Tracks
 
 
 def rows_of(path):
@@ -49,20 +48,6 @@ def test_tracks_of_some_ids(tmp_path):
     with pytest.raises(InputError, match=r"unknown Gaussian ids \[7\]"):
         table.finish()
     table.discard()
-    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
-
-
-def test_tracks_that_were_asked_for_have_their_confidence(tmp_path):
-    positions = np.array([[[1.0, 2, 3], [np.nan] * 3], [[4, 5, 6], [7, 8, 9]]])
-    tracks = Tracks(positions, np.array([[0.5, 0], [0.25, 1]]), np.array([3, -1]), np.array([7, 9]))
-    write_tracks(tmp_path / "a.csv", tracks, [0.7, 0.9])
-    rows = rows_of(tmp_path / "a.csv")
-    assert [(row["frame"], row["time"], row["id"], row["confidence"]) for row in rows] == [
-        ("7", "0.7", "3", "0.5"), ("9", "0.9", "3", "0.25"), ("9", "0.9", "-1", "1")
-    ]  # fmt: skip
-    np.testing.assert_allclose(numbers(rows, "x", "y", "z"), positions[np.isfinite(positions)].reshape(-1, 3))
-    with pytest.raises(ValueError, match="zip"):
-        write_tracks(tmp_path / "b.csv", tracks, [0.7])
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
 
 

@@ -15,12 +15,12 @@ from scas4d_core.engines.limits import scene_limits
 from scas4d_core.engines.renderer import PairCounts, pair_counts
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame import static_scene
-from scas4d_core.first_frame.fit_first_frame import fit_static_scene
 from scas4d_core.first_frame.fit_schedule import FitProgress
 from scas4d_core.first_frame.static_scene import (
     STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
+    first_trainer,
 )
 from scas4d_core.fit.exposures import SPREAD
 from scas4d_core.fit.initial_gaussians import initial_parameters, logit
@@ -59,7 +59,8 @@ def cloud() -> tuple[np.ndarray, np.ndarray]:
 def fit(settings: StaticSettings = SETTINGS, frame: Frame | None = None, masks: bool = True) -> StaticResult:
     factory = ViewFactory(RIG)
     frame = frame or take_frame(0, 0.0, BOX, RIG, masks)
-    return fit_static_scene(factory, factory.views(frame, {}), *cloud(), None, SceneSettings(), settings)
+    trainer = first_trainer(factory, factory.views(frame, {}), *cloud(), None, SceneSettings(), settings)
+    return trainer.result(trainer.train())
 
 
 def new_trainer(settings: StaticSettings = SETTINGS) -> StaticTrainer:
@@ -178,7 +179,7 @@ def test_an_empty_cloud_is_refused() -> None:
     views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
     with pytest.raises(ValueError, match="is empty; provide points"):
-        fit_static_scene(factory, views, *nothing, None, SceneSettings(), SETTINGS)
+        first_trainer(factory, views, *nothing, None, SceneSettings(), SETTINGS)
 
 
 def test_progress_counts_every_iteration() -> None:
@@ -186,7 +187,8 @@ def test_progress_counts_every_iteration() -> None:
     views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
     seen: list[FitProgress] = []
     short = SETTINGS.model_copy(update={"iterations": 5})
-    result = fit_static_scene(factory, views, *cloud(), None, SceneSettings(), short, seen.append)
+    trainer = first_trainer(factory, views, *cloud(), None, SceneSettings(), short)
+    result = trainer.result(trainer.train(seen.append))
     assert [(now.done, now.loss) for now in seen] == list(enumerate(result.losses, start=1))
     assert {now.planned for now in seen} == {5}
 

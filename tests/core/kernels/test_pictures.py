@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
 
-from scas4d_core.kernels.pictures import fill_planes, mark_changes, row_differences
+from scas4d_core.kernels.pictures import fill_planes, mark_changes
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(0, 256, (13, 21, 3)).astype(np.uint8)
@@ -34,11 +34,3 @@ def test_equal_images_have_no_changes() -> None:
     marked = np.ones((13, 21), np.float32)
     assert not mark_changes(IMAGE, IMAGE, 0, 2, marked)
     assert not marked.any()
-
-
-@pytest.mark.parametrize("every", [1, 4])
-def test_row_differences_are_sums_over_every_nth_row(every: int) -> None:
-    first = np.diff(IMAGE[::every].astype(int), axis=1)
-    expected = np.abs(first).sum(), np.abs(np.diff(first, axis=1)).sum()
-    assert row_differences(IMAGE, every) == expected
-    assert row_differences(IMAGE[:, :1].copy(), every) == (0, 0)

@@ -52,9 +52,9 @@ class Probes:
     def errors(self, *, moved: bool, learnt: bool, state_next: bool = False) -> dict[str, float]:
         return self._found(self._small, moved)
 
-    def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
+    def full_size_errors(self, *, learnt: bool) -> dict[str, float]:
         self.asked += 1
-        return self._found(self._whole, moved)
+        return self._found(self._whole, moved=True)
 
     def _found(self, error: Error, moved: bool) -> dict[str, float]:
         state = self.engine.state(learnt=False) if moved else BOX

@@ -44,7 +44,7 @@ PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "held_back": (
         (
             "engines/cpu/deformation.py",
-            "find_finite(np.ascontiguousarray(previous.means), np.ascontiguousarray(previous.factors), moving, sound)",
+            "sound &= np.isfinite(previous.factors[moving]).all(axis=(1, 2))",
             "sound[:] = True",
         ),
     ),

@@ -25,7 +25,7 @@ from scas4d_core.engines.cpu.gloss import (
     without_turn,
 )
 from scas4d_core.engines.cpu.renderer import CpuRenderer
-from scas4d_core.engines.renderer import Neighbourhoods, with_turned_normals
+from scas4d_core.engines.renderer import Neighbourhoods
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.gloss_strengths import estimate_strengths
 from scas4d_core.first_frame.glossy import fit_with_gloss_trial
@@ -184,7 +184,7 @@ def test_highlights_stay_with_the_world_while_the_ball_turns() -> None:
     state = sphere().replace(colours=np.full((COUNT, 3), 0.3, np.float32))
     turn = Rotation.from_rotvec([0.1, 0.5, 0.2])
     means = turn.apply(state.means).astype(np.float32)
-    there = with_turned_normals(state, state.replace(means=means), Neighbourhoods(state.means))
+    there = CpuRenderer((0, 0, 0)).turn_normals(state, state.replace(means=means), Neighbourhoods(state.means))
     assert there.gloss is not None
     np.testing.assert_allclose(there.gloss, turn.apply(state.gloss), atol=1e-4)
     camera = CameraArrays.of(rig().cameras[3])

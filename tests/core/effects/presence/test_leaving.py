@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from scas4d_core.cameras import Camera, Rig
 from scas4d_core.effects.presence.leaving import EFFECT, FRAMES, outside_all_views
+from scas4d_core.gaussians import Gaussians
 from tests.helpers.effect_cases.visited_room import known, make_rig, scene, seen, visitor
 
 AWAY = np.array([0.0, -4.0, 0.0])
@@ -14,6 +16,13 @@ def test_only_what_moves_and_is_in_no_picture_is_outside() -> None:
     state = scene(known(), visitor(AWAY))
     out = outside_all_views(state, make_rig())
     assert np.flatnonzero(out).tolist() == list(range(len(state) - 300, len(state)))
+
+
+def test_gaussians_behind_or_beside_all_cameras_are_outside() -> None:
+    camera = Camera("a", [[100, 0, 50], [0, 100, 50], [0, 0, 1]], np.eye(4), 100, 100)  # looks along z
+    state = Gaussians.of_points([[0, 0, 2], [0, 0, -2], [2, 0, 2], [1.02, 0, 2], [5, 0, 2]], radius=0.02)
+    state = state.replace(foreground=np.float32([1, 1, 1, 1, 0]))  # the last one does not move
+    assert outside_all_views(state, Rig((camera,))).tolist() == [False, True, True, False, False]
 
 
 def test_it_is_retired_after_some_frames() -> None:
