@@ -30,8 +30,8 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_sync
 
+from client.retries import OUTAGE_S
 from client.subscriptions import (
-    OUTAGE_S,
     Event,
     PartsEvent,
     StatesEvent,

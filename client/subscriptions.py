@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import random
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from websockets.typing import Subprotocol
 
 from client.calls.call import wire_camera
 from client.errors import error_of_problem, unreachable
+from client.retries import backoff
 from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel, TracksRequest
 from client.wire.base import Model
 from client.wire.stream import (
@@ -38,9 +38,6 @@ from client.wire.stream import (
 )
 from scas4d_core.cameras import Camera
 
-OUTAGE_S = 20.0
-FIRST_WAIT_S = 0.2
-LONGEST_WAIT_S = 5.0
 UNREAD_MESSAGES = 2
 """Maximum number of messages to read ahead of the caller.
 
@@ -328,8 +325,7 @@ class StreamSession:
                 raise error_of_problem(_problem(error)) from error
             raise unreachable(self.address, error, self._failures) from error
         self._failures += 1
-        grown = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16))
-        return grown * random.uniform(0.5, 1.0)
+        return backoff(self._failures)
 
 
 def _problem(error: InvalidStatus) -> ProblemDetails:

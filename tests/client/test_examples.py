@@ -54,7 +54,7 @@ def test_an_example_gives_what_it_says(example, service, scenes, capture_folder,
 
 
 def test_every_call_class_and_method_has_an_example():
-    own = {name: vars(sdk.Client)[name] for name in vars(sdk.Client) if not name.startswith("_")}
+    own = {name: getattr(sdk.Client, name) for name in dir(sdk.Client) if not name.startswith("_")}
     own |= {
         name: getattr(stream, name)
         for name in ("scene_changes", "finished_frames", "live_states", "view", "tracks", "parts")
