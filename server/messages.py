@@ -261,13 +261,6 @@ class ReplayPoint:
     frames: int
 
 
-@dataclass(frozen=True)
-class ReplayEnded:
-    """Notification that the replay has ended; `fault` is None if all iteration counts were measured."""
-
-    fault: str | None = None
-
-
 # Messages to and from the export process; each export has its own process.
 
 
@@ -296,8 +289,11 @@ class ExportProgressed:
     size: int
 
 
+# The last message of both.
+
+
 @dataclass(frozen=True)
-class ExportEnded:
-    """Notification that the export has ended; `fault` is None if its file is complete."""
+class JobEnded:
+    """Notification that a replay or export has ended; `fault` is the reason why it failed, or None."""
 
     fault: str | None = None

@@ -138,7 +138,7 @@ class Scene:
         self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
         self.open_frames = OpenFrames(self.ingest, self._background)
         self.updates.on_queue_room(self.open_frames.close_due)
-        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.report_damage, self._background)
+        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.report_damage)
 
         if content.events:
             self._background.run(self.log.write(*content.events))
