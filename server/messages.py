@@ -99,14 +99,13 @@ class Ready:
     """Notification that the worker is ready to accept frames.
 
     `indices` lists the committed frames that it found, `damaged` maps the unreadable ones to the reason, and `report`
-    is the newest report. `undone` lists frames whose commit was rolled back and which must be sent again. `faults`
-    explains why, in one sentence per fault.
+    is the newest report. `faults` lists the reasons for commits that were rolled back, and the files that were
+    restored, in one sentence each.
     """
 
     indices: tuple[int, ...] = ()
     damaged: dict[int, str] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
-    undone: tuple[int, ...] = ()
     faults: tuple[str, ...] = ()
 
 
