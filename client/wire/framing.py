@@ -166,26 +166,3 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
         raise FramingError(
             f"has an invalid header{' field ' + field if field else ''}: {first['msg']}", "correct the header"
         ) from None
-
-
-def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
-    """Returns the header and zero-copy views of each file's bytes.
-
-    Raises:
-        FramingError: the data is not a frame, is truncated, or is longer than the header states.
-    """
-    view = memoryview(data)
-    at = PREFIX.size + head_length(view[: PREFIX.size])
-    if at > len(view):
-        raise FramingError(f"is truncated within its header, after {len(view)} bytes", "send the whole frame")
-    head = parse_head(view[PREFIX.size : at])
-    expected = at + sum(file.size for file in head.files)
-    if len(view) != expected:
-        raise FramingError(
-            f"has {len(view)} bytes, but its header declares {expected}", "send exactly the files that the header lists"
-        )
-    pieces = []
-    for file in head.files:
-        pieces.append(view[at : at + file.size])
-        at += file.size
-    return head, pieces
