@@ -14,6 +14,7 @@ from client import rig
 from client.cli import scenes
 from client.cli.capture_options import finish, note, open_capture, with_capture_options
 from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_labels
+from client.cli.scenes import Scene, Token, Url
 from client.importers.open_source import CaptureOptions
 from client.progress import Bars, console
 from client.sdk import DEFAULT_URL, Client
@@ -40,12 +41,6 @@ class WhenFull(StrEnum):
 
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; see docs/captures.md.")]
-Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Service URL.")]
-Token = Annotated[
-    str | None,
-    typer.Option(envvar="SCAS4D_TOKEN", help="Access token; prefer the environment variable SCAS4D_TOKEN."),
-]
-Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")]
 Encode = Annotated[
     Encoding, typer.Option(help="Encoding of undistorted images and video frames; jpeg uses quality 95.")
 ]
