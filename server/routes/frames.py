@@ -20,6 +20,7 @@ from client.wire import (
     FrameSeconds,
     MissingRequest,
 )
+from client.wire.frames import FrameList
 from server.http.immutable import immutable_response
 from server.ingest.batch import REFUSED_CONTENT, Batch, Numbering, OnRefusal, receive_batch, receive_form_batch
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
@@ -85,6 +86,8 @@ PICTURE: dict[str, Any] = {
         },
     }
 }
+MOST_FRAMES = 500
+"""Maximum number of frames per response; each report lists every camera."""
 MOST_STATES = 120
 """Maximum number of frames in a requested compact file; they take a few seconds of reader time and a few megabytes."""
 SENT_AS = {
@@ -226,6 +229,19 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
     Images of the frame that have already arrived are discarded. The next update spans the longer time interval.
     """
     return await scene.open_frames.declare_missing(n, "" if request is None else request.reason)
+
+
+@router.get("/{id}/frames")
+async def frames(
+    scene: TheScene,
+    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first frame.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="Maximum number of frames.")] = MOST_FRAMES,
+) -> FrameList:
+    """Returns the reports of up to `limit` frames starting at `first`; `next` is the `first` of the next page."""
+    after = min(first + limit, scene.next_frame)  # frame indices have no gaps
+    reports = [await scene.report(index) for index in range(first, after)]
+    short = [report.model_copy(update={"loss": [], "curve": []}) for report in reports if report is not None]
+    return FrameList(frames=short, next=after if first <= after < scene.next_frame else None)
 
 
 @router.get("/{id}/frames/{n}")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from fastapi import APIRouter, Request, Response
 
-from client.wire import SceneCreate, SceneEdit, SceneList, SceneStatus
+from client.wire import RigModel, SceneCreate, SceneEdit, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
 from scas4d_core.engines.choose import free_gpu_mb, gpu_fault
 from scas4d_core.presets import SettingError, preset
@@ -136,6 +136,12 @@ async def listed(scenes: AllScenes, request: Request, response: Response) -> Sce
 async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
     """Returns the state, progress and queue of the scene without waking it."""
     return scenes.status(id)
+
+
+@router.get("/{id}/rig")
+async def rig(scene: TheRecord) -> RigModel:
+    """Returns the camera rig of the scene as uploaded, without calibration corrections."""
+    return scene.request.rig
 
 
 @router.patch("/{id}")
