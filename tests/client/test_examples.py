@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import doctest
 import importlib
+import inspect
 import time
 
 import numpy as np
@@ -61,5 +62,5 @@ def test_every_call_class_and_method_has_an_example():
     }
     own |= {kind.__name__: kind for kind in (sdk.Client, sdk.AsyncClient, stream.Stream, stream.AsyncStream)}
     own |= {"IngestSocket": ingest.IngestSocket, "push": push}
-    assert len(own) > len(calls.__all__)
+    assert len(own) > sum(map(inspect.isfunction, vars(calls).values()))
     assert [name for name, value in own.items() if ">>> " not in (value.__doc__ or "")] == []
