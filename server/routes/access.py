@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import difflib
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
 from fastapi import Depends, Path, Request, params
@@ -22,37 +22,31 @@ from server.scene.scenes import Scenes
 from server.settings import ServerSettings
 
 
-def _scenes(request: Request) -> Scenes:
-    scenes: Scenes = request.app.state.scenes
-    return scenes
+def _of_app(name: str) -> Any:
+    """Returns the dependency that reads an attribute of the application's state."""
+
+    def read(request: Request) -> Any:
+        return getattr(request.app.state, name)
+
+    return Depends(read)
 
 
-def _exports(request: Request) -> Exports:
-    exports: Exports = request.app.state.exports
-    return exports
-
-
-def _settings(request: Request) -> ServerSettings:
-    settings: ServerSettings = request.app.state.settings
-    return settings
-
-
+AllScenes = Annotated[Scenes, _of_app("scenes")]
+AllExports = Annotated[Exports, _of_app("exports")]
+TheSettings = Annotated[ServerSettings, _of_app("settings")]
 SceneId = Annotated[str, Path(max_length=64)]
 
 
-async def _scene(request: Request, id: SceneId) -> AsyncIterator[Scene]:
-    async with _scenes(request).use(id) as scene:
+async def _scene(scenes: AllScenes, id: SceneId) -> AsyncIterator[Scene]:
+    async with scenes.use(id) as scene:
         yield scene
 
 
-async def _record(request: Request, id: SceneId) -> AsyncIterator[Scene]:
-    async with _scenes(request).use(id, place=False) as scene:
+async def _record(scenes: AllScenes, id: SceneId) -> AsyncIterator[Scene]:
+    async with scenes.use(id, place=False) as scene:
         yield scene
 
 
-AllScenes = Annotated[Scenes, Depends(_scenes)]
-AllExports = Annotated[Exports, Depends(_exports)]
-TheSettings = Annotated[ServerSettings, Depends(_settings)]
 TheScene = Annotated[Scene, Depends(_scene)]
 """Scene for routes that need its processes; the scene is woken up and takes a slot."""
 TheRecord = Annotated[Scene, Depends(_record)]
