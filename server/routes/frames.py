@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from bisect import bisect_left, bisect_right
-from collections.abc import AsyncIterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -118,13 +119,11 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
     response is 507.
     """
     kind = _media_type(request)
-    try:
+    with _connected("frame"):
         if kind == FRAME_MEDIA_TYPE:
-            return await receive_frame(scene.ingest, n, _body(request), _length(request))
+            return await receive_frame(scene.ingest, n, request.stream(), _length(request))
         if kind == "multipart/form-data":
             return await receive_form(scene.ingest, n, request)
-    except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
     raise _media_type_problem(request)
 
 
@@ -152,15 +151,13 @@ async def post(
     for frames that were accepted before.
     """
     kind = _media_type(request)
-    try:
+    with _connected("batch"):
         if kind == FRAME_MEDIA_TYPE:
-            batch = await receive_batch(scene.open_frames, numbering, on_refusal, _body(request))
+            batch = await receive_batch(scene.open_frames, numbering, on_refusal, request.stream())
         elif kind == "multipart/form-data":
             batch = await receive_form_batch(scene.open_frames, numbering, on_refusal, request)
         else:
             raise _media_type_problem(request)
-    except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the batch again") from None
     return _answer(batch, response)
 
 
@@ -189,12 +186,10 @@ async def put_camera(
     The image is on disk when the response is sent. The frame closes when the images of all cameras have arrived, on
     POST …/close, or at the scene's deadline. A camera may be a few frames ahead of the others. Frames close in order.
     """
-    try:
+    with _connected("image"):
         if _media_type(request) == FRAME_MEDIA_TYPE:
-            return await receive_camera(scene.open_frames, n, c, _body(request), _length(request))
-        return await receive_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
-    except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the image again") from None
+            return await receive_camera(scene.open_frames, n, c, request.stream(), _length(request))
+        return await receive_file(scene.open_frames, n, c, kind, time, request.stream(), _length(request))
 
 
 @router.get("/{id}/frames/{n}/cameras/{c}", response_class=Response, responses=FILE)
@@ -358,8 +353,13 @@ def _media_type_problem(request: Request) -> Problem:
     )
 
 
-def _body(request: Request) -> AsyncIterator[bytes]:
-    return request.stream()
+@contextmanager
+def _connected(what: str) -> Iterator[None]:
+    """Raises `Problem` (400) if the sender closes the connection while it sends `what`."""
+    try:
+        yield
+    except ClientDisconnect:
+        raise Problem(400, "the sender closed the connection", field="body", remedy=f"send the {what} again") from None
 
 
 def _length(request: Request) -> int | None:
