@@ -16,9 +16,10 @@ from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from client.calls.call import wire_camera
+from client.calls.tracks import tracks_request
 from client.errors import error_of_problem, unreachable
 from client.retries import backoff
-from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel, TracksRequest
+from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel
 from client.wire.base import Model
 from client.wire.stream import (
     SERVER_MESSAGE,
@@ -217,17 +218,8 @@ def tracks(
     >>> event.first, event.frame, event.model().ids
     (0, 2, [0, 1])
     """
-    request = {
-        "ids": None if ids is None else [int(id) for id in ids],
-        "pixels": None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
-        "camera": None if camera is None else wire_camera(camera),
-        "points": None if points is None else np.asarray(points, dtype=np.float64).tolist(),
-        "at": at,
-        "first": first,
-        "project": [wire_camera(one) for one in project],
-        "format": format,
-    }
-    return SubscriptionRequest(Topic.TRACKS, TracksRequest.model_validate(request))
+    request = tracks_request(ids, pixels, camera, points, at, (first, None), project, format)
+    return SubscriptionRequest(Topic.TRACKS, request)
 
 
 def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:

@@ -43,7 +43,7 @@ def tracks(
     >>> client.tracks(scene, points=[[0, 0, 0]]).ids
     [0]
     """
-    request = _request(ids, pixels, camera, points, at, frames, project, "json")
+    request = tracks_request(ids, pixels, camera, points, at, frames, project, "json")
     return Call("POST", path(id, "tracks", "query"), json_reader(TracksModel), arguments=body(request))
 
 
@@ -63,20 +63,21 @@ def tracks_arrays(
     >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
     (3, 2, 3)
     """
-    request = _request(ids, pixels, camera, points, at, frames, project, "npz")
+    request = tracks_request(ids, pixels, camera, points, at, frames, project, "npz")
     return Call("POST", path(id, "tracks", "query"), read_npz, arguments=body(request))
 
 
-def _request(
+def tracks_request(
     ids: Sequence[int] | None,
     pixels: ArrayLike | None,
     camera: Camera | str | None,
     points: ArrayLike | None,
     at: int | None,
-    frames: tuple[int, int] | None,
+    frames: tuple[int | None, int | None] | None,
     project: Sequence[Camera | str],
     format: str,
 ) -> TracksRequest:
+    """Returns the request for trajectories; the arguments are those of `tracks`."""
     first, last = frames or (None, None)
     return TracksRequest.model_validate(
         {
