@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -35,58 +35,39 @@ from server.storage.frame_store import FrameDamage, read_pictures
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
 BINARY = {"type": "string", "format": "binary"}
-BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF, described in docs/api.md."}},
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "properties": {"time": {"type": "number", "description": "Frame time in seconds; optional."}},
-                    "additionalProperties": {
-                        **BINARY,
-                        "description": "Image of the camera with the name of the field; `mask.<camera>` is its mask.",
-                    },
-                }
-            },
-        },
-    }
-}
-BATCH_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            FRAME_MEDIA_TYPE: {
-                "schema": {**BINARY, "description": "S4DF frames, one after another, as described in docs/api.md."}
-            },
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "additionalProperties": {
-                        **BINARY,
-                        "description": (
-                            "A field as for a single frame, with the frame index before its name: `0/<camera>`, "
-                            "`0/mask.<camera>`, `0/time`."
-                        ),
-                    },
-                }
-            },
-        },
-    }
-}
+
+
+def _request_body(frames: str, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns the description of a body of S4DF frames, or of another media type with the schema given for it."""
+    schemas = {**others, FRAME_MEDIA_TYPE: {**BINARY, "description": frames}}
+    return {"requestBody": {"required": True, "content": {kind: {"schema": schemas[kind]} for kind in schemas}}}
+
+
+def _form(files: str, **fields: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    schema = {"type": "object", "additionalProperties": {**BINARY, "description": files}}
+    return {"multipart/form-data": schema | ({"properties": fields} if fields else {})}
+
+
+BODY = _request_body(
+    "S4DF, described in docs/api.md.",
+    _form(
+        "Image of the camera with the name of the field; `mask.<camera>` is its mask.",
+        time={"type": "number", "description": "Frame time in seconds; optional."},
+    ),
+)
+BATCH_BODY = _request_body(
+    "S4DF frames, one after another, as described in docs/api.md.",
+    _form(
+        "A field as for a single frame, with the frame index before its name: `0/<camera>`, `0/mask.<camera>`, "
+        "`0/time`."
+    ),
+)
 ANSWERS: dict[int | str, dict[str, Any]] = {
     207: {"model": FrameBatch, "description": "At least one frame was refused; see its `problem`."}
 }
-PICTURE: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            **{kind: {"schema": BINARY} for kind in ("image/jpeg", "image/png", "image/webp")},
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "Image and mask of the camera in one body."}},
-        },
-    }
-}
+PICTURE = _request_body(
+    "Image and mask of the camera in one body.", dict.fromkeys(("image/jpeg", "image/png", "image/webp"), BINARY)
+)
 MOST_FRAMES = 500
 """Maximum number of frames per response; each report lists every camera."""
 MOST_STATES = 120
