@@ -22,7 +22,6 @@ from client.calls.frames import (
     put_frames,
     states,
 )
-from client.calls.gaussians import gaussians
 from client.calls.parts import joints, parts
 from client.calls.scenes import (
     begin_again,
@@ -39,5 +38,5 @@ from client.calls.scenes import (
     scenes,
 )
 from client.calls.service import cluster, ingest_ready, live, metrics, ready, share, ticket
-from client.calls.tracks import tracks, tracks_arrays
+from client.calls.tracks import gaussians, tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file

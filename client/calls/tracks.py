@@ -1,4 +1,4 @@
-"""Calls for trajectories of Gaussians, pixels and 3D points."""
+"""Calls for trajectories of Gaussians, pixels and 3D points, and for the lifetimes of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from client.calls.call import Call, body, json_reader, path, read_npz, wire_camera
-from client.wire import TracksModel, TracksRequest
+from client.wire import GaussiansModel, TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
 
 
@@ -65,6 +65,17 @@ def tracks_arrays(
     """
     request = tracks_request(ids, pixels, camera, points, at, frames, project, "npz")
     return Call("POST", path(id, "tracks", "query"), read_npz, arguments=body(request))
+
+
+def gaussians(id: str, ids: Sequence[int]) -> Call[GaussiansModel]:
+    """Returns the lifetime of each requested Gaussian: the frames in which it was created, retired and revived.
+
+    >>> found = client.gaussians(scene, [1, 0])
+    >>> [(one.id, one.born, one.retired) for one in found.gaussians]
+    [(1, 0, []), (0, 0, [])]
+    """
+    arguments = {"params": {"ids": ",".join(str(int(value)) for value in ids)}}
+    return Call("GET", path(id, "gaussians"), json_reader(GaussiansModel), arguments=arguments)
 
 
 def tracks_request(

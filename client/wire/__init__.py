@@ -47,6 +47,7 @@ from client.wire.scenes import (
     Retention,
     SceneCreate,
     SceneEdit,
+    SceneEstimate,
     SceneList,
     SceneState,
     SceneStatus,

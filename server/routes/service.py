@@ -15,8 +15,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from client import __version__
-from client.wire import Cluster, Health, Node, RigModel, SceneCreate, Share, ShareRequest, Ticket
-from client.wire.estimate import SceneEstimate
+from client.wire import Cluster, Health, Node, RigModel, SceneCreate, SceneEstimate, Share, ShareRequest, Ticket
 from server.counters import registry
 from server.health.estimate import estimate, machine_mb
 from server.health.metrics import ServiceState
