@@ -35,7 +35,6 @@ from server.routes import (
     ingest,
     parts,
     points,
-    reconstructions,
     reference,
     render,
     scenes,
@@ -117,7 +116,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     if settings.trusted_proxies:
         app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
-    of_scenes = (scenes, reconstructions, points, frames, ingest, render, tracks, parts, stream)
+    of_scenes = (scenes, points, frames, ingest, render, tracks, parts, stream)
     resources = (*of_scenes, budget, tradeoff, exports, service, viewer, reference)
     for resource in resources:
         app.include_router(
