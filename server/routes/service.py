@@ -23,8 +23,7 @@ from server.health.readiness import Readiness
 from server.http.permissions import ALL, PERMISSION
 from server.http.sharing import Sharing
 from server.http.tickets import SUBPROTOCOL, TICKET_SECONDS, Tickets
-from server.peers.clusters import merge_clusters
-from server.peers.peers import PROXIED_HEADER, Peers
+from server.peers.peers import PROXIED_HEADER, Peers, merge_clusters
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.routes.access import AllScenes, TheSettings
